@@ -129,7 +129,7 @@ def test_invalid_numbers_stop_the_start(visit: Visit, files: dict[str, Path]) ->
     page.locator(".presets input").first.wait_for()
     expand(watched)
     for name, (text, _) in wrong.items():
-        page.locator(f"[data-name={name}] input").press_sequentially(text)
+        page.locator(f"[data-name={name}] input:not([type=radio])").press_sequentially(text)
     page.get_by_role("button", name="Start").click()
     for name, (_, message) in wrong.items():
         page.locator(f"[data-name={name}]").get_by_text(message).wait_for()

@@ -162,7 +162,7 @@ def test_paintings_are_chosen_from_the_gallery(visit: Visit, service: Service, f
     page.get_by_role("button", name="Add The Great Wave off Kanagawa, Hokusai").click()
     page.get_by_role("button", name="Remove great_wave.jpg").wait_for()
     broken = "(images) => images.filter((image) => image.complete && !image.naturalWidth).length"
-    assert page.locator(".painting img").count() == 7
+    assert page.locator(".painting img").count() > 6, "those of earlier jobs, and six of the page"
     assert page.locator(".painting img").evaluate_all(broken) == 0
     set_options(watched, **STEPS)
     page.get_by_role("radio", name="Balanced").check(force=True)
