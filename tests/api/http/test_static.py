@@ -133,7 +133,7 @@ def test_changed_file_changes_digest(tmp_path: Path) -> None:
     for version, text in enumerate(("let a = 1;", "let a = 2;")):
         folder = tmp_path / str(version)
         folder.mkdir()
-        for page in ("index.html", "docs.html"):
+        for page in ("index.html", "shared.html", "docs.html"):
             (folder / page).write_text('<script src="{{static}}/page.js"></script>')
         (folder / "page.js").write_text(text)
     first, second = (static_files(tmp_path / name) for name in "01")
