@@ -13,6 +13,8 @@ import { splatVertex } from "./shaders.js";
 
 /** Longer side of the image in pixels. */
 const LONGER = 768;
+/** Texture unit to which nothing is bound. */
+const FREE_UNIT = 15;
 
 const pickFragment = `#version 300 es
 precision highp float; precision highp int;
@@ -92,7 +94,7 @@ export class PickPass {
   }
 
   /**
-   * Bind samplers of colors to another unit than those of integers, in case the driver retains unused ones.
+   * Bind samplers of colors to a unit without an integer texture, in case the driver retains unused ones.
    *
    * @param {WebGLProgram} program
    * @param {(name: string) => WebGLUniformLocation | null} at
@@ -101,7 +103,7 @@ export class PickPass {
     const { gl } = this.viewer;
     for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); i++) {
       const { name, type } = gl.getActiveUniform(program, i) ?? {};
-      if (name && type === gl.SAMPLER_2D) gl.uniform1i(at(name), 1);
+      if (name && type === gl.SAMPLER_2D) gl.uniform1i(at(name), FREE_UNIT);
     }
   }
 }
