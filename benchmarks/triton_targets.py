@@ -67,7 +67,7 @@ _TYPES = {
     **dict.fromkeys(("count", "centered", "target_gram", "target_mean", "target_std", "terms"), "*fp64"),
     **dict.fromkeys(("positions", "row_step", "column_step", "weight_row_step", "weight_column_step", "spans"), "i32"),
     **dict.fromkeys(("out_row_step", "out_column_step"), "i32"),
-    **dict.fromkeys(("total", "visible", "width", "first_row", "last_row", "across"), "i32"),
+    **dict.fromkeys(("total", "visible", "width", "height", "across"), "i32"),
 }
 _FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (cached_kernels.HALF_SCALE, "*fp16")}
 

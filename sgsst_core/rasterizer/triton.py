@@ -195,7 +195,7 @@ class TritonRasterizer(Rasterizer):
         with on_device(self.device):
             kernels.slot_gradients[(tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, image_gradient, slots,
-                camera.width, 0, camera.height, across,
+                camera.width, camera.height, across,
                 **self.cuts(kernels.SUMMING_WARPS),
             )  # fmt: skip
         add_slots_(gradient, slots, isects.first_slots, isects.gaussians)
@@ -239,7 +239,7 @@ class TritonRasterizer(Rasterizer):
         with on_device(self.device):
             kernels.render[(tiles,)](
                 isects.ranks, isects.starts, isects.gaussians, isects.values, colors, self.background,
-                image, transmittance, camera.width, 0, camera.height, across,
+                image, transmittance, camera.width, camera.height, across,
                 **self.cuts(kernels.PIXEL_WARPS),
             )  # fmt: skip
         return image, transmittance

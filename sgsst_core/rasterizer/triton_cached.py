@@ -46,7 +46,7 @@ class CountedPieces:
         with on_device(device):
             kernels.count_pieces[(self.tiles,)](
                 isects.ranks, isects.slots, isects.starts, isects.values, self.masks, self.slot_pieces,
-                self.block_pieces, self.ends, camera.width, 0, camera.height, self.across,
+                self.block_pieces, self.ends, camera.width, camera.height, self.across,
                 **rasterizer.cuts(SUMMING_WARPS),
             )  # fmt: skip
         self.pieces = int(self.block_pieces.sum())
@@ -153,9 +153,9 @@ class WeightPieces:
         """Return the launch grid: one program per block."""
         return (len(self.block_starts) - 1,)
 
-    def _view_arguments(self) -> tuple[int, int, int, int]:
-        """Return the kernel arguments that describe the view: width, rows, and raster tiles per row."""
-        return self.camera.width, 0, self.camera.height, tiles_of(self.camera)[0]
+    def _view_arguments(self) -> tuple[int, int, int]:
+        """Return the kernel arguments that describe the view: width, height, and raster tiles per row."""
+        return self.camera.width, self.camera.height, tiles_of(self.camera)[0]
 
 
 def _offsets(counts: Tensor, dtype: torch.dtype) -> Tensor:

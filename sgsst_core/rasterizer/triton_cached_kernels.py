@@ -34,14 +34,14 @@ _SIDE: tl.constexpr = tl.constexpr(4)
 
 
 @triton.jit
-def _block_pixels(block, width, first_row, last_row, across):
-    """Return which of a block's 16 pixels are in the band, and their indices in it."""
-    tile = first_row // _TILE * across + block // BLOCKS
+def _block_pixels(block, width, height, across):
+    """Return which of a block's 16 pixels are in the image, and their indices in it."""
+    tile = block // BLOCKS
     pixel = tl.arange(0, PIECE)
     x = tile % across * _TILE + block % _SIDE * _SIDE + pixel % _SIDE
     y = tile // across * _TILE + block % BLOCKS // _SIDE * _SIDE + pixel // _SIDE
-    inside = (x < width) & (y >= first_row) & (y < last_row)
-    return inside, (y - first_row).to(tl.int64) * width + x
+    inside = (x < width) & (y < height)
+    return inside, y.to(tl.int64) * width + x
 
 
 @triton.jit
@@ -62,19 +62,19 @@ def _present_blocks(weight):
 
 @triton.jit
 def count_pieces(
-    ranks, slots, starts, values, masks, slot_pieces, block_pieces, ends, width, first_row, last_row, across,
+    ranks, slots, starts, values, masks, slot_pieces, block_pieces, ends, width, height, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
 ):  # fmt: skip
-    """Find the blocks in which each (Gaussian, raster tile) pair has weights; one program per raster tile of the band.
+    """Find the blocks in which each (Gaussian, raster tile) pair has weights; one program per raster tile.
 
     Args:
         masks: Output [E] int32, one bit per block; zeros on entry.
         slot_pieces: Output [E] int32, pieces by the pair's slot; zeros on entry.
-        block_pieces: Output [16 tiles] int32, pieces of every block in the band's tiles.
-        ends: Output [tiles] int64, entry of each of the band's tiles after which all pixels are finished.
+        block_pieces: Output [16 tiles] int32, pieces of every block.
+        ends: Output [tiles] int64, entry of each tile after which all pixels are finished.
     """
-    tile = first_row // _TILE * across + tl.program_id(0)
-    x, y, _pixel, inside = tile_pixels(tile, across, width, first_row, last_row)
+    tile = tl.program_id(0)
+    x, y, _pixel, inside = tile_pixels(tile, across, width, height)
     left = tl.where(inside, 1.0, 0.0)
     block, pair = tl.arange(0, BLOCKS), tl.arange(0, PAIRS)
     pieces = tl.zeros([BLOCKS], tl.int32)
@@ -99,20 +99,20 @@ def count_pieces(
 @triton.jit
 def store_pieces(
     ranks, slots, starts, values, gaussians, masks, ends, slot_starts, block_starts, piece_gaussians, piece_slots,
-    weights, transmittances, width, first_row, last_row, across,
+    weights, transmittances, width, height, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr, SCALE: tl.constexpr,
 ):  # fmt: skip
-    """Store the pieces counted by `count_pieces`, and the final transmittance [h, width] of the band.
+    """Store the pieces counted by `count_pieces`, and the final transmittance [h, width].
 
     Args:
         slot_starts: [E + 1], first piece slot of each pair; the piece slots of one Gaussian are contiguous.
-        block_starts: [16 tiles + 1], first piece of each block of the band.
+        block_starts: [16 tiles + 1], first piece of each block.
         piece_gaussians: Output [P] int32, indices into the scene.
         piece_slots: Output [P], slot of each piece's gradient.
         weights: Output [16 P] float32, or float16 multiplied by SCALE.
     """
-    tile = first_row // _TILE * across + tl.program_id(0)
-    x, y, pixel, inside = tile_pixels(tile, across, width, first_row, last_row)
+    tile = tl.program_id(0)
+    x, y, pixel, inside = tile_pixels(tile, across, width, height)
     left = tl.where(inside, 1.0, 0.0)
     final = left
     block, pair = tl.arange(0, BLOCKS), tl.arange(0, PAIRS)
@@ -157,11 +157,11 @@ def _load_pieces(weights, k, end, P: tl.constexpr):
 
 @triton.jit
 def apply_pieces(
-    block_starts, gaussians, weights, colors, background, transmittances, image, width, first_row, last_row, across,
+    block_starts, gaussians, weights, colors, background, transmittances, image, width, height, across,
     SCALE: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
     """Render the image [h, width, 3] from cached weights; one program per block."""
-    inside, pixel = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
+    inside, pixel = _block_pixels(tl.program_id(0), width, height, across)
     k, end = tl.load(block_starts + tl.program_id(0)), tl.load(block_starts + tl.program_id(0) + 1)
     red, green, blue = (
         tl.zeros([P, PIECE], tl.float32),
@@ -183,11 +183,11 @@ def apply_pieces(
 
 @triton.jit
 def piece_gradients(
-    block_starts, slots, weights, image_gradient, out, width, first_row, last_row, across,
+    block_starts, slots, weights, image_gradient, out, width, height, across,
     SCALE: tl.constexpr, P: tl.constexpr,
 ):  # fmt: skip
     """Write dL/dcolor of every piece to its slot [P, 3]; one program per block."""
-    inside, pixel = _block_pixels(tl.program_id(0), width, first_row, last_row, across)
+    inside, pixel = _block_pixels(tl.program_id(0), width, height, across)
     red = tl.load(image_gradient + 3 * pixel, mask=inside, other=0.0)
     green = tl.load(image_gradient + 3 * pixel + 1, mask=inside, other=0.0)
     blue = tl.load(image_gradient + 3 * pixel + 2, mask=inside, other=0.0)

@@ -283,27 +283,27 @@ def blend(
 
 
 @triton.jit
-def tile_pixels(tile, across, width, first_row, last_row):
+def tile_pixels(tile, across, width, height):
     """Return columns and rows of a tile's pixels [8, 32] relative to its center, their indices, and which exist.
 
-    Indices are those in the band; a pixel outside the band or the image does not exist.
+    A pixel outside the image does not exist.
     """
     pixel = tl.arange(0, _PIXELS // PAIRS)[:, None] * PAIRS + tl.arange(0, PAIRS)[None, :]
     column, row = pixel % _TILE, pixel // _TILE
     x, y = tile % across * _TILE + column, tile // across * _TILE + row
-    inside = (x < width) & (y >= first_row) & (y < last_row)
+    inside = (x < width) & (y < height)
     center = (_TILE - 1) / 2
-    return column - center, row - center, (y - first_row).to(tl.int64) * width + x, inside
+    return column - center, row - center, y.to(tl.int64) * width + x, inside
 
 
 @triton.jit
 def render(
-    ranks, starts, gaussians, values, colors, background, image, transmittances, width, first_row, last_row, across,
+    ranks, starts, gaussians, values, colors, background, image, transmittances, width, height, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
 ):  # fmt: skip
-    """Render the image [h, width, 3] and final transmittance [h, width] of a band; one program per raster tile."""
-    tile = first_row // _TILE * across + tl.program_id(0)
-    x, y, pixel, inside = tile_pixels(tile, across, width, first_row, last_row)
+    """Render the image [h, width, 3] and final transmittance [h, width]; one program per raster tile."""
+    tile = tl.program_id(0)
+    x, y, pixel, inside = tile_pixels(tile, across, width, height)
     left = tl.where(inside, 1.0, 0.0)
     final = left
     red, green, blue = tl.zeros_like(left), tl.zeros_like(left), tl.zeros_like(left)
@@ -332,12 +332,12 @@ def render(
 
 @triton.jit
 def slot_gradients(
-    ranks, slots, starts, values, image_gradient, out, width, first_row, last_row, across,
+    ranks, slots, starts, values, image_gradient, out, width, height, across,
     ALPHA_MAX: tl.constexpr, ALPHA_MIN: tl.constexpr, STOP: tl.constexpr,
 ):  # fmt: skip
     """Write dL/dcolor of every (Gaussian, tile) pair to its slot [E, 3], which must be zero on entry."""
-    tile = first_row // _TILE * across + tl.program_id(0)
-    x, y, pixel, inside = tile_pixels(tile, across, width, first_row, last_row)
+    tile = tl.program_id(0)
+    x, y, pixel, inside = tile_pixels(tile, across, width, height)
     red = tl.load(image_gradient + 3 * pixel, mask=inside, other=0.0)
     green = tl.load(image_gradient + 3 * pixel + 1, mask=inside, other=0.0)
     blue = tl.load(image_gradient + 3 * pixel + 2, mask=inside, other=0.0)
@@ -398,7 +398,7 @@ def survey(
     ones, but take only one pass. There is one program per raster tile.
     """
     tile = tl.program_id(0)
-    x, y, pixel, inside = tile_pixels(tile, across, width, 0, height)
+    x, y, pixel, inside = tile_pixels(tile, across, width, height)
     left = tl.where(inside, 1.0, 0.0)
     final = left
     pair = tl.arange(0, PAIRS)
