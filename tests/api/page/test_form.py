@@ -93,7 +93,7 @@ def test_what_was_entered_survives_other_views(visit: Visit, files: dict[str, Pa
     page.get_by_role("link", name="New", exact=True).click()
     for path in files.values():
         page.get_by_role("button", name=f"Remove {path.name}").wait_for()
-    page.get_by_text("616 Gaussians").wait_for()
+    page.get_by_text("616 Gaussians · SH degree 1").wait_for()
     wait_for(lambda: page.locator("[data-name=steps_sos] input").input_value() == "17", "the options")
     assert page.locator("[data-name=name] input").input_value() == "kept"
     assert page.get_by_role("group", name="Region 1").get_by_label("Name").input_value() == "left"
