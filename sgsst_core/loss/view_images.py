@@ -139,7 +139,9 @@ class _Exchange:
     def gathered(self, pixels: _Pixels, background: tuple[float, float, float]) -> _Pixels:
         """Return the pixels of the image that this rank needs, given those that it renders."""
         own, area = downscale(pixels.image[self.own.slices], self.scale), self.windows[self.collectives.rank]
-        image = own.new_tensor(background).expand(*area.shape, 3).clone()
+        image = own.new_empty((*area.shape, 3))
+        for channel, color in zip(image.unbind(-1), background, strict=True):
+            channel.fill_(color)  # scalars are kernel arguments, so the host does not wait for a copy to the device
         with self.timer("communication"):
             self.collectives.gather_parts(own, self.parts, image, self.windows)
         return _Pixels(image, self.scale, area)

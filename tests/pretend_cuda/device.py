@@ -246,6 +246,8 @@ class _Moves(TorchFunctionMode):
             return _to(args[0], "cpu")
         if func in (torch.tensor, torch.as_tensor) and _is_cuda(kwargs.get("device")):
             return _to(func(*args, **{**kwargs, "device": "cpu"}), DEVICE)
+        if func is Tensor.new_tensor and isinstance(args[0], PretendTensor):
+            return _to(args[0].host.new_tensor(*args[1:], **{**kwargs, "device": "cpu"}), kwargs.get("device", DEVICE))
         if func is torch.as_tensor and args and isinstance(args[0], PretendTensor) and kwargs.get("device") is None:
             return args[0].to(kwargs.get("dtype", args[0].dtype))
         if func is Tensor.pin_memory:

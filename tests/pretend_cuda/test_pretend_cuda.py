@@ -37,6 +37,7 @@ def test_tensors_are_created_moved_and_computed_on_device(counts: Counts) -> Non
         torch.zeros(2, device="cuda"),
         torch.tensor([1.0], device="cuda"),
         there.new_ones(2),
+        there.new_tensor([1.0]),
         there + 1,
         there[0],
     )
@@ -73,6 +74,7 @@ def test_operations_that_cuda_rejects_are_rejected(counts: Counts) -> None:
         (lambda x: x[x > 1], 1),
         (lambda x: x.nonzero(), 1),
         (lambda x: torch.tensor([1.0], device="cuda"), 1),
+        (lambda x: x.new_tensor([1.0]), 1),
         (lambda x: torch.ones(3).to("cuda"), 1),
         (lambda x: torch.ones(3).to("cuda", non_blocking=True), 0),
         (lambda x: torch.ones(1 << 20).to("cuda", non_blocking=True), 1),
