@@ -25,7 +25,7 @@ from sgsst_core import Stylizer, make_settings
 from sgsst_core.features.partition import Rectangle, computed_twice
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide, loads
-from sgsst_core.planning.cost import IterationWork, pieces_of
+from sgsst_core.planning.cost import IterationWork, pieces_of, proportional
 from sgsst_core.planning.facts import Link
 from sgsst_core.planning.probe import probe_link
 from sgsst_core.report.machine import peak_memory
@@ -161,7 +161,7 @@ def modeled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> 
         pieces,
         figures["halo"],
         (network - forward * twice) / pixels,
-        raster,
+        proportional(raster),
         fixed,
         gaussians,
         forward=forward,

@@ -17,7 +17,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO
 from sgsst_core.loss.tiling import RENDERING
 from sgsst_core.parallel.division import Piece, divide, loads
-from sgsst_core.planning.cost import IterationWork
+from sgsst_core.planning.cost import IterationWork, proportional
 from sgsst_core.planning.facts import Link
 from sgsst_core.scene.pyramid import scale_count
 
@@ -55,7 +55,7 @@ def main() -> None:
             ),
             halo=HALO["vgg19"],
             pixel=FLOP_PER_PIXEL / (arguments.tflops * 1e12),
-            raster=raster,
+            raster=proportional(raster),
             fixed=FIXED_SECONDS,
             gaussians=gaussians,
             shown=arguments.shown * gaussians,

@@ -13,7 +13,7 @@ measurements, and predicts the peak memory of a rank.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from sgsst_core.budget import content_fraction, least_intersection_memory, measuring_memory, memory_for
@@ -272,17 +272,43 @@ class ViewData:
         """Time in seconds at every visit of a view to recompute uncached data, mean over views."""
         return (1 - self.cached) * self.seconds
 
-    def cached_bytes(self, ranks: int = 1) -> float:
-        """Return the final size in bytes of the data that each rank caches if `ranks` ranks divide every view."""
-        total = self.bytes / ranks
-        if total <= self.budget:
-            return total
-        return self.budget if self.views is None else self.budget // (total / self.views) * (total / self.views)
+    def cached_bytes(self) -> float:
+        """Return the final size in bytes of the data that are cached."""
+        if self.bytes <= self.budget:
+            return self.bytes
+        return (
+            self.budget if self.views is None else self.budget // (self.bytes / self.views) * (self.bytes / self.views)
+        )
+
+
+@dataclass(frozen=True)
+class RankPart:
+    """Part of the work on each view that a rank does.
+
+    Attributes:
+        ranks: Number of ranks that divide a view.
+        window: Fraction of a view's covered pixels that the rank renders: its part of the view and the halo.
+        memory: Memory budget of the rank, relative to `Machine.memory`; more than 1 if some ranks do not take part.
+    """
+
+    ranks: int = 1
+    window: float = 1.0
+    memory: float = 1.0
+
+    def seconds(self, whole: float, fixed: float = 0.0) -> float:
+        """Return the rank's time in seconds, given that of a whole view, and how much of it is for any window."""
+        fixed = min(fixed, whole)
+        return fixed + (whole - fixed) * self.window
+
+    def data(self, whole: ViewData, fraction: float, fixed: float = 0.0) -> ViewData:
+        """Return the rank's data of the views, a fraction of those of the whole views."""
+        seconds = self.seconds(whole.seconds, fixed)
+        return replace(whole, seconds=seconds, bytes=whole.bytes * fraction, budget=whole.budget * self.memory)
 
 
 @dataclass(frozen=True)
 class ViewCosts:
-    """All data that are computed for the views of a job.
+    """All data that are computed for the views of a job: for whole views, or for one rank's part of each.
 
     Attributes:
         intersections: Tile intersections of the rasterizer that computes weights.
@@ -297,6 +323,7 @@ class ViewCosts:
         maps: Maps of the regions.
         raster: Time in seconds of a render and its gradient with recomputed weights.
         raster_cached: Time in seconds of a render and its gradient with cached weights.
+        fixed: Portions of `raster` and of the time for tile intersections that do not depend on the number of pixels.
         in_coarse: Whether phase 1 already computes tile intersections, colors and weights for phase 2.
     """
 
@@ -311,6 +338,7 @@ class ViewCosts:
     maps: ViewData
     raster: float
     raster_cached: float
+    fixed: tuple[float, float]
     in_coarse: bool
 
     @staticmethod
@@ -327,7 +355,8 @@ class ViewCosts:
         """
         raster, memory, views = probe.raster, probe.machine.memory, len(plan.covered)
         view_budget, raster_budget = view_memory(plan, memory), memory_for("rasterizer", memory)
-        surveyed = ViewData(0.0, len(probe.sizes) * raster.intersection_bytes, raster_budget)
+        # Ranks have surveyed different views.
+        surveyed = ViewData(0.0, len(probe.sizes) * raster.intersection_bytes / probe.machine.ranks, raster_budget)
         budget = raster_budget if plan.cached_weights == "none" else least_intersection_memory(memory)
         intersections = ViewData(raster.first_seconds, views * raster.intersection_bytes, budget)
         colors = views * int(plan.seen.sum()) * _COLOR_BYTES if probe.scene.used_degree else 0
@@ -355,7 +384,9 @@ class ViewCosts:
             maps=maps,
             intersections=intersections,
             surveyed=surveyed,
-            reused=min(surveyed.cached / intersections.cached, 1.0) * (1 if plan.seen.all() else 1 - _RESTRICTING),
+            reused=min(surveyed.cached / intersections.cached, 1.0)
+            / probe.machine.ranks
+            * (1 if plan.seen.all() else 1 - _RESTRICTING),
             colors=ViewData(raster.colors_seconds, colors, view_budget / 4),
             weights=weights,
             content=ViewData(rendered + work.pixels * forward, content, content_budget),
@@ -363,7 +394,26 @@ class ViewCosts:
             images=images,
             raster=raster.seconds,
             raster_cached=raster.seconds if raster.cached_seconds is None else raster.cached_seconds,
+            fixed=(raster.fixed, raster.first_fixed),
             in_coarse=plan.steps_coarse > 0,
+        )
+
+    def of_rank(self, part: RankPart) -> ViewCosts:
+        """Return the costs of a rank that processes a part of each view, given those of whole views."""
+        raster, first = self.fixed
+        return replace(
+            self,
+            intersections=part.data(self.intersections, part.window, first),
+            reused=self.reused if part.ranks == 1 else 0.0,  # the survey's tile intersections are of whole views
+            colors=replace(self.colors, budget=self.colors.budget * part.memory),
+            weights=self.weights and part.data(self.weights, part.window, raster),
+            content=part.data(self.content, 1 / part.ranks),
+            content_coarse=part.data(self.content_coarse, 1 / part.ranks),
+            # Images are counted with their whole sizes, on which all ranks agree.
+            images=replace(part.data(self.images, part.window), budget=self.images.budget * part.memory * part.window),
+            maps=part.data(self.maps, 1.0),  # every rank has the whole maps
+            raster=part.seconds(self.raster, raster),
+            raster_cached=part.seconds(self.raster_cached, raster),
         )
 
     def rasterized(self) -> float:
@@ -386,6 +436,11 @@ class ViewCosts:
         return content + intersections + (self.weights.once if self.weights else 0.0)
 
 
+def proportional(seconds: float) -> Callable[[RankPart], float]:
+    """Return the function of a part for a time in seconds that is in proportion to the rendered pixels."""
+    return lambda part: part.seconds(seconds)
+
+
 # --- several ranks -------------------------------------------------------------------------------------------------
 
 
@@ -399,7 +454,7 @@ class IterationWork:
         pieces: One piece for each computed scale.
         halo: Pixels around a partition tile.
         pixel: Seconds per pixel through the network: both passes and statistics.
-        raster: Time in seconds of render and gradient on one rank.
+        raster: Function that returns the time in seconds of render, gradient and uncached data of the view for a part.
         fixed: Seconds that every rank needs regardless of their number: comparing statistics, and the optimizer.
         gaussians: Number of optimized Gaussians.
         forward: Seconds per pixel of a forward pass alone, for pixels whose activations are not cached.
@@ -417,7 +472,7 @@ class IterationWork:
     pieces: tuple[Piece, ...]
     halo: int
     pixel: float
-    raster: float
+    raster: Callable[[RankPart], float]
     fixed: float
     gaussians: int
     forward: float = 0.0
@@ -437,15 +492,18 @@ class IterationWork:
             ranks: Number of ranks per group.
             groups: Number of groups, each of which takes a view.
         """
-        shards = self._shards(ranks)
         held = self.held / min(ranks * groups, self.sharing)
-        windows = [window.pixels for window in self._shares(ranks).windows]
-        whole = max(self._shares(1).windows[0].pixels, 1)
         own = (
-            self._network(shard, ranks, held) + self.raster * window / whole
-            for shard, window in zip(shards, windows, strict=True)
+            self._network(shard, ranks, held) + self.raster(part)
+            for shard, part in zip(self.shards(ranks), self.parts(ranks, groups), strict=True)
         )
         return max(own) + self.matching / ranks + self.fixed
+
+    def parts(self, ranks: int, groups: int = 1) -> list[RankPart]:
+        """Return the part of the view that each rank of a group renders; see `computing`."""
+        memory = self.sharing / min(ranks * groups, self.sharing)
+        whole = max(self._shares(1).windows[0].pixels, 1)
+        return [RankPart(ranks, window.pixels / whole, memory) for window in self._shares(ranks).windows]
 
     def _network(self, shard: Sequence[Piece], ranks: int, held: float) -> float:
         """Return the time in seconds of a rank's pieces, split into partition tiles as its memory requires."""
@@ -494,7 +552,8 @@ class IterationWork:
         by_rank = divide(pieces, self.halo, (1.0,) * ranks, self.rendering)
         return Shares.of((height, width), by_rank, self.halo)
 
-    def _shards(self, ranks: int) -> tuple[tuple[Piece, ...], ...]:
+    def shards(self, ranks: int) -> tuple[tuple[Piece, ...], ...]:
+        """Return the pieces that each rank of a group passes through the network."""
         rendering = self.rendering if self.rendered in ((), self.pieces) else 0.0
         return divide(self.pieces, self.halo, (1.0,) * ranks, rendering)
 
@@ -504,7 +563,7 @@ class IterationWork:
         scale = shares.exchanged_scale(piece.scale for piece in self.pieces)
         if scale is None:
             return [(0, 0)] * ranks
-        windows = shares.coarse_windows(self._shards(ranks), self.halo, scale)
+        windows = shares.coarse_windows(self.shards(ranks), self.halo, scale)
         parts = [part.at_scale(scale) for part in shares.parts]
         shared = [[12 * part.intersection(window).pixels for window in windows] for part in parts]
         return [
@@ -641,11 +700,12 @@ class CostModel:
         )
         return Prediction(seconds, seconds_coarse, 0), int(self.work.peak * probe.network.held_bytes)
 
-    def on_several_ranks(self) -> tuple[RanksChoice, Prediction, int]:
+    def on_several_ranks(self) -> tuple[RanksChoice, Prediction, int, RankPart]:
         """Choose the number of ranks.
 
         Returns:
-            Choice, prediction for the steps on the chosen ranks, and bytes of each rank's activations.
+            Choice, prediction for the steps on the chosen ranks, bytes of a rank's activations, and its part of a view;
+            both for the rank with most of them.
         """
         available, link = self._probe.machine.ranks, self._probe.link
         coarse, sos = self._sampled(coarsest=True), self._sampled(coarsest=False)
@@ -655,21 +715,24 @@ class CostModel:
             choice = replace(choice, ranks=available)
         return choice, *self._on_ranks(choice.ranks, coarse, sos)
 
-    def _on_ranks(self, ranks: int, coarse: list[IterationWork], sos: list[IterationWork]) -> tuple[Prediction, int]:
-        """Return the prediction for a number of ranks, and each rank's activations in bytes.
+    def _on_ranks(
+        self, ranks: int, coarse: list[IterationWork], sos: list[IterationWork]
+    ) -> tuple[Prediction, int, RankPart]:
+        """Return the prediction for a number of ranks, and a rank's activations in bytes and its part of a view.
 
         Groups of ranks process views in parallel, one view per group.
         """
-        link, network, sharing = self._probe.link, self._probe.network, self._probe.machine.sharing
+        link, network = self._probe.link, self._probe.network
         groups = math.gcd(self._settings.views_per_step, ranks)
         each, turns = ranks // groups, self._settings.views_per_step // groups
 
         def per_step(seconds: Sequence[float]) -> float:
             return turns * sum(seconds) / len(seconds)
 
-        largest = max(max(loads(divide(work.pieces, work.halo, (1.0,) * each), work.halo)) for work in sos)
-        # With fewer ranks, each has more memory.
-        memory = memory_for("activations", self._probe.machine.memory) * sharing / min(ranks, sharing)
+        largest = max(max(loads(work.shards(each), work.halo)) for work in sos)
+        parts = [max(work.parts(each, groups), key=lambda part: part.window) for work in sos]
+        part = replace(parts[0], window=sum(each.window for each in parts) / len(parts))
+        memory = memory_for("activations", self._probe.machine.memory) * part.memory
         activations = int(min(largest * (network.held_bytes + network.working_bytes), memory))
         prediction = Prediction(
             per_step([work.seconds(each, link, groups) for work in sos]),
@@ -678,18 +741,23 @@ class CostModel:
             per_step([work.communication(each, link) for work in sos]),
             per_step([work.seconds(1, link) for work in sos]) * groups,
         )
-        return prediction, activations
+        return prediction, activations, part
 
     def _sampled(self, *, coarsest: bool) -> list[IterationWork]:
         """Return the work of iterations of a sample of views: of phase 1, or on all scales."""
         network, sharing, plan = self._probe.network, self._probe.machine.sharing, self._plan
         sample = range(0, len(self.sizes), max(1, len(self.sizes) // _SAMPLED_VIEWS))
+
+        def raster(part: RankPart) -> float:
+            views = self.views.of_rank(part)
+            return views.rasterized() + views.later(coarse=coarsest)
+
         return [
             IterationWork(
                 pieces,
                 network.halo,
                 network.rate.both,
-                self.views.rasterized(),
+                raster,
                 network.fixed * len(pieces),
                 int(plan.seen.sum()),
                 forward=network.rate.forward,
@@ -705,21 +773,25 @@ class CostModel:
             for pieces, rendered in zip(self._pieces(sample, coarsest=coarsest), self._pieces(sample), strict=True)
         ]
 
-    def whole_job(self, steps: Prediction, activations: int) -> tuple[Prediction, int, int]:
+    def whole_job(
+        self, steps: Prediction, activations: int, part: RankPart = RankPart()
+    ) -> tuple[Prediction, int, int]:
         """Extend a prediction of the steps to the whole job, and choose its measurements.
 
         Args:
             steps: Prediction for the steps.
             activations: Peak size of a rank's activations in an iteration, in bytes.
+            part: Part of each view that a rank processes.
 
         Returns:
             Prediction, level of measurements (see `Plan.measuring`), and number of views for the loss.
         """
         plan, settings, rate, work = self._plan, self._settings, self._probe.network.rate, self.work
+        views = self.views.of_rank(part)
         expected = replace(
             steps,
-            first_visit=self.views.first(coarse=False),
-            first_visit_coarse=self.views.first(coarse=True),
+            first_visit=views.first(coarse=False),
+            first_visit_coarse=views.first(coarse=True),
             style=self._probe.styles * work.without_region * rate.forward,
         )
         seconds = self._steps_seconds(expected)
@@ -727,7 +799,7 @@ class CostModel:
         count = len(plan.covered)
         level, loss_views = plan.measuring, min(LOSS_VIEWS[0], count)
         if plan.measured:
-            once = _RENDER * self.views.rasterized() + self.views.later(coarse=False) + work.evaluation(rate)
+            once = _RENDER * views.rasterized() + views.later(coarse=False) + part.seconds(work.evaluation(rate))
             unvisited = max(1 - settings.steps_sos * settings.views_per_step / count, 0.0)
             price = once + unvisited * expected.first_visit
             # `target_loss` is relative to the initial loss on these views. Their number must not depend on timings, or
@@ -740,7 +812,7 @@ class CostModel:
             level = choose_level(prices, novel_view_seconds(settings.measure, expected), total)
             measuring = expected.losses + prices.of(LEVELS[level], len(LEVELS[level].moments(total)))
             expected = replace(expected, measuring=measuring, job=seconds + measuring)
-        memory = _PeakMemory(self, plan, self._probe, settings, level, loss_views, activations)
+        memory = _PeakMemory(self, views, part, plan, self._probe, settings, level, loss_views, activations)
         process, device = memory.bytes()
         return replace(expected, peak_bytes=process, device_bytes=device), level, loss_views
 
@@ -835,6 +907,8 @@ class _PeakMemory:
 
     Attributes:
         model: Cost model of the job.
+        views: Data that the rank computes for the views.
+        part: Part of each view that the rank processes.
         plan: Plan under construction.
         probe: Measured facts.
         settings: Settings of the job.
@@ -844,6 +918,8 @@ class _PeakMemory:
     """
 
     model: CostModel
+    views: ViewCosts
+    part: RankPart
     plan: Plan
     probe: Probe
     settings: Settings
@@ -861,9 +937,10 @@ class _PeakMemory:
         measuring, everything = MEASURING_BYTES if plan.measured else 0, probe.scene.gaussians
         held = self._intersections_and_weights() + self._content() + self._colors() + self._novel_views()
         held += gaussians * OPTIMIZER_BYTES
-        building = everything * BUILDING_BYTES + probe.raster.most_pairs * SORTING_BYTES
+        pairs = int(probe.raster.most_pairs * self.part.window)
+        building = everything * BUILDING_BYTES + pairs * SORTING_BYTES
         if probe.machine.device != "cpu":
-            rastering = probe.raster.most_pairs * _SLOT_BYTES
+            rastering = pairs * _SLOT_BYTES
             # A CUDA graph does not share its memory.
             graphs = self.activations if plan.graphs else 0
             passing = graphs + max(self._passing() + CUDNN_BYTES, rastering, building)
@@ -871,19 +948,25 @@ class _PeakMemory:
             return probe.process_bytes + measuring, probe.device_bytes + held + passing + messages
         held += self._scene() + measuring
         searching = everything * SEARCH_BYTES if neighbors_are_searched(plan, self.settings) else 0
-        rastering = gaussians * _STEP_BYTES + int(_SLOTS_FRACTION * probe.raster.intersection_bytes)
+        slots = int(_SLOTS_FRACTION * probe.raster.intersection_bytes * self.part.window)
+        rastering = gaussians * _STEP_BYTES + slots
         return probe.process_bytes + max(building, held + max(self._passing(), rastering, searching)), None
 
     def _passing(self) -> int:
         """Return the bytes that the loss of a view and its gradient take, without a graph."""
         probe = self.probe
         # render, gradient, and their temporary float32 copies
-        image = max(height * width for height, width in probe.sizes) * 3 * 4 * 6
+        image = int(max(height * width for height, width in probe.sizes) * self.part.window) * 3 * 4 * 6
         device, tiling = probe.machine.device, self.model.tiling
         matching = _matching_bytes(self.model.sizes, tiling, probe.network.vector_channels, device)
-        budget = memory_for("activations", probe.machine.memory)
+        budget = memory_for("activations", self._memory)
         colors = int(self.plan.seen.sum()) * _COLOR_BYTES
         return image + matching + colors + reference_activations(self.plan, self.activations, budget)
+
+    @property
+    def _memory(self) -> int:
+        """Memory budget of the rank in bytes."""
+        return int(self.probe.machine.memory * self.part.memory)
 
     def _visited(self, steps: int) -> float:
         """Return the fraction of views visited by this many steps and by the initial loss."""
@@ -899,38 +982,40 @@ class _PeakMemory:
 
         Content images, if they are cached instead, and maps of regions are included.
         """
-        views = self.model.views
+        views = self.views
         content, coarse, images, maps = views.content, views.content_coarse, views.images, views.maps
         in_sos = self._visited(self.settings.steps_sos)
         features = in_sos * content.bytes + (self._all_visited - in_sos) * coarse.bytes
         beside = sum(min(self._all_visited * data.bytes, data.budget) for data in (images, maps))
-        return int(min(features / self.probe.machine.ranks, content.budget) + beside)
+        return int(min(features, content.budget) + beside)
 
     def _weights(self) -> int:
-        weights, ranks = self.model.views.weights, self.probe.machine.ranks
-        return int(min(self._all_visited * weights.bytes / ranks, weights.cached_bytes(ranks))) if weights else 0
+        weights = self.views.weights
+        return int(min(self._all_visited * weights.bytes, weights.cached_bytes())) if weights else 0
 
     def _colors(self) -> int:
-        colors = self.model.views.colors
+        colors = self.views.colors
         return int(min(self._all_visited * colors.bytes, colors.budget))
 
     def _intersections_and_weights(self) -> int:
         """Return the size in bytes of weights and tile intersections, which share a budget.
 
-        Tile intersections that the survey has already cached are not included.
+        Tile intersections that the survey has already cached are not included. Those of whole views are dropped if
+        ranks divide the views.
         """
-        memory, weights, views = self.probe.machine.memory, self._weights(), self.model.views
+        memory, weights, views = self._memory, self._weights(), self.views
         budget = memory_for("rasterizer", memory) - weights
         novel = RENDERED * LEVELS[self.level].views if self.plan.measured else 0
         intersections = views.intersections.bytes + novel * self.probe.raster.intersection_bytes
         if views.weights is not None:  # the tile intersections of a view are dropped once its weights are cached
             budget = max(budget, least_intersection_memory(memory))
             intersections -= views.weights.cached * self._all_visited * views.intersections.bytes
-        return max(int(min(intersections, budget)) + weights - int(views.surveyed.cached_bytes()), 0)
+        further = int(min(intersections, budget)) + weights - int(views.surveyed.cached_bytes())
+        return further if self.part.ranks > 1 else max(further, 0)
 
     def _scene(self) -> int:
         """Return the size in bytes of a partial copy of the scene, and of shapes for computing tile intersections."""
-        gaussians, everything, views = int(self.plan.seen.sum()), self.probe.scene.gaussians, self.model.views
+        gaussians, everything, views = int(self.plan.seen.sum()), self.probe.scene.gaussians, self.views
         if gaussians == everything:
             return 0
         copy = gaussians * gaussian_bytes(self.probe.scene.held_degree) - everything * SHAPE_BYTES
@@ -942,7 +1027,7 @@ class _PeakMemory:
         """Return the size in bytes of the caches for novel views and for the reference, except tile intersections."""
         if not self.plan.measured:
             return 0
-        memory, held = measuring_memory(self.probe.machine.memory), 0
+        memory, held = measuring_memory(self._memory), 0
         gaussians, pixels = self.probe.scene.gaussians, max(height * width for height, width in self.probe.sizes)
         views = LEVELS[self.level].views
         if views:
@@ -951,7 +1036,7 @@ class _PeakMemory:
             held += gaussians * SHAPE_BYTES + min(colors, memory // 8) + min(coverage, memory // 8)
             held += min(views * pixels * _WARP_BYTES, memory // 2)
         if is_approximated(self.plan):
-            evaluated, data = self.loss_views / len(self.plan.covered), self.model.views
+            evaluated, data = self.loss_views / len(self.plan.covered), self.views
             held += int(min(evaluated * reference_size(self.plan) * data.content.bytes, memory // 2))
             held += int(min(evaluated * data.colors.bytes, memory // 4))
         return held

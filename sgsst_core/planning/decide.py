@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from sgsst_core.decision import Decision
 from sgsst_core.planning import choices
-from sgsst_core.planning.cost import CostModel, tiling_of
+from sgsst_core.planning.cost import CostModel, RankPart, tiling_of
 from sgsst_core.planning.facts import Probe
 from sgsst_core.planning.measuring import LEAST_ALLOWED, LEVELS, allowed_seconds
 from sgsst_core.planning.plan import Plan, Prediction
@@ -59,13 +59,13 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
         measured=measured,
     )
     model = CostModel(plan, probe, settings)
-    ranks, rank_lines = 1, list[Decision]()
+    ranks, rank_lines, part = 1, list[Decision](), RankPart()
     if machine.ranks == 1:
         steps, activations = model.on_one_rank()
     else:
-        choice, steps, activations = model.on_several_ranks()
+        choice, steps, activations, part = model.on_several_ranks()
         ranks, rank_lines = choice.ranks, [choices.about_ranks(choice, machine.ranks, probe.link)]
-    prediction, level, loss_views = model.whole_job(steps, activations)
+    prediction, level, loss_views = model.whole_job(steps, activations, part)
     plan = replace(
         plan, spare=model.spare(), ranks=ranks, measuring=level, loss_views=loss_views, prediction=prediction
     )

@@ -101,6 +101,9 @@ class RasterCost:
         intersection_bytes: Mean size in bytes of a view's tile intersections; 0 if unknown.
         most_pairs: Largest number of pairs of Gaussian and raster tile that a GPU sorts for a view; 0 if unknown.
         colors_seconds: Time in seconds for the contribution of spherical harmonics to the colors of a view.
+        fixed: Portion of `seconds` that does not depend on the number of pixels. It is measured on a single raster tile
+            if there are several ranks, each of which renders a part of a view; 0 otherwise.
+        first_fixed: Such a portion of `first_seconds`.
     """
 
     seconds: float
@@ -112,6 +115,8 @@ class RasterCost:
     intersection_bytes: int = 0
     most_pairs: int = 0
     colors_seconds: float = 0.0
+    fixed: float = 0.0
+    first_fixed: float = 0.0
 
     @property
     def least_visits(self) -> float | None:

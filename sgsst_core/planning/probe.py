@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.budget import memory_for
+from sgsst_core.constants import RASTER_TILE
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.graphs import LossGraphs, graphs_problem
@@ -293,6 +294,12 @@ def _raster_cost(context: PlanningContext, cameras: Sequence[Camera]) -> RasterC
         "most_pairs": cost.most_pairs,
         "colors_seconds": _colors_seconds(scene, sample[middle], rasterizer.device),
     }
+    if context.machine.ranks > 1:
+        tile = rasterizer.probe_cost([_central_tile(sample[middle])])
+        known |= {
+            "fixed": min(*tile.seconds, mean),
+            "first_fixed": min(tile.preparation_seconds, cost.preparation_seconds),
+        }
     if not rasterizer.can_cache:
         return RasterCost(mean, **known)
     if not rasterizer.on_gpu and _comes_too_seldom(settings, len(cameras)):
@@ -311,6 +318,12 @@ def _raster_cost(context: PlanningContext, cameras: Sequence[Camera]) -> RasterC
     reused = cached.step_seconds(sample[middle], visits=2)[1]
     # Scaled to the mean view, like the seconds that it is compared with.
     return RasterCost(mean, reused * mean / cost.seconds[middle], total, half, caching, **known)
+
+
+def _central_tile(camera: Camera) -> Camera:
+    """Return the camera of one raster tile in the middle of a view."""
+    top, left = camera.height // 2 // RASTER_TILE * RASTER_TILE, camera.width // 2 // RASTER_TILE * RASTER_TILE
+    return camera.cropped(top, left, min(top + RASTER_TILE, camera.height), min(left + RASTER_TILE, camera.width))
 
 
 def _comes_too_seldom(settings: Settings, views: int) -> bool:

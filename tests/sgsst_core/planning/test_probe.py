@@ -59,7 +59,17 @@ def test_probe_contains_the_measured_facts(tiny_weights: BackboneWeights) -> Non
     assert probe.raster.intersection_bytes == sum(sizes) // 3
     assert probe.raster.first_seconds > 0 < probe.raster.colors_seconds
     assert (probe.machine.memory_limit, probe.machine.memory, probe.machine.ranks) == (10**9, 10**9, 1)
+    assert (probe.raster.fixed, probe.raster.first_fixed) == (0.0, 0.0)
     assert probe.process_bytes > 10**7
+
+
+def test_time_that_does_not_depend_on_pixels_is_measured_for_several_ranks(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    two = equipped(tiny_weights, scene)
+    two = replace(two, machine=replace(two.machine, ranks=2))
+    raster = measure(two, survey_views(scene, two.cameras, two.rasterizer), FREE).raster
+    assert 0 < raster.fixed <= raster.seconds
+    assert 0 < raster.first_fixed <= raster.first_seconds
 
 
 def test_feature_matching_is_timed_separately(tiny_weights: BackboneWeights) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.parallel.division import Piece
-from sgsst_core.planning.cost import IterationWork, choose_ranks
+from sgsst_core.planning.cost import IterationWork, choose_ranks, proportional
 from sgsst_core.planning.facts import Link
 
 FREE = Link(math.inf, 0.0)
@@ -18,7 +18,7 @@ SLOW = Link(1e6, 1e-3)
 
 def work(height: int = 720, width: int = 1280, scales: int = 2) -> IterationWork:
     pieces = tuple(Piece(s, (height >> s, width >> s), Rectangle(0, 0, height >> s, width >> s)) for s in range(scales))
-    return IterationWork(pieces, halo=64, pixel=1e-6, raster=0.1, fixed=0.01, gaussians=50_000)
+    return IterationWork(pieces, halo=64, pixel=1e-6, raster=proportional(0.1), fixed=0.01, gaussians=50_000)
 
 
 def test_one_rank_has_no_communication() -> None:
@@ -71,7 +71,7 @@ def test_free_link_uses_all_ranks_and_slow_link_one() -> None:
 
 def test_additional_ranks_must_save_time() -> None:
     """For a view that is all halo, more ranks only speed up the rasterizer."""
-    small = replace(work(40, 40, 1), raster=1e-6)
+    small = replace(work(40, 40, 1), raster=proportional(1e-6))
     assert choose_ranks([(0, [small]), (10, [small])], 1, 8, FREE).ranks == 1
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from sgsst_core.planning.cost import ViewData
+from sgsst_core.planning.cost import CostModel, RankPart, ViewData
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import RasterCost
 from sgsst_core.planning.plan import Plan, Prediction
@@ -44,9 +44,10 @@ def test_data_that_fit_cost_time_once_and_others_at_every_visit() -> None:
 def test_views_that_are_cached_completely_leave_some_budget_unused() -> None:
     data = ViewData(6.0, 400, 250, views=4)
     assert (data.cached, data.once, data.always, data.cached_bytes()) == (0.5, 3.0, 3.0, 200)
-    assert (data.cached_bytes(2), data.cached_bytes(4)) == (200, 100)
     alone = ViewData(6.0, 400, 250, views=1)
-    assert (alone.cached, alone.always, alone.cached_bytes(), alone.cached_bytes(2)) == (0.0, 6.0, 0, 200)
+    assert (alone.cached, alone.always, alone.cached_bytes()) == (0.0, 6.0, 0)
+    half = RankPart(2, 0.5).data(alone, 0.5)
+    assert (half.cached, half.once, half.cached_bytes()) == (1.0, 3.0, 200)
 
 
 def test_blend_weights_take_no_memory_if_no_view_fits() -> None:
@@ -81,6 +82,39 @@ def test_survey_intersections_are_reused_if_every_gaussian_is_rendered() -> None
     """If only some Gaussians are rendered, the intersections must be reduced first."""
     restricted, reused = expected(LARGE), expected(LARGE, keep=("unseen",))
     assert restricted.first_visit - reused.first_visit == pytest.approx(0.25 * 5.0)
+
+
+def on_two_ranks(raster: RasterCost, *, sharing: int = 1) -> tuple[Prediction, RankPart]:
+    """Return the prediction for two ranks that divide every view, and the larger part."""
+    settings = make_settings(steps_coarse=0, steps_sos=40, position_weights="off", keep=("ranks",))
+    measurements = probe(raster=raster, ranks=2, sharing=sharing)
+    plan = decide(measurements, settings)
+    assert plan.prediction is not None
+    assert plan.ranks == 2
+    return plan.prediction, CostModel(plan, measurements, settings).on_several_ranks()[3]
+
+
+def test_ranks_prepare_and_render_parts_of_views() -> None:
+    """The survey's tile intersections are of whole views, so ranks compute those of their parts again."""
+    free = replace(LARGE, seconds=0.0, first_seconds=0.0, colors_seconds=0.0)
+    without, part = on_two_ranks(free)
+    assert part.ranks == 2
+    assert 0.5 < part.window < 0.75
+    large, _ = on_two_ranks(replace(LARGE, fixed=0.4, first_fixed=1.0))
+    render = 0.5 * 2.0 * part.window  # of the content image
+    assert large.first_visit - without.first_visit == pytest.approx(1.0 + 4.0 * part.window + 0.5 + render)
+    assert large.seconds - without.seconds == pytest.approx(0.4 + 1.6 * part.window, rel=0.02)
+
+
+def test_parts_of_views_fit_where_whole_views_do_not() -> None:
+    size = int(1.3 * 10 * GIGABYTE // 16)  # of the tile intersections of each of four views
+    (small, part), (tight, _) = (on_two_ranks(replace(LARGE, intersection_bytes=each)) for each in (10**8, size))
+    assert tight.seconds == small.seconds
+    assert tight.first_visit == small.first_visit
+    held = 4 * part.window - 2  # in whole views: those of the job, in place of those that the rank has surveyed
+    assert tight.peak_bytes - small.peak_bytes == pytest.approx(held * (size - 10**8))
+    shared, _ = on_two_ranks(replace(LARGE, intersection_bytes=size), sharing=2)
+    assert shared.seconds > small.seconds, "two ranks on one machine have half of its memory each"
 
 
 def test_phase_1_prepares_views_for_phase_2() -> None:
