@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sgsst_core.files.scene_file import SceneFile
 from worker.prepare import Job
 
 
@@ -25,7 +26,11 @@ class Prepared:
 def describe(job: Job) -> Prepared:
     """Summarize the inputs and the plan for the user."""
     stylizer, settings = job.stylizer, job.stylizer.job.settings
-    lines = [("scene", _describe_scene(job)), ("views", _describe_views(job)), ("network", _describe_network(job))]
+    lines = [
+        ("scene", describe_scene(job.scene_file)),
+        ("views", _describe_views(job)),
+        ("network", _describe_network(job)),
+    ]
     lines += [(decision.item, f"{decision.decision}: {decision.reason}") for decision in stylizer.job.plan.decisions]
     rate = f"learning rate {settings.learning_rate:g}"
     if settings.learning_rate_end != settings.learning_rate:
@@ -44,13 +49,13 @@ def describe(job: Job) -> Prepared:
     return Prepared(lines, job.resumed.state.step if job.resumed else 0, stylizer.job.total_steps)
 
 
-def _describe_scene(job: Job) -> str:
-    scene = job.scene_file.scene
-    notes = f", {job.scene_file.dropped:,} invalid ones dropped" if job.scene_file.dropped else ""
-    if job.scene_file.clamped:
-        notes += f", {job.scene_file.clamped:,} infinite opacities read as almost 0 or 1"
-    more = "".join(f"; {note}" for note in job.scene_file.notes)
-    return f"{len(scene):,} Gaussians{notes}, SH degree {scene.sh_degree}{more}"
+def describe_scene(file: SceneFile) -> str:
+    """Return a text about the Gaussians of a file, and what of it was not read, or not as stored."""
+    notes = f", {file.dropped:,} invalid ones dropped" if file.dropped else ""
+    if file.clamped:
+        notes += f", {file.clamped:,} infinite opacities read as almost 0 or 1"
+    more = "".join(f"; {note}" for note in file.notes)
+    return f"{len(file.scene):,} Gaussians{notes}, SH degree {file.scene.sh_degree}{more}"
 
 
 def _describe_views(job: Job) -> str:

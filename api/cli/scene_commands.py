@@ -178,7 +178,14 @@ def _frame_bar() -> Iterator[Callable[[int, int], None]]:
 @with_options(ViewOptions, only=("near", "drop_invalid", "spz_axes", "render_mode", "eps2d"))
 def convert(
     scene: SceneArgument,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help=f"Scene to write: {RESULT_SUFFIXES}.", show_default=False)],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help=f"Scene to write: {RESULT_SUFFIXES}; meta.json for an unpacked SOG, .usdc for OpenUSD.",
+            show_default=False,
+        ),
+    ],
     compare: Annotated[
         bool, typer.Option("--compare", help="Report the PSNR of small renders against those of the scene.")
     ] = False,
@@ -198,7 +205,7 @@ def convert(
         print_field(line.item, f"{line.decision}: {line.reason}")
     if converted.loss is not None:
         print_field("compared", converted.loss.text(scene.name))
-    print_field("scene", f"{out}, {converted.count:,} Gaussians")
+    print_field("scene", f"{out}, {converted.scene}")
 
 
 @with_options(ViewOptions, only=("drop_invalid", "spz_axes"))

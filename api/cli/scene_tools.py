@@ -21,9 +21,10 @@ from sgsst_core.files.formats.sog import META_NAME
 from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.json_files import write_json
-from sgsst_core.files.library import save
+from sgsst_core.files.library import load_scene, save
 from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
 from sgsst_core.files.stylized_ply import check_sh_attenuation
+from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
 from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
@@ -40,6 +41,7 @@ from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import about_rendering, choose_axes, read_capture
+from worker.description import describe_scene
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
 from worker.request import (
     SceneRequest,
@@ -191,14 +193,12 @@ class Converted:
     """Result of a conversion.
 
     Attributes:
-        count: Number of Gaussians.
-        notes: Notes on what of the scene was not read, or read in another way than stored.
+        scene: Text about the scene, and what of it was not read, or not as stored.
         decisions: Lines about the scene's axes and the cameras.
         loss: Difference of the written scene; None if it was not measured.
     """
 
-    count: int
-    notes: tuple[str, ...]
+    scene: str
     decisions: tuple[Decision, ...]
     loss: CompressionLoss | None
 
@@ -207,7 +207,8 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
     """Write a scene in the format that the name of a file determines. Colors and order may change by its rounding.
 
     Args:
-        source: Scene, and cameras for the comparison; without cameras, views are those of an orbit.
+        source: Scene or checkpoint of a trainer, and cameras for the comparison; without cameras, views are those of an
+            orbit.
         out: File to write: a scene, the meta.json of an unpacked SOG, or a USD file, which cannot be compared.
         compare: Whether to read the file back and compare renders.
 
@@ -220,7 +221,8 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
     if compare and source.cameras is None:
         source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
     axes, decisions = choose_axes(source)
-    file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+    loaded = load_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+    file = loaded.scene_file() if isinstance(loaded, TrainerCheckpoint) else loaded
     file = file.rendered(source.render_mode, source.eps2d)
     scene, decisions = file.scene, [*decisions, *about_rendering(file)]
     cameras: list[Camera] = []
@@ -231,7 +233,7 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
     size = _write_as(out, scene)
     decisions += _about_lost_mode(out, scene)
     loss = replace(measure_compression(out, scene, cameras, near=source.near), size=size) if compare else None
-    return Converted(len(scene), file.notes, tuple(decisions), loss)
+    return Converted(describe_scene(file), tuple(decisions), loss)
 
 
 def _check_target(out: Path, compare: bool) -> None:

@@ -21,7 +21,7 @@ from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import HEAD_BYTES
 from sgsst_core.files.formats.unsupported import is_checkpoint
-from sgsst_core.files.scene_file import file_stamp
+from sgsst_core.files.scene_file import SceneFile, file_stamp
 from sgsst_core.files.splats import SPLAT_KEYS, scene_of_splats, stylized_splats
 from sgsst_core.refine.split import Refinement
 from sgsst_core.scene.gaussians import Scene
@@ -58,6 +58,10 @@ class TrainerCheckpoint:
     scene: Scene
     splats: dict[str, Tensor]
     stamp: tuple[int, int]
+
+    def scene_file(self) -> SceneFile:
+        """Return the scene as that of a file of another format than PLY, which states no render mode."""
+        return SceneFile(self.path, self.scene, None, None, self.stamp, "checkpoint")
 
     def stylized(self, scene: Scene, refinement: Refinement | None, sh_attenuation: float) -> TrainerCheckpoint:
         """Return the checkpoint of a stylized scene; see `stylized_splats`."""

@@ -33,8 +33,9 @@ def refuse_unsupported(start: FileStart) -> None:
     path, head, suffix = start.path, start.head, start.path.suffix.lower()
     if is_checkpoint(head):
         raise SceneError(
-            f"{path}: is a checkpoint, not a scene. Export a PLY: `ns-export gaussian-splat` (nerfstudio), "
-            "`--save-ply` (gsplat); the original 3DGS code has point_cloud/iteration_*/point_cloud.ply beside it."
+            f"{path}: is a checkpoint, not a scene. Make a PLY of it: `sgsst convert {path.name} scene.ply` (gsplat, "
+            "nerfstudio) or `ns-export gaussian-splat` (nerfstudio); the original 3DGS code has "
+            "point_cloud/iteration_*/point_cloud.ply beside it."
         )
     if suffix == ".gltf" or (head.lstrip().startswith(b"{") and b'"asset"' in head):
         raise SceneError(
@@ -65,8 +66,11 @@ def refuse_folder(folder: Path) -> NoReturn:
     if any(folder.glob("nerfstudio_models/*.ckpt")):
         command = f"ns-export gaussian-splat --load-config {folder / 'config.yml'} --output-dir exports"
         raise SceneError(f"{folder}: is a run of nerfstudio. Export its scene: `{command}`.")
-    if any(folder.glob("ckpts/*.pt")):
-        raise SceneError(f"{folder}: is a run of gsplat without a PLY. Run it again with --save-ply.")
+    checkpoint = max(folder.glob("ckpts/*_rank0.pt"), key=_numbers, default=None)
+    if checkpoint is not None:
+        raise SceneError(
+            f"{folder}: is a run of gsplat without a PLY. Make one: `sgsst convert {checkpoint} scene.ply`."
+        )
     raise SceneError(f"{folder}: is a folder. Give the file of a scene.")
 
 

@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -33,6 +34,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.gaussians import TENSORS
 from sgsst_core.scene.rendering import Rendering
+from tests.sgsst_core.trainer_scenes import write_gsplat, write_nerfstudio
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -1038,6 +1040,29 @@ def test_convert_writes_what_it_reads(files: Files, capsys: pytest.CaptureFixtur
     assert (one.format, other.format) == (name, "ply")
     for field in TENSORS:
         assert torch.equal(getattr(one.scene, field), getattr(other.scene, field)), field
+
+
+@pytest.mark.parametrize("write", [write_gsplat, write_nerfstudio])
+def test_convert_reads_checkpoints_of_trainers(files: Files, capsys: pytest.CaptureFixture[str], write: Any) -> None:
+    checkpoint = write(files.ply.with_name("checkpoint.pt"), wall(sh_degree=1))
+    arguments = ["convert", str(checkpoint), str(files.out), "--cameras", str(files.cameras)]
+    assert main([*arguments, "--render-mode", "antialiased", "--compare"]) == 0
+    assert "renders identical to checkpoint.pt" in capsys.readouterr().out
+    written = read_scene(files.out).scene
+    assert written.rendering.antialiased
+    for field in TENSORS:
+        assert torch.equal(getattr(written, field), getattr(wall(sh_degree=1), field)), field
+    assert main(["convert", str(files.ply.with_name("checkpoint.pt")), str(files.out.with_name("a.pt"))]) == 2
+
+
+def test_convert_says_what_it_changes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    ply = PlyData.read(files.ply, mmap=False)
+    ply["vertex"]["opacity"][:3] = np.inf
+    ply["vertex"]["x"][3] = np.nan
+    ply.write(files.ply)
+    assert main(["convert", str(files.ply), str(files.out), "--drop-invalid"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 invalid ones dropped, 3 infinite opacities read as almost 0 or 1" in said
 
 
 def test_convert_writes_an_unpacked_sog(files: Files, capsys: pytest.CaptureFixture[str]) -> None:

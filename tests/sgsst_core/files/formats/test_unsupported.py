@@ -23,7 +23,7 @@ OBJ = b"# Blender\nmtllib cube.mtl\no Cube\n" + b"".join(b"v %d 0 1.5\n" % i for
         (b"g empty", "mesh.obj", "is an OBJ mesh"),
         (b'\n{"scenes": [], "asset": {"version": "2.0"}}', "scene", "Save it as one GLB"),
         (b'{"scenes": []}', "scene.gltf", "Save it as one GLB"),
-        (b"\x80\x02}q\x00.", "model.pth", "is a checkpoint.*ns-export"),
+        (b"\x80\x02}q\x00.", "model.pth", "is a checkpoint.*sgsst convert model.pth scene.ply.*ns-export"),
     ],
 )
 def test_error_names_the_file_type(tmp_path: Path, data: bytes, name: str, message: str) -> None:
@@ -61,7 +61,10 @@ def test_text_is_not_taken_for_an_obj_file(tmp_path: Path) -> None:
             ["config.yml", "nerfstudio_models/step-000029999.ckpt"],
             "`ns-export gaussian-splat --load-config {}/config.yml --output-dir exports`",
         ),
-        (["ckpts/ckpt_29999_rank0.pt"], "Run it again with --save-ply"),
+        (
+            ["ckpts/ckpt_6999_rank0.pt", "ckpts/ckpt_29999_rank0.pt", "ckpts/ckpt_29999_rank1.pt"],
+            "`sgsst convert {}/ckpts/ckpt_29999_rank0.pt scene.ply`",
+        ),
         ([], "is a folder. Give the file of a scene"),
     ],
 )
