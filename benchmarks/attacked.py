@@ -27,7 +27,7 @@ class Attacked:
         urls: Addresses of its API processes.
         files: Input files of all jobs by role.
         parameters: Parameters of all jobs.
-        accepted: Parameters of the accepted jobs in which they differ, by id.
+        accepted: Parameters in which each accepted job differs from the others, by job id.
         resent: Number of requests that were sent again.
     """
 

@@ -82,7 +82,7 @@ class Carrier(threading.Thread):
         self._ended = threading.Event()
 
     def add(self, source: int, way: Way, target: int) -> None:
-        """Start to forward packets from the device with descriptor `source` to the one with descriptor `target`."""
+        """Start forwarding packets from the device with descriptor `source` to the one with descriptor `target`."""
         with self._lock:
             self._selector.register(source, selectors.EVENT_READ, (way, target))
 

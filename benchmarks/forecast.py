@@ -445,7 +445,7 @@ def step_seconds(
         shares: Assumed fractions of the peak rates.
         device: GPU.
         precision: Precision of the feature network.
-        launches: Kernels of a step, and those of them in the CUDA graph of its loss, which one launch starts.
+        launches: Number of kernels of a step, and how many of them the CUDA graph of the loss starts in one launch.
     """
     rates, (kernels, in_graph) = shares.rates(device, precision), launches
     seconds = {name: part.visits * sum(w.seconds(rates) for w in part.works) for name, part in parts.items()}

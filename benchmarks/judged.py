@@ -22,7 +22,7 @@ UNSTYLIZED = "unstylized"
 
 
 def judged(judge: Judge, sh_dc: Tensor) -> dict[str, float]:
-    """Return the judgment of colors [N, 3] and, if installed, their DISTS, without measures that no view allows."""
+    """Return the judgment of colors [N, 3], with DISTS if installed, and without measures that have no value."""
     judgment, dists = judge.judge(sh_dc), load_dists_or_none()
     assert judgment is not None, "no view can be judged: give more cameras, or larger views"
     measures = {**asdict(judgment), "dists": judge.dists(dists, sh_dc) if dists else None}

@@ -87,14 +87,14 @@ def restore(settings: ServiceSettings, folder: Path) -> None:
     store = Store(settings)
     if inspect(store.database.engine).has_table(JobRow.__tablename__):
         raise BackupError("The database has jobs' tables already. Restore into an empty one.")
-    places = _places(settings)
+    stores = _stores(settings)
     restored = 0
-    for name, place in places.items():
+    for name, objects in stores.items():
         kept = ObjectStore(f"file://{(folder / 'files' / name).absolute()}")
-        place.make_bucket()
-        restored += _copy(kept, place)
+        objects.make_bucket()
+        restored += _copy(kept, objects)
     _load(store, folder)
-    missing = _missing(store, places)
+    missing = _missing(store, stores)
     store.close()
     print(f"restored the database and {restored} files; {len(missing)} files are missing")
     for name in missing:
@@ -107,7 +107,7 @@ def _checkpoints(store: Store) -> set[str]:
         return set(session.scalars(select(ArtifactRow.location).where(ArtifactRow.name == CHECKPOINT)))
 
 
-def _places(settings: ServiceSettings) -> dict[str, ObjectStore]:
+def _stores(settings: ServiceSettings) -> dict[str, ObjectStore]:
     """Return the file stores by the names of their folders in a backup."""
     store = ObjectStore(settings.artifacts_url)
     if not store.local:
@@ -118,9 +118,9 @@ def _places(settings: ServiceSettings) -> dict[str, ObjectStore]:
 
 def _copy_all(settings: ServiceSettings, files: Path) -> int:
     copied = 0
-    for name, place in _places(settings).items():
+    for name, objects in _stores(settings).items():
         (files / name).mkdir(parents=True, exist_ok=True)
-        copied += _copy(place, ObjectStore(f"file://{(files / name).absolute()}"))
+        copied += _copy(objects, ObjectStore(f"file://{(files / name).absolute()}"))
     return copied
 
 
@@ -183,9 +183,9 @@ def _run(program: str, *words: str, url: URL) -> None:
         raise BackupError(f"{program} is missing: it comes with PostgreSQL's client.") from error
 
 
-def _missing(store: Store, places: dict[str, ObjectStore]) -> list[str]:
+def _missing(store: Store, stores: dict[str, ObjectStore]) -> list[str]:
     """Return the missing files that database rows refer to, except checkpoints, whose rows are deleted instead."""
-    there = {name: set(place.below("")) for name, place in places.items()}
+    there = {name: set(objects.below("")) for name, objects in stores.items()}
     remote = "blobs" not in there
     blobs = {name.removeprefix(f"{BLOBS}/") for name in there["store"]} if remote else there["blobs"]
     missing = []

@@ -48,7 +48,7 @@ class Result:
         after: Loss of the last round of views; empty if the job was interrupted.
         loss_over_time: Summary for the report (`loss_over_time`); None if no step was made on all scales.
         report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
-        packed: Measured loss of quality in the compressed file; None if no compressed file was requested.
+        compressed: Measured loss of quality in the compressed file; None if no compressed file was requested.
         weights: Weights of the scales in `before` and `after`.
     """
 
@@ -59,7 +59,7 @@ class Result:
     after: Evaluation
     loss_over_time: dict[str, Any] | None = None
     report_error: str | None = None
-    packed: CompressionLoss | None = None
+    compressed: CompressionLoss | None = None
     weights: ScaleWeights = EVEN
 
     @property
@@ -198,7 +198,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.job.collectives.rank == 0
     stylizer.job.collectives.broadcast(lambda: _write_ply(job))
-    packed = stylizer.job.collectives.broadcast(lambda: _write_packed(job))
+    compressed = stylizer.job.collectives.broadcast(lambda: _write_compressed(job))
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
     measure.at_the_end()
@@ -207,7 +207,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     # A run that ends before its first step has no round of views.
     round_length, weights = stylizer.job.round_length, stylizer.job.loss.weights
     after = round_evaluation(stylizer.history, round_length, weights) if stylizer.history else measure.evaluate()
-    error = _write_reports(job, stopped, before, after, packed) if first else None
+    error = _write_reports(job, stopped, before, after, compressed) if first else None
     over_time = loss_over_time(stylizer, before)
     problem = str(error) if error else None
     return Result(
@@ -218,7 +218,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
         after,
         over_time,
         problem,
-        packed,
+        compressed,
         weights,
     )
 
@@ -241,9 +241,9 @@ def _has_rows_of_file(job: Job) -> bool:
     return job.scene_file.retained is None and job.scene_file.copies is None
 
 
-def _write_packed(job: Job) -> CompressionLoss | None:
+def _write_compressed(job: Job) -> CompressionLoss | None:
     """Write the stylized scene in a compressed format beside the PLY, and measure the loss of quality."""
-    path, format, stylizer = job.outputs.packed, job.outputs.packed_format, job.stylizer
+    path, format, stylizer = job.outputs.compressed, job.outputs.compressed_format, job.stylizer
     if path is None or format is None:
         return None
     scene = replace(stylizer.job.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
@@ -255,7 +255,7 @@ def _write_packed(job: Job) -> CompressionLoss | None:
 
 
 def _write_reports(
-    job: Job, stopped: Stopped, before: Evaluation, after: Evaluation, packed: CompressionLoss | None
+    job: Job, stopped: Stopped, before: Evaluation, after: Evaluation, compressed: CompressionLoss | None
 ) -> Exception | None:
     """Write the reports beside the PLY. Return an error instead of raising it, because the PLY is already written."""
     stylizer, outputs = job.stylizer, job.outputs
@@ -267,7 +267,7 @@ def _write_reports(
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
         sent = sent_json(stylizer.history)
-        report["packed"] = packed and packed.as_dict()
+        report["compressed"] = compressed and compressed.as_dict()
         report["workers"] = {**job.workers, "bytes_sent": sent, "seconds_lost": round(lost, 3)}
         write_json(outputs.report, report)
         write_contact_sheet(outputs.sheet, stylizer)

@@ -72,11 +72,11 @@ class Outputs:
 
     Attributes:
         ply: Stylized scene.
-        packed: Stylized scene in another format, which the suffix of its name determines; None if not requested.
+        compressed: Stylized scene in another format, which the suffix of its name determines; None if not requested.
     """
 
     ply: Path
-    packed: Path | None = None
+    compressed: Path | None = None
 
     @staticmethod
     def of(out: Path) -> Outputs:
@@ -91,9 +91,9 @@ class Outputs:
         return Outputs(out.with_name(out.name[: -len(format.suffix)] + PLY.suffix), out)
 
     @property
-    def packed_format(self) -> SceneFormat | None:
+    def compressed_format(self) -> SceneFormat | None:
         """Return the format of the compressed file; None if there is none."""
-        return None if self.packed is None else format_of_name(self.packed.name)
+        return None if self.compressed is None else format_of_name(self.compressed.name)
 
     def _beside(self, suffix: str) -> Path:
         return self.ply.with_name(self.ply.stem + suffix)
@@ -148,7 +148,7 @@ class Outputs:
         """Return the paths of all output files except the older checkpoint, which is only created by renaming."""
         paths = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
         paths += [self.colors, self.video]
-        return paths if self.packed is None else [*paths, self.packed]
+        return paths if self.compressed is None else [*paths, self.compressed]
 
     @property
     def checkpoints(self) -> Checkpoints:
@@ -214,7 +214,7 @@ def check_request(request: StylizeRequest) -> Outputs:
     if out.is_dir():
         raise OutputError(f"{out}: is a folder. Give the PLY file to write, such as {out / 'stylized.ply'}.")
     outputs = Outputs.of(out)
-    for path in (outputs.ply, outputs.packed):
+    for path in (outputs.ply, outputs.compressed):
         if path is not None:
             check_is_not_scene(path, request.source.scene, "" if path == out else f" (the PLY beside {out.name})")
     check_folder(out.parent)

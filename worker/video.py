@@ -97,7 +97,7 @@ def render_video(
         request: Request that `check_video_request` accepts.
         progress: Callback that receives the numbers of completed and of all frames.
         warn: Callback for warnings about scene and cameras.
-        in_place: Whether to write to the file itself, which exists, because no other can be created beside it.
+        in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
 
     Raises:
         InvalidInputError: If an input cannot be used, or the video cannot be written.

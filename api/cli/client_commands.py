@@ -357,7 +357,7 @@ def _print_compression_loss(client: Client, job_id: str, format: ExtraName | Non
 
 
 def _format_of(out: Path) -> ExtraName | None:
-    """Return the compressed format that the ending of a file name stands for; None for any other name."""
+    """Return the compressed format of a file name, by its suffix; None if it has no such suffix."""
     format = format_of_name(out.name)
     return format.name if format in EXTRA_FORMATS else None
 

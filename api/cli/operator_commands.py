@@ -86,7 +86,7 @@ def fsck(
 
 
 def _check_database_exists(data: Path | None) -> None:
-    """Raise a SettingsError if the folder has no SQLite database: opening one would create it, without findings."""
+    """Raise a SettingsError if the folder has no SQLite database, because opening it would create an empty one."""
     from sqlalchemy.engine import make_url
 
     from sgsst_core.errors import SettingsError

@@ -193,7 +193,7 @@ class Converted:
     """Result of a conversion.
 
     Attributes:
-        scene: Text about the scene, and what of it was not read, or not as stored.
+        scene: Text about the scene, with contents that were not read, or not read as stored.
         decisions: Lines about the scene's axes and the cameras.
         loss: Difference of the written scene; None if it was not measured.
     """

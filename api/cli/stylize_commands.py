@@ -193,9 +193,9 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
     for line in _loss_over_time(result):
         print_field("loss over time", line)
     paths = [("stylized scene", outputs.ply)]
-    if outputs.packed is not None and result.packed is not None:
-        print_field("compressed", result.packed.text("the PLY"))
-        paths.append(("compressed scene", outputs.packed))
+    if outputs.compressed is not None and result.compressed is not None:
+        print_field("compressed", result.compressed.text("the PLY"))
+        paths.append(("compressed scene", outputs.compressed))
     paths += [("views", outputs.views)] if outputs.views.exists() else []
     if result.report_error is None:
         paths += [("before and after", outputs.sheet), ("loss curves", outputs.curves), ("report", outputs.page)]

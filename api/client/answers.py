@@ -34,7 +34,7 @@ class ApiError(SgsstError):
 
 
 class RequestError(ApiError, InvalidInputError):
-    """A request that is itself at fault: its files, parameters, key or id."""
+    """Request that the service refused because of its files, parameters, key or id."""
 
     code = "api-request"
 

@@ -89,7 +89,7 @@ class Client:
         self._stack.close()
 
     def _stop(self) -> None:
-        """Stop the portal. An interrupt while a call started can have left its coroutine running; it is canceled."""
+        """Stop the portal, and cancel coroutines that interrupted calls left running."""
         self._portal.call(self._portal.stop, True)
 
     def _run(self, function: Callable[[], Awaitable[T]]) -> T:

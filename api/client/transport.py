@@ -119,7 +119,7 @@ class Transport:
         await self._retry(once, reading=True)
 
     def gives_up(self, error: Exception) -> bool:
-        """Return whether an error of a read says that there is no service, rather than that it restarts."""
+        """Return whether a read error means that there is no service, rather than that it is restarting."""
         return isinstance(error, httpx.ConnectError) and not self.reached
 
     async def _retry(self, once: Callable[[], Awaitable[T]], *, reading: bool = False) -> T:

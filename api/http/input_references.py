@@ -20,7 +20,7 @@ def parse_reference(text: str) -> tuple[str, str] | None:
 
 
 def input_entry(job: JobRow, name: str) -> dict[str, Any] | None:
-    """Return a job's entry for an input such as "scene" or "style:1"; None if it has none, or none any more."""
+    """Return a job's entry for an input such as "scene" or "style:1"; None if it is missing or was released."""
     match = _INPUT.fullmatch(name)
     if match is None or job.status == JobStatus.EXPIRED:
         return None

@@ -100,7 +100,7 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
 
 
 def _filled_modules() -> dict[str, tuple[bytes, object]]:
-    """Return the placeholder and its JSON value for each module that shows a table of the server."""
+    """Return the placeholder in each module that contains a table of the server, with the table as JSON."""
     formats = [
         {
             "name": each.name,

@@ -118,7 +118,7 @@ def run(sizes: Sizes, findings: Findings) -> None:
 
 
 def report(launches: Launches, prefix: str, findings: Findings, rounds: int) -> None:
-    """Add a row for each kernel, those that take the longest first."""
+    """Add a row for each kernel, slowest first."""
     for name, kernel in sorted(launches.kernels.items(), key=lambda item: -sum(item[1].seconds)):
         if kernel.seconds:
             total = sum(kernel.seconds)

@@ -185,7 +185,7 @@ def _pixels(cameras: Sequence[Camera]) -> int:
 
 
 def _refinement_note(settings: Settings) -> str:
-    """Return the note for an error message that a number of Gaussians includes refinement; empty without refinement."""
+    """Return a note that a reported number of Gaussians includes refinement; empty without refinement."""
     return f" once it is refined to at most {settings.refine:g} times as many" if settings.refine > 1 else ""
 
 

@@ -53,10 +53,10 @@ class Operations:
         self._database = database
         self._lease_seconds = lease_seconds
 
-    def record_heartbeat(self, name: str, places: int, free: int) -> None:
+    def record_heartbeat(self, name: str, slots: int, free: int) -> None:
         """Record a dispatcher's heartbeat with its total and free capacity."""
         now = self._database.clock()
-        values = {"seen_at": now, "places": places, "free": free}
+        values = {"seen_at": now, "slots": slots, "free": free}
         with self._database.writing() as session:
             insert = upsert(session)(DispatcherRow).values(name=name, **values)
             session.execute(insert.on_conflict_do_update(index_elements=["name"], set_=values))

@@ -103,7 +103,8 @@ class DispatcherRow(Base):
 
     name: Mapped[str] = mapped_column(String(120), primary_key=True)
     seen_at: Mapped[float] = mapped_column(Float)
-    places: Mapped[int] = mapped_column(Integer)
+    # The column keeps its first name: without it, dispatchers of earlier versions stop during a rolling upgrade.
+    slots: Mapped[int] = mapped_column("places", Integer, key="slots")
     free: Mapped[int] = mapped_column(Integer)
 
 
@@ -187,7 +188,7 @@ class BlobRow(Base):
 
 
 class BlobUseRow(Base):
-    """Holder of a blob: `job:ID` or `upload:ID`."""
+    """Reference to a blob from its holder, `job:ID` or `upload:ID`."""
 
     __tablename__ = "blob_uses"
 

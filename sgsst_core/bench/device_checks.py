@@ -1,4 +1,4 @@
-"""Checks of a device by known results: errors against float64, repeated bits, and memory that holds NaN."""
+"""Checks of a device: errors against float64, bit-identical repetitions, and memory that holds NaN."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def _weights() -> Finding:
 
 
 def _caches() -> Iterator[Finding]:
-    """Yield a finding for each folder that cannot be written, or one if all can."""
+    """Yield a finding for each folder that cannot be written; if all can be, a single finding."""
     from sgsst_core.compiled import kernel_folders
     from sgsst_core.errors import OutputError
     from sgsst_core.files.atomic import ensure_writable_folder
@@ -190,7 +190,7 @@ def _rasterizer(*, gpu: bool) -> tuple[str, Finding]:
 
 
 def _results(rasterizer: str, device: torch.device) -> Iterator[Finding]:
-    """Yield a finding for each wrong result, or one if all are right."""
+    """Yield a finding for each wrong result; if all are right, a single finding."""
     import torch
 
     from sgsst_core.bench.device_checks import CheckSizes, check_device

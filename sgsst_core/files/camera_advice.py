@@ -1,4 +1,4 @@
-"""Detection of camera files that cannot be read, to name the way to one that can."""
+"""Errors for camera files in known but unsupported formats, which say how to convert them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _BY_SUFFIX = {".xml": _METASHAPE, ".csv": _REALITY_CAPTURE, ".out": _BUNDLER, ".
 
 
 def advice_for_name(name: str) -> str:
-    """Return a sentence about a file whose name has the suffix of a known format, after a blank; else nothing."""
+    """Return advice for the suffix of a known format, with a leading space; empty for other suffixes."""
     advice = _BY_SUFFIX.get(PurePosixPath(name).suffix.lower())
     return "" if advice is None else f" It may be {advice}."
 
@@ -61,7 +61,7 @@ def refuse_file(path: Path) -> None:
     """Raise an error if the start of a file shows that it is in a known format that cannot be read.
 
     Raises:
-        CameraError: If so; it names the way out.
+        CameraError: If so; the message says how to convert the data.
         OSError: If the file cannot be read.
     """
     with path.open("rb") as file:
@@ -77,7 +77,7 @@ def refuse_json(path: Path, content: Any) -> None:
     """Raise an error if the content of a JSON file is in a known format that cannot be read.
 
     Raises:
-        CameraError: If so; it names the way out.
+        CameraError: If so; the message says how to convert the data.
     """
     first = content[0] if isinstance(content, list) and content else content
     if not isinstance(first, dict):
@@ -97,7 +97,7 @@ def refuse_folder(folder: Path) -> None:
     """Raise an error if a folder holds data in a known format that cannot be read.
 
     Raises:
-        CameraError: If so; it names the way out.
+        CameraError: If so; the message says how to convert the data.
     """
     for pattern, advice in (
         ("keyframes/*cameras", _POLYCAM),

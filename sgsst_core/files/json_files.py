@@ -1,4 +1,4 @@
-"""Atomic writing of JSON files, and numbers in JSON of others."""
+"""Atomic writing of JSON files, and validation of numbers in JSON from other programs."""
 
 from __future__ import annotations
 

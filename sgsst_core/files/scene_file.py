@@ -70,7 +70,7 @@ class SceneFile:
         stamp: Size in bytes and modification time in ns of the file when it was read.
         format: Name of the file's format.
         clamped: Number of infinite opacities that were replaced by finite ones. The stylized PLY keeps them.
-        notes: Notes on what of the file is not read, or read in another way than stored.
+        notes: Notes on contents of the file that are not read, or not read as stored.
         tag: Render mode that the file states. `scene.rendering` is another one if it was requested.
         copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
         sh_attenuation: SH attenuation that the scene has, but not the file.

@@ -171,7 +171,7 @@ def _scaled(network_weights: BackboneWeights, image: Tensor, side: int) -> dict[
 
 
 def _cells(coverage: Tensor | None, side: int) -> Callable[[str], Tensor | None]:
-    """Return a function that averages position weights [H, W] over the cells of a layer, with pixels of a side."""
+    """Return a function that averages position weights [H, W] over a layer's cells of side x side scaled pixels."""
 
     def of(layer: str) -> Tensor | None:
         if coverage is None:

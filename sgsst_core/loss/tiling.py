@@ -147,7 +147,7 @@ class Divider:
     def divide_view(
         self, size: Size, scales: Sequence[int], coverage: Sequence[Tensor] | None, region: Rectangle | None
     ) -> Division:
-        """Divide the work on some scales of a view of which each rank renders a part.
+        """Divide the work on some scales of a view if each rank renders only a part of it.
 
         The parts do not depend on the scales. If the finest computed scale is among them, each rank's piece of it is
         the part that the rank renders.

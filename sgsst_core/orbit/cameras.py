@@ -291,7 +291,7 @@ def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor
 
 
 def _shape(half: tuple[float, float]) -> float:
-    """Return the nearest permitted aspect ratio (width over height) for something with these half extents."""
+    """Return the permitted aspect ratio (width over height) that is nearest to that of the half extents."""
     steps = round(math.log(half[0] / half[1]) / math.log(_STEP))
     return float(_STEP ** max(-_MOST_STEPS, min(_MOST_STEPS, steps)))
 

@@ -114,7 +114,7 @@ def about_views(probe: Probe) -> list[Decision]:
 def position_weights(survey: Survey, settings: Settings) -> tuple[bool, list[Decision]]:
     """Choose whether statistics are weighted by coverage."""
     asked = settings.position_weights
-    if asked == "off" or (asked == "auto" and survey.uncovered_share <= _UNCOVERED):
+    if asked == "off" or (asked == "auto" and survey.uncovered_fraction <= _UNCOVERED):
         return False, []
     line = Decision("position weights", "statistics are weighted by coverage", _uncovered(survey), error=ANOTHER_LOSS)
     return True, [line]
@@ -136,12 +136,12 @@ def about_uncovered_pixels(model: CostModel, probe: Probe) -> list[Decision]:
 
 
 def _uncovered(survey: Survey) -> str:
-    return f"{survey.uncovered_share:.1%} of the views' pixels are uncovered"
+    return f"{survey.uncovered_fraction:.1%} of the views' pixels are uncovered"
 
 
 def is_scan(survey: Survey, *, weighted: bool) -> bool:
-    """Return whether views show an object without background, and statistics are weighted by coverage (`weighted`)."""
-    return weighted and survey.uncovered_share > _SCAN
+    """Return whether a job has an object scan: coverage weights its statistics, and many pixels are uncovered."""
+    return weighted and survey.uncovered_fraction > _SCAN
 
 
 def training_background(settings: Settings, *, scan: bool) -> PlannedBackground:
@@ -219,7 +219,7 @@ def computed_scales(sizes: Sequence[Size], settings: Settings) -> list[int]:
 
 
 def steps_coarse(scales: Sequence[int], settings: Settings) -> tuple[int, list[Decision]]:
-    """Choose the number of steps of phase 1. `scales` are the numbers of scales with a weight, of all views."""
+    """Choose the number of steps of phase 1, given the number of scales with a weight of each view."""
     if not settings.steps_coarse or max(scales) > 1 or settings.preset == "paper":
         return settings.steps_coarse, []
     reason = "there is only one scale, so it would be the same as phase 2"
@@ -230,7 +230,7 @@ def steps_coarse(scales: Sequence[int], settings: Settings) -> tuple[int, list[D
 
 
 def about_scales(counts: Sequence[int], settings: Settings) -> list[Decision]:
-    """Return the lines about scales and their weights. `counts` are the numbers of scales of the job's views."""
+    """Return the lines about scales and their weights, given the number of scales of each view."""
     scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
     reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
     lines = [Decision("scales", scales, reason)]

@@ -101,7 +101,7 @@ def common_device(collectives: Collectives) -> Device:
 
 
 def gpu_problems(collectives: Collectives) -> dict[str, str]:
-    """Return the reason, by name, why each GPU rasterizer that was tried does not work on some rank.
+    """Return the problem of each GPU rasterizer that does not work on some rank, by the rasterizer's name.
 
     Rasterizers are tried in order of preference, until one works.
     """

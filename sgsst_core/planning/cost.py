@@ -874,7 +874,7 @@ def view_memory(plan: Plan, memory: int) -> int:
 
 
 def is_approximated(plan: Plan) -> bool:
-    """Return whether the gradient of a job is compared with the float32 reference when it is measured."""
+    """Return whether measurements compare the gradient of a job with the float32 reference."""
     return plan.precision != "float32" or plan.cached_weights == "half"
 
 

@@ -118,7 +118,7 @@ def _style_count(style: Style | None, regions: Regions | None) -> int:
 
 
 def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> list[Decision]:
-    """Return the lines about what was not used of style images, and about the mixture of several."""
+    """Return the lines about unused parts of style images, and about the mixture of several images."""
     own = [region.style for region in regions.every if region.style] if regions else []
     lines = [Decision("style", "warning", note) for each in (style, *own) for note in each.notes]
     if len(style.images) == 1:

@@ -81,7 +81,7 @@ class Survey:
         total_blend_weights: [N] float64, blend weights of each Gaussian summed over all pixels of all views.
         covered: Indices of the views that see anything.
         regions: Rectangle of each view that contains all covered pixels.
-        uncovered_share: Fraction of uncovered pixels in the views that see anything.
+        uncovered_fraction: Fraction of uncovered pixels in the views that see anything.
         shown: Mean number of Gaussians visible in such a view; None if it was not counted.
         uncovered: Fraction of uncovered pixels of each view, 1 if nothing is seen; None if not recorded per view.
     """
@@ -89,7 +89,7 @@ class Survey:
     total_blend_weights: Tensor
     covered: list[int]
     regions: list[Rectangle]
-    uncovered_share: float
+    uncovered_fraction: float
     shown: float | None = None
     uncovered: list[float] | None = None
 
@@ -140,12 +140,14 @@ def survey_views(
     if not covered:
         raise nothing_seen(len(cameras))
     weights = collectives.all_reduce(weights.to(rasterizer.device)).cpu()
-    uncovered_share = sum(views[index].uncovered for index in covered) / sum(views[index].pixels for index in covered)
+    uncovered_fraction = sum(views[index].uncovered for index in covered) / sum(
+        views[index].pixels for index in covered
+    )
     regions = [views[index].region for index in range(len(cameras))]
     shown = sum(views[index].shown for index in covered) / len(covered)
     ordered = [views[index] for index in range(len(cameras))]
     uncovered = [view.uncovered / view.pixels if view.covered else 1.0 for view in ordered]
-    return Survey(weights, covered, regions, uncovered_share, shown, uncovered)
+    return Survey(weights, covered, regions, uncovered_fraction, shown, uncovered)
 
 
 def _survey_view(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _ViewSurvey:

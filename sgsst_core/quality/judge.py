@@ -144,7 +144,7 @@ class Judge:
     def dists(self, network: Dists, sh_dc: Tensor) -> float | None:
         """Return the mean DISTS of colors `sh_dc` [N, 3] against the unstylized scene; None if there are no views.
 
-        It is 0 for identical images. Only covered pixels count. `dists.may_judge` says which jobs it is fair to.
+        It is 0 for identical images. Only covered pixels count. Use it only for jobs that `dists.may_judge` accepts.
         """
         sh_dc, distances = sh_dc.detach().to(self._rasterizer.device), []
         for camera in self.cameras:

@@ -78,7 +78,7 @@ class Refinement:
         psnr: PSNR in dB of unstylized renders of the refined scene against the original one, over all compared views;
             None if nothing was split.
         lowest_psnr: PSNR of the worst of these views.
-        taken_back: Number of Gaussians that were left whole because splitting them would have changed the image too
+        reverted: Number of Gaussians that were left whole because splitting them would have changed the image too
             much.
         sh_dc: [M, 3] float32, colors of the refined scene, fitted to renders of the original scene. None if children
             have their parents' colors.
@@ -90,7 +90,7 @@ class Refinement:
     size: float | None = None
     psnr: float | None = None
     lowest_psnr: float | None = None
-    taken_back: int = 0
+    reverted: int = 0
     sh_dc: Tensor | None = None
 
     def of(self, scene: Scene) -> Scene:

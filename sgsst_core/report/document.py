@@ -141,7 +141,7 @@ def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
         "cameras": _cameras_json(stylizer, sources),
         "position_weights": {
             "used": stylizer.job.view_targets.weighted,
-            "uncovered_share": round(stylizer.job.plan.survey.uncovered_share, 6),
+            "uncovered_fraction": round(stylizer.job.plan.survey.uncovered_fraction, 6),
         },
     }
 
@@ -187,7 +187,7 @@ def _refined_json(plan: Plan) -> dict[str, Any] | None:
         "gaussians_before": len(refinement.pieces),
         "gaussians": refinement.gaussians,
         "split": refinement.split,
-        "taken_back": refinement.taken_back,
+        "reverted": refinement.reverted,
         "size": refinement.size,
         "psnr": refinement.psnr,
         "lowest_psnr": refinement.lowest_psnr,

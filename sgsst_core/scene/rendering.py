@@ -1,4 +1,4 @@
-"""Render mode of a scene: how Gaussians are drawn that are smaller than a pixel.
+"""Render mode of a scene: how Gaussians that are smaller than a pixel are drawn.
 
 PyTorch is not imported, because the API process and the command line's help read this module.
 """

@@ -151,7 +151,7 @@ class _Refining:
         counts = piece_counts(pieces)
         parents = int((counts > 1).sum())
         if change is None:
-            return replace(nothing, taken_back=chosen)
+            return replace(nothing, reverted=chosen)
         return Refinement(
             pieces, parents, int(counts.sum()), size, change.psnr, change.lowest, chosen - parents, change.sh_dc
         )

@@ -145,7 +145,7 @@ class Views:
         return view_colors_gradient(gradient, colors, clamp_aware_gradient=self.clamp_aware_gradient)
 
     def cache_weights(self, index: int) -> None:
-        """Cache the blend weights of this rank's rectangle of a view, if the rasterizer can and they fit."""
+        """Cache the blend weights of this rank's rectangle of a view, if the rasterizer supports it and they fit."""
         camera = self._own_camera(index)
         if camera is not None:
             self.rasterizer.cache_weights(camera)

@@ -411,7 +411,7 @@ def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path
             process.environ()["MKL_NUM_THREADS"] for process in service.processes("service.scheduling.attempt_process")
         ]
         assert set(threads) == {str(max(1, (os.cpu_count() or 1) // 2))}
-        wait_for(lambda: "sgsst_places_free 0.0" in client.get("/metrics").text, "no place to be free", service.said)
+        wait_for(lambda: "sgsst_slots_free 0.0" in client.get("/metrics").text, "no place to be free", service.said)
         ready = client.get("/readyz").json()
         assert (ready["status"], ready["checks"]["dispatchers"]) == ("ok", "1")
         for job_id in jobs:

@@ -280,7 +280,7 @@ def _referred_input(
         jobs: Jobs that were read for other references, to which this one is added.
 
     Raises:
-        UnknownInputError: If there is no such input, or no longer.
+        UnknownInputError: If the input does not exist, or was released.
     """
     try:
         job = jobs.setdefault(job_id, jobs.get(job_id) or find(context, caller, job_id))

@@ -1,4 +1,4 @@
-"""`/v1/jobs/{id}/shares`: links to a result. `/v1/shared/{token}`: what somebody with such a link can read."""
+"""`/v1/jobs/{id}/shares`: links to a result. `/v1/shared/{token}`: the result, for readers with such a link."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def _black_views(scale: str) -> Situation:
 
 
 def _pixels(situation: Situation, factor: float | None = None) -> Situation:
-    """Return the same job with pixel colors as a further feature layer, at a given factor or the usual one."""
+    """Return the same job with pixel colors as an additional feature layer; None for the default factor."""
     weights = even_network()
     scales = weights.scales if factor is None else weights.scales | {PIXELS: factor}
     return replace(situation, weights=replace(weights, scales=scales))

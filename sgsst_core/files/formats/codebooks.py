@@ -101,7 +101,7 @@ def palette(rows: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], 
 
 
 def _distinct_rows(rows: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32] | None, NDArray[np.int64]]:
-    """Return distinct rows and the index of each row's, or None and zeros if there are more than `size`."""
+    """Return the distinct rows and each row's index among them; None and zeros if there are more than `size`."""
     none = None, np.zeros(len(rows), np.int64)
     keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).reshape(-1)
     if len(np.unique(keys[: 2 * size])) > size:

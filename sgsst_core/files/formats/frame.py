@@ -70,7 +70,7 @@ class Frame:
             block["sh_rest"][:] = np.einsum("ij,njc->nic", harmonics, rest)
 
     def _quaternion(self) -> NDArray[np.float64]:
-        """Return the matrix [4, 4] that multiplies a quaternion (wxyz) by that of the rotation, from the left."""
+        """Return the matrix [4, 4] of left multiplication by the rotation's quaternion, for quaternions wxyz."""
         from scipy.spatial.transform import Rotation  # the API process, which only reads headers, needs no SciPy
 
         x, y, z, w = Rotation.from_matrix(self.rotation).as_quat()

@@ -98,7 +98,7 @@ class PlyHeader:
 
     @property
     def vertex(self) -> PlyElement:
-        """Return the element of the Gaussians; raise ValueError if there is none."""
+        """Return the element that holds the Gaussians; raise ValueError if there is none."""
         return self.elements[self.names.index("vertex")]
 
 

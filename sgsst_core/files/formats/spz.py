@@ -454,7 +454,7 @@ def _first_three(data: NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
-    """Decode rotations of version 3 and later: components with a sign and 9 bits, in the order xyzw."""
+    """Decode rotations of version 3 and later: a sign bit and 9 bits of magnitude per component, in the order xyzw."""
     packed = data.view("<u4")
     three = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1)
     values = np.where(three & 512, -1.0, 1.0) * (three & 511) / 511 * np.sqrt(0.5)

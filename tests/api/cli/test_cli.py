@@ -190,8 +190,8 @@ def test_stylize_reads_and_writes_compressed_scenes(
     assert torch.equal(ply.scene.means, source.means)
     assert not torch.equal(ply.scene.sh_dc, source.sh_dc)
     report = json.loads(files.out.with_name("wall.report.json").read_text())
-    assert (report["packed"]["name"], report["packed"]["bytes"]) == (files.out.name, files.out.stat().st_size)
-    assert report["packed"]["psnr_db"] > 35
+    assert (report["compressed"]["name"], report["compressed"]["bytes"]) == (files.out.name, files.out.stat().st_size)
+    assert report["compressed"]["psnr_db"] > 35
     for command in ("render", "check"):
         options = ["--out", str(files.out.parent / "renders")] if command == "render" else []
         assert main([command, str(files.out), "--cameras", str(files.cameras), *options]) == 0

@@ -57,7 +57,7 @@ def test_controls_take_effect_and_are_reported(tmp_path: Path, capsys: pytest.Ca
     assert report["settings"]["scales"] == [1, 0, 0.5]
     assert report["settings"]["sh_attenuation"] == 0.25
     assert report["scene"]["sh_degree"] == 1
-    assert (report["packed"]["name"], report["packed"]["bytes"]) == (out.name, out.stat().st_size)
+    assert (report["compressed"]["name"], report["compressed"]["bytes"]) == (out.name, out.stat().st_size)
     loss = report["loss"]["after"]
     assert sorted(loss["scales"]) == ["0", "2"]
     assert loss["total"] == pytest.approx((loss["scales"]["0"]["total"] + 0.5 * loss["scales"]["2"]["total"]) / 1.5)

@@ -759,7 +759,7 @@ def test_readiness_reports_dispatchers(service: Service, client: httpx.Client) -
     answer = client.get("/readyz")
     assert (answer.json()["status"], answer.json()["checks"]["dispatchers"]) == ("ok", "1")
     metrics = client.get("/metrics").text.splitlines()
-    assert {"sgsst_dispatchers 1.0", "sgsst_places 8.0", "sgsst_places_free 3.0"} <= set(metrics)
+    assert {"sgsst_dispatchers 1.0", "sgsst_slots 8.0", "sgsst_slots_free 3.0"} <= set(metrics)
     store.operations.remove_dispatcher("one")
     assert client.get("/readyz").json()["status"] == "waiting"
     assert "sgsst_dispatchers 0.0" in client.get("/metrics").text

@@ -67,7 +67,7 @@ def leased(store: Store, dispatcher: str) -> Lease:
 def test_running_dispatcher_is_registered(settings: ServiceSettings, store: Store) -> None:
     with at_work(settings, store) as dispatcher:
         dispatchers = wait_for(store.operations.dispatchers, "the dispatcher to be known")
-        assert [(row.name, row.places, row.free) for row in dispatchers] == [(dispatcher.name, 2, 2)]
+        assert [(row.name, row.slots, row.free) for row in dispatchers] == [(dispatcher.name, 2, 2)]
     assert store.operations.dispatchers() == []
 
 

@@ -297,7 +297,7 @@ def test_dispatchers_are_alive_while_they_send_heartbeats(store: Store, clock: C
     clock.now += LEASE / 2
     operations.record_heartbeat("two", 4, 0)
     operations.record_heartbeat("one", 8, 3)
-    assert [(row.name, row.places, row.free) for row in operations.dispatchers()] == [("one", 8, 3), ("two", 4, 0)]
+    assert [(row.name, row.slots, row.free) for row in operations.dispatchers()] == [("one", 8, 3), ("two", 4, 0)]
     operations.remove_dispatcher("one")
     assert [row.name for row in operations.dispatchers()] == ["two"]
     clock.now += LEASE + 1

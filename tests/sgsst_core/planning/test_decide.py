@@ -123,7 +123,7 @@ def test_blind_views_are_skipped() -> None:
     [(0.3, "auto", True), (0.001, "auto", False), (0.3, "off", False), (0.0, "on", True)],
 )
 def test_position_weights_are_for_views_with_an_empty_background(uncovered: float, wanted: str, weighted: bool) -> None:
-    plan = plan_of(probe(uncovered_share=uncovered), position_weights=wanted)
+    plan = plan_of(probe(uncovered_fraction=uncovered), position_weights=wanted)
     assert plan.weighted is weighted
     assert (line(plan, "position weights") is not None) is weighted
 
@@ -146,7 +146,7 @@ def test_position_weights_are_for_views_with_an_empty_background(uncovered: floa
 def test_training_background_and_start_follow_coverage_and_settings(
     uncovered: float, values: dict[str, Any], training_background: str, warm: bool
 ) -> None:
-    plan = plan_of(probe(uncovered_share=uncovered), **values)
+    plan = plan_of(probe(uncovered_fraction=uncovered), **values)
     assert (plan.training_background, plan.warm_start) == (training_background, warm)
     behind, start = line(plan, "training_background"), line(plan, "start")
     assert (behind is not None, start is not None) == (training_background != "background", warm)
@@ -160,7 +160,7 @@ def test_training_background_and_start_follow_coverage_and_settings(
 def test_random_background_costs_a_content_pass_and_disables_early_stop() -> None:
     """Content features are recomputed for the new background at every visit, from cached images if they fit."""
     drawn, fixed = (
-        plan_of(probe(uncovered_share=0.5), training_background=kind, early_stop=True)
+        plan_of(probe(uncovered_fraction=0.5), training_background=kind, early_stop=True)
         for kind in ("random", "background")
     )
     assert drawn.prediction is not None
@@ -170,16 +170,16 @@ def test_random_background_costs_a_content_pass_and_disables_early_stop() -> Non
     assert drawn.prediction.first_visit < fixed.prediction.first_visit
     assert "0.6 s per step" in text_of(drawn, "training_background")
     assert text_of(drawn, "early stop").startswith("none: all steps are run: losses on different backgrounds")
-    without = plan_of(probe(uncovered_share=0.5), training_background="random", content_weight=0.0)
+    without = plan_of(probe(uncovered_fraction=0.5), training_background="random", content_weight=0.0)
     assert "per step" not in text_of(without, "training_background")
-    uncached = plan_of(probe(uncovered_share=0.5), training_background="random", keep=("content",))
+    uncached = plan_of(probe(uncovered_fraction=0.5), training_background="random", keep=("content",))
     assert uncached.prediction is not None
     assert uncached.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # also a render of the content
     assert drawn.prediction.first_visit - uncached.prediction.first_visit == pytest.approx(0.15)
 
 
 def test_uncovered_pixels_skip_the_network() -> None:
-    scan = probe(uncovered_share=0.5, regions=[Rectangle(160, 160, 320, 320)] * VIEWS)
+    scan = probe(uncovered_fraction=0.5, regions=[Rectangle(160, 160, 320, 320)] * VIEWS)
     plan, everything = plan_of(scan), plan_of(scan, keep=("uncovered",))
     assert "of the pixels skip the network: 50.0% of" in text_of(plan, "uncovered pixels")
     assert line(everything, "uncovered pixels") is None
@@ -606,7 +606,7 @@ def test_computed_data_count_as_gpu_memory() -> None:
 
 
 def test_same_probe_gives_the_same_plan() -> None:
-    one, other = (plan_of(probe(uncovered_share=0.2, ranks=3, link=Link(1e9, 1e-4))) for _ in range(2))
+    one, other = (plan_of(probe(uncovered_fraction=0.2, ranks=3, link=Link(1e9, 1e-4))) for _ in range(2))
     for field in dataclasses.fields(Plan):
         values = [getattr(plan, field.name) for plan in (one, other)]
         if field.name == "survey":
@@ -631,7 +631,7 @@ def test_decisions_have_a_fixed_order() -> None:
     measurements = probe(
         covered=[0, 1, 2],
         used_degree=0,
-        uncovered_share=0.5,
+        uncovered_fraction=0.5,
         regions=[Rectangle(160, 160, 320, 320)] * VIEWS,
         ranks=2,
         link=Link(1e9, 1e-4),

@@ -118,15 +118,15 @@ def test_faint_uniform_or_close_gaussians_are_not_candidates() -> None:
     assert not candidates(prints, splittable, torch.zeros(5), torch.zeros(5)).any(), "no gradient asks for anything"
 
 
-@pytest.mark.parametrize("taken_back", [0, 7])
-def test_plan_line_states_splits_and_their_image_error(taken_back: int) -> None:
+@pytest.mark.parametrize("reverted", [0, 7])
+def test_plan_line_states_splits_and_their_image_error(reverted: int) -> None:
     pieces = torch.ones(1000, 3, dtype=torch.uint8)
     pieces[:10, 0] = 5
-    refinement = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, taken_back)
+    refinement = Refinement(pieces, 10, 1040, 6.5, 43.21, 41.09, reverted)
     line = refine_decision(refinement, make_settings(refine=4))
     assert line.decision == "10 are split, which turns 1,000 Gaussians into 1,040"
     assert "6.5 pixels" in line.reason
-    assert ("7 are not split" in line.reason) == bool(taken_back)
+    assert ("7 are not split" in line.reason) == bool(reverted)
     assert "43.2 dB" in line.error
     assert "41.1 dB" in line.error
     none = refine_decision(Refinement(torch.ones(9, 3, dtype=torch.uint8), 0, 9), make_settings(refine=4))

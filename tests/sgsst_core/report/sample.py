@@ -42,7 +42,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
             "names": ["a", "b", "c", "d", "e"],
             "seeing_nothing": ["e"],
         },
-        "position_weights": {"used": True, "uncovered_share": 0.25},
+        "position_weights": {"used": True, "uncovered_fraction": 0.25},
         "plan": {
             "decisions": [_decision(index) for index in range(3)],
             "prediction": {"seconds": 2.0, "peak_bytes": 3_000_000_000},

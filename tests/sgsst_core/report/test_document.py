@@ -70,7 +70,7 @@ def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluati
     assert report["cameras"]["sizes"] == [[64, 48]]
     assert report["cameras"]["seeing_nothing"] == ["blind"]
     assert report["position_weights"]["used"] is True
-    assert 0.3 < report["position_weights"]["uncovered_share"] < 1
+    assert 0.3 < report["position_weights"]["uncovered_fraction"] < 1
     assert len(report["backbone"]["sha256"]) == 64
     assert report["settings"] == stylizer.job.settings.model_dump(mode="json")
     assert report["memory"]["peak_bytes"] > 50_000_000

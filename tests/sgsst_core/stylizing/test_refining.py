@@ -103,7 +103,7 @@ def test_refinement_is_deterministic(tiny_weights: BackboneWeights) -> None:
 def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights) -> None:
     small = replace(wall(), scales=torch.full_like(wall().scales, -5.0))
     refinement = refinement_of(tiny_weights, 8.0, small)
-    assert (refinement.split, refinement.gaussians, refinement.taken_back) == (0, len(small), 0)
+    assert (refinement.split, refinement.gaussians, refinement.reverted) == (0, len(small), 0)
     assert refinement.psnr is None
     assert refined(small, refinement) is small
 
@@ -115,12 +115,12 @@ def test_splits_that_would_change_the_image_are_undone(
     monkeypatch.setattr(refining, "LEAST_PSNR", 200.0)
     refinement = refinement_of(tiny_weights, 4.0)
     assert refinement.split == 0
-    assert refinement.taken_back > 0
+    assert refinement.reverted > 0
     assert "are not split" in choice.refine_decision(refinement, settings(refine=4)).reason
     monkeypatch.setattr(refining, "LEAST_PSNR", 0.0)
     loose = refinement_of(tiny_weights, 4.0)
-    assert loose.taken_back == 0
-    assert loose.split == refinement.taken_back
+    assert loose.reverted == 0
+    assert loose.split == refinement.reverted
 
 
 def test_factor_of_one_turns_refinement_off(tiny_weights: BackboneWeights) -> None:

@@ -303,7 +303,7 @@ def test_position_weights_are_for_views_with_an_empty_background(
 ) -> None:
     stylizer = make(tiny_weights, thing(), preset=preset, **values)
     assert stylizer.job.view_targets.weighted is weighted
-    uncovered = stylizer.job.plan.survey.uncovered_share
+    uncovered = stylizer.job.plan.survey.uncovered_fraction
     assert uncovered > 0.3 if thing is ball else uncovered < 0.01
     assert (stylizer.job.view_targets.target(0, [0]).coverage is not None) is weighted
 

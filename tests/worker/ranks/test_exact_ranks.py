@@ -71,7 +71,7 @@ def gradient(
     loss.divider.speeds = speeds or loss.divider.speeds
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     survey = survey_views(scene, [camera], rasterizer)
-    weighted = survey.uncovered_share > 0.01
+    weighted = survey.uncovered_fraction > 0.01
     style_images = Style.of(synthetic_image(90, 110, seed=4, dtype=dtype))
     regions = regions and regions.resolved(survey.total_blend_weights)
     styles = JobStyles.prepared(style_images, regions, make_settings(), scene.sh_dc, survey.total_blend_weights)
