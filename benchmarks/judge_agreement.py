@@ -76,8 +76,8 @@ def agreement(pairs: Sequence[Sequence[Run]], first: str, second: str) -> tuple[
     return total / count if count else float("nan"), count
 
 
-def _cell(found: tuple[float, int]) -> str:
-    correlation, count = found
+def _cell(cell: tuple[float, int]) -> str:
+    correlation, count = cell
     return f"{correlation:.2f} ({count})" if count else "-"
 
 

@@ -165,8 +165,8 @@ class Trial:
         command = [sys.executable, "-m", "api.cli", "submit", str(self._files["scene"]), "--json"]
         command += ["--style", str(self._files["style"]), "--cameras", str(self._files["cameras"])]
         command += ["--parameters", json.dumps(self._parameters), "--out", str(out), "--url", self._service.url]
-        said = _run(command)
-        self._job = json.loads(said.splitlines()[-1])["job"]
+        output = _run(command)
+        self._job = json.loads(output.splitlines()[-1])["job"]
         return {**self._job_seconds(), "result_mb": round(out.stat().st_size / 1e6, 1)}
 
     def curl(self) -> dict[str, Any]:

@@ -92,9 +92,9 @@ def scene_in(folder: Path) -> Path:
         SystemExit: If there is none.
     """
     for pattern in SCENES:
-        found = sorted(folder.glob(pattern), key=lambda path: (len(str(path)), str(path)))
-        if found:
-            return found[-1]
+        matches = sorted(folder.glob(pattern), key=lambda path: (len(str(path)), str(path)))
+        if matches:
+            return matches[-1]
     raise SystemExit(f"{folder}: holds no {' and no '.join(SCENES)}. Name the folder of a trained scene.")
 
 

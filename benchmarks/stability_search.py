@@ -42,7 +42,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.only is not None:
-        _tell(arguments.only)
+        _report(arguments.only)
         return
     ended, failures = search(arguments.seconds, arguments.first)
     print(f"{sum(ended.values())} jobs: " + ", ".join(f"{count} {how}" for how, count in ended.most_common()))
@@ -194,7 +194,7 @@ def _settings(rng: random.Random) -> dict[str, Any]:
     return values
 
 
-def _tell(number: int) -> None:
+def _report(number: int) -> None:
     """Run one job, and print its description and outcome."""
     situation = drawn(number)
     scene = situation.scene

@@ -90,9 +90,9 @@ def restore(settings: ServiceSettings, folder: Path) -> None:
     stores = _stores(settings)
     restored = 0
     for name, objects in stores.items():
-        kept = ObjectStore(f"file://{(folder / 'files' / name).absolute()}")
+        backup = ObjectStore(f"file://{(folder / 'files' / name).absolute()}")
         objects.make_bucket()
-        restored += _copy(kept, objects)
+        restored += _copy(backup, objects)
     _load(store, folder)
     missing = _missing(store, stores)
     store.close()

@@ -165,10 +165,10 @@ class FileCheck:
         def forget() -> str:
             used = exists().where(BlobUseRow.sha256 == row.sha256)
             with self._database.writing() as session:
-                gone = session.execute(
+                deleted = session.execute(
                     delete(BlobRow).where(BlobRow.sha256 == row.sha256, BlobRow.location == row.location, ~used)
                 )
-                return "its row is deleted" if gone.rowcount else "it comes back when it is sent again"  # type: ignore[attr-defined]
+                return "its row is deleted" if deleted.rowcount else "it comes back when it is sent again"  # type: ignore[attr-defined]
 
         return _File(
             "input", self._objects, name, lambda: self._objects.fault(name, row.sha256), is_current, forget, holders

@@ -118,21 +118,21 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
     If neither request nor file state them, they are those under which the cameras see the scene. Without cameras, or if
     both see it, they stay open. Nothing is raised: `read_scene` and `read_capture` report unusable files.
     """
-    asked = source.spz_axes
-    if source.cameras is None or asked != "auto":
-        return asked, []
+    requested = source.spz_axes
+    if source.cameras is None or requested != "auto":
+        return requested, []
     try:
         header = read_scene_header(source.scene)
         if not isinstance(header, SpzHeader) or header.extended or header.stated_axes is not None:
-            return asked, []
+            return requested, []
         cameras = read_cameras(source.cameras, images)
         means = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene.means
     except (SceneError, CameraError):
-        return asked, []
+        return requested, []
     rdf = shown_by(means, cameras, source.near).typical
     rub = shown_by(means * means.new_tensor([1, -1, -1]), cameras, source.near).typical
     if rub <= _CLEARLY_MORE * rdf:
-        return asked, []
+        return requested, []
     reason = f"a typical view has {rub:.1%} of the Gaussians in its frame so, and {rdf:.1%} with rdf; see --spz-axes"
     return "rub", [Decision("axes", "the scene is rotated by 180 degrees about x (rub: y up, z backward)", reason)]
 

@@ -217,9 +217,9 @@ class Fleet:
         row, _ = self.store.jobs.create(new, limit=10**9)
         self.records[row.id] = Record(job)
         self._waiting += 1
-        self._at(self._soon(), self._somebody_looks)
+        self._at(self._soon(), self._schedule_polls)
 
-    def _somebody_looks(self) -> None:
+    def _schedule_polls(self) -> None:
         """Schedule polls of all hosts with free GPUs, in random order."""
         hosts = [host for host in self.hosts if host.free and host.reserved_for is None]
         self._chance.shuffle(hosts)
@@ -341,7 +341,7 @@ class Fleet:
         self.store.leases.expire(host.selector.dispatcher)
         self.store.operations.remove_dispatcher(host.selector.dispatcher)
         self._waiting += self.store.leases.waiting() - held
-        self._at(self._soon(), self._somebody_looks)
+        self._at(self._soon(), self._schedule_polls)
 
     def _repair(self, host: Host) -> None:
         host.up, host.reserved_for = True, None

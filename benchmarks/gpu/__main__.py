@@ -105,15 +105,15 @@ def in_a_process(part: str, budget: float) -> dict[str, Any]:
             process = subprocess.Popen([*command, "--findings", path], stderr=stderr, start_new_session=True)
             try:
                 status = process.wait(budget)
-                said = {} if status == 0 else {"reason": f"status {status}: {errors.read_text()[-4000:]}"}
+                problem = {} if status == 0 else {"reason": f"status {status}: {errors.read_text()[-4000:]}"}
             except subprocess.TimeoutExpired:
-                said = {"reason": f"its {budget:.0f} seconds were up"}
+                problem = {"reason": f"its {budget:.0f} seconds were up"}
             finally:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
         findings = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    ended = {"status": "failed", **said} if said else findings.pop("_ended")
+    ended = {"status": "failed", **problem} if problem else findings.pop("_ended")
     return {**ended, "seconds": round(time.perf_counter() - started, 1), "findings": findings}
 
 

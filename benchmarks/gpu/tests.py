@@ -34,7 +34,7 @@ def run(sizes: Sizes, findings: Findings) -> None:
             raise RuntimeError(f"pytest ended with status {ended.returncode}:\n{ended.stdout[-2000:]}{ended.stderr}")
         outcomes = [outcome(case) for case in ElementTree.parse(path).iter("testcase")]
     for kind in ("passed", "failed", "skipped"):
-        own = [(name, said) for name, what, said in outcomes if what == kind]
+        own = [(name, reason) for name, what, reason in outcomes if what == kind]
         findings.add(kind, len(own) if kind == "passed" else dict(own))
     unexplained = ended.returncode not in _FINE and not any(what != "passed" for _, what, _ in outcomes)
     findings.check("tests_that_failed", float(sum(what == "failed" for _, what, _ in outcomes) + unexplained), 0.0)
@@ -55,6 +55,6 @@ def outcome(case: Any) -> tuple[str, str, str]:
     if problem.tag == "skipped":
         return name, "skipped", problem.get("message", "")
     if any(part in text for part in _MISSING):
-        said = [line.strip() for line in text.splitlines() if any(part in line for part in _MISSING)]
-        return name, "skipped", said[-1]
+        lines = [line.strip() for line in text.splitlines() if any(part in line for part in _MISSING)]
+        return name, "skipped", lines[-1]
     return name, "failed", text[-2000:]

@@ -177,12 +177,12 @@ def photo_size(camera: Camera) -> tuple[int, int]:
 def _fitting(path: Path, camera: Camera) -> Photo:
     """Return the photo in the orientation that fits the camera."""
     stored, orientation = stored_size(path)
-    turned = (stored[1], stored[0]) if orientation >= 5 else stored
+    rotated = (stored[1], stored[0]) if orientation >= 5 else stored
     if fits(stored, camera):
-        return Photo(path, stored, ambiguous=orientation != 1 and fits(turned, camera))
-    if not fits(turned, camera):
+        return Photo(path, stored, ambiguous=orientation != 1 and fits(rotated, camera))
+    if not fits(rotated, camera):
         raise _misfit(path, stored, camera)
-    return Photo(path, turned, oriented=True)
+    return Photo(path, rotated, oriented=True)
 
 
 def _misfit(path: Path, size: tuple[int, int], camera: Camera) -> ImageError:

@@ -68,8 +68,8 @@ def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: 
         SettingsError: If a scale with a positive weight exists in no view, or a view has no scale with a positive
             weight.
     """
-    asked = ScaleWeights(tuple(weights))
-    if not asked.values:
+    requested = ScaleWeights(tuple(weights))
+    if not requested.values:
         return
     counts = {camera.name: scale_count(camera.height, camera.width, coarsest) for camera in cameras}
     most, last = max(counts.values()), max(scale for scale, weight in enumerate(weights) if weight > 0)
@@ -80,7 +80,7 @@ def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: 
             "larger views or a smaller --coarsest-side."
         )
     for name, count in counts.items():
-        if not asked.chosen(count):
+        if not requested.chosen(count):
             raise SettingsError(
                 f"--scales leaves view {name!r} nothing: it has {count} of the views' {most} scales, and none of them "
                 "has a weight. Give one of them a weight, or views of one size."

@@ -96,7 +96,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
         SettingsError: If an option is out of range; see `cameras.orbit`.
     """
     subject = find_subject(scene)
-    up = find_up(subject) if request.up is None else _asked_up(request.up)
+    up = find_up(subject) if request.up is None else _requested_up(request.up)
     first = ELEVATION if request.elevation is None else request.elevation
     rings = request.count // _LEAST_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
     tried = [first]
@@ -173,7 +173,7 @@ def _doubts(orbit: Orbit) -> list[Decision]:
     return warnings
 
 
-def _asked_up(direction: tuple[float, float, float]) -> Up:
+def _requested_up(direction: tuple[float, float, float]) -> Up:
     axis = torch.tensor(direction, dtype=torch.float64)
     return Up(axis / axis.norm().clamp_min(1e-300), "requested")
 

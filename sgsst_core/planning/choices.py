@@ -113,8 +113,8 @@ def about_views(probe: Probe) -> list[Decision]:
 
 def position_weights(survey: Survey, settings: Settings) -> tuple[bool, list[Decision]]:
     """Choose whether statistics are weighted by coverage."""
-    asked = settings.position_weights
-    if asked == "off" or (asked == "auto" and survey.uncovered_fraction <= _UNCOVERED):
+    requested = settings.position_weights
+    if requested == "off" or (requested == "auto" and survey.uncovered_fraction <= _UNCOVERED):
         return False, []
     line = Decision("position weights", "statistics are weighted by coverage", _uncovered(survey), error=ANOTHER_LOSS)
     return True, [line]
@@ -323,31 +323,31 @@ def about_network(model: CostModel, probe: Probe, settings: Settings) -> list[De
     return [*lines, Decision("second forward", none, f"they fit in {memory}", seconds=saved)]
 
 
-def precision_of(asked: Precision, ratio: float | None) -> Precision:
+def precision_of(requested: Precision, ratio: float | None) -> Precision:
     """Return the precision of the network: the requested one if it is faster than float32, else float32.
 
     Processors without bfloat16 instructions compute it hundreds of times more slowly than float32.
 
     Args:
-        asked: Requested precision.
+        requested: Requested precision.
         ratio: Ratio of a convolution's time in float32 to that in the requested precision; None if float32 was
             requested, or the requested one is unavailable.
     """
-    return asked if ratio is not None and ratio > 1 else "float32"
+    return requested if ratio is not None and ratio > 1 else "float32"
 
 
 def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decision]]:
     """Choose the network's precision. The plan has no line about it if float32 was requested."""
-    asked, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
-    chosen = precision_of(asked, ratio)
-    if asked == "float32":
+    requested, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
+    chosen = precision_of(requested, ratio)
+    if requested == "float32":
         return chosen, []
     if ratio is None:
-        needed = "an NVIDIA GPU" if asked == "tf32" else "a CPU, an AMD GPU, or an NVIDIA GPU"
-        reason = f"{asked} was requested, but needs {needed} of compute capability 8.0 or higher"
+        needed = "an NVIDIA GPU" if requested == "tf32" else "a CPU, an AMD GPU, or an NVIDIA GPU"
+        reason = f"{requested} was requested, but needs {needed} of compute capability 8.0 or higher"
         return chosen, [Decision("precision", "features in float32", reason)]
     if chosen == "float32":
-        reason = f"{asked} was requested, but takes {1 / ratio:.1f} times as long as float32 on this processor"
+        reason = f"{requested} was requested, but takes {1 / ratio:.1f} times as long as float32 on this processor"
         return chosen, [Decision("precision", "features in float32", reason)]
     known = "the error of the colors is measured during the run"
     if error is not None:
@@ -355,7 +355,7 @@ def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decisio
             f"the first view's pixel gradient has a relative error of {error.relative_error:.2g} (cosine "
             f"{error.cosine:.5f}); {known}"
         )
-    what = {"bfloat16": "features in bfloat16", "tf32": "convolutions in TF32"}[asked]
+    what = {"bfloat16": "features in bfloat16", "tf32": "convolutions in TF32"}[requested]
     return chosen, [Decision("precision", what, f"requested, {ratio:.1f} times faster here", error=known)]
 
 

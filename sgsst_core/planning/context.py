@@ -131,7 +131,7 @@ def make_network(weights: BackboneWeights, settings: Settings, precision: Precis
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
 
-def precision_ratio(asked: Precision, device: Device, collectives: Collectives) -> float | None:
+def precision_ratio(requested: Precision, device: Device, collectives: Collectives) -> float | None:
     """Return how many times faster a convolution is in the requested precision than in float32.
 
     All ranks must call this.
@@ -139,12 +139,12 @@ def precision_ratio(asked: Precision, device: Device, collectives: Collectives) 
     Returns:
         Ratio measured on the first rank. None if float32 was requested, or some rank lacks the requested precision.
     """
-    if asked == "float32":
+    if requested == "float32":
         return None
-    supported = has_tf32(device) if asked == "tf32" else has_bfloat16(device)
+    supported = has_tf32(device) if requested == "tf32" else has_bfloat16(device)
     if not all(collectives.all_gather(supported)):
         return None
-    return collectives.broadcast(lambda: convolution_ratio(asked, device))
+    return collectives.broadcast(lambda: convolution_ratio(requested, device))
 
 
 def convolution_ratio(precision: Precision, device: Device) -> float:

@@ -131,19 +131,19 @@ def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> 
     return [*lines, Decision("styles", f"a mixture: {style.text}", reason, error=ANOTHER_LOSS)]
 
 
-def _about_regions(asked: Regions, resolved: Regions, plan: Plan, cameras: Sequence[Camera]) -> list[Decision]:
+def _about_regions(regions: Regions, resolved: Regions, plan: Plan, cameras: Sequence[Camera]) -> list[Decision]:
     """Return the lines about the regions and the cost of their maps.
 
     Args:
-        asked: Regions as requested.
+        regions: Regions as requested.
         resolved: Regions after `Regions.resolved`.
         plan: Plan under construction.
         cameras: Cameras of all views.
     """
     weights = plan.survey.total_blend_weights
     lines = []
-    for index, region in enumerate(asked.every):
-        requested, members = int(asked.members(index).sum()), resolved.members(index)
+    for index, region in enumerate(regions.every):
+        requested, members = int(regions.members(index).sum()), resolved.members(index)
         reason = region.select or "not in any other region"
         lost = region.selected - requested
         if lost > 0:

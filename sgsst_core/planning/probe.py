@@ -302,7 +302,7 @@ def _raster_cost(context: PlanningContext, cameras: Sequence[Camera]) -> RasterC
         }
     if not rasterizer.can_cache:
         return RasterCost(mean, **known)
-    if not rasterizer.on_gpu and _comes_too_seldom(settings, len(cameras)):
+    if not rasterizer.on_gpu and _is_too_rare(settings, len(cameras)):
         counted = rasterizer.count_weights(sample[middle])
         total, half = (counted.nbytes(format_) * len(cameras) for format_ in _FORMATS)
         return RasterCost(mean, None, total, half, **known)
@@ -326,7 +326,7 @@ def _central_tile(camera: Camera) -> Camera:
     return camera.cropped(top, left, min(top + RASTER_TILE, camera.height), min(left + RASTER_TILE, camera.width))
 
 
-def _comes_too_seldom(settings: Settings, views: int) -> bool:
+def _is_too_rare(settings: Settings, views: int) -> bool:
     """Return whether views are visited too few times for caching to pay off on a CPU, and it was not requested."""
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / views
     return settings.cached_weights == "auto" and visits < LEAST_VISITS

@@ -100,9 +100,9 @@ def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, magn
         cancels: [N], portion of the gradient that cancels, summed over all views; see `disagreement`.
         magnitude: [N], total of the gradient's magnitude, summed over all views; see `disagreement`.
     """
-    asked = cancels > _LEAST_DISAGREEMENT * magnitude
+    disagree = cancels > _LEAST_DISAGREEMENT * magnitude
     large = footprints.weights >= _LEAST_WEIGHT
-    return splittable & asked & large & (footprints.reach <= _LARGEST_REACH)
+    return splittable & disagree & large & (footprints.reach <= _LARGEST_REACH)
 
 
 def most_children(weights: Tensor) -> Tensor:

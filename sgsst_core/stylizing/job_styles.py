@@ -55,12 +55,12 @@ class JobStyles:
         """
         if regions is None:
             return JobStyles(prepared_style(style, settings, sh_dc, weights))
-        asked = [regions.every[index].style or style for index in regions.active]
+        by_region = [regions.every[index].style or style for index in regions.active]
         if not regions.mapped:
-            return JobStyles(prepared_style(asked[0], settings, sh_dc, weights), regions)
+            return JobStyles(prepared_style(by_region[0], settings, sh_dc, weights), regions)
         each = [
             prepared_style(own, settings, sh_dc, torch.where(regions.members(index), weights, 0.0))
-            for index, own in zip(regions.active, asked, strict=True)
+            for index, own in zip(regions.active, by_region, strict=True)
         ]
         rest = each[regions.active.index(0)] if 0 in regions.active else prepared_style(style, settings, sh_dc, weights)
         return JobStyles(rest, regions, tuple(each))

@@ -121,7 +121,7 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
         callbacks.preview(stylizer)
     _measure(stylizer, callbacks)  # a resumed job may have been stopped before this measurement
     while stylizer.step < stylizer.job.total_steps:
-        reason = stylizer.job.collectives.broadcast(lambda: _asked_to_end(stylizer, callbacks)) or _enough(stylizer)
+        reason = stylizer.job.collectives.broadcast(lambda: _end_requested(stylizer, callbacks)) or _enough(stylizer)
         if reason:
             return _end_early(stylizer, callbacks, reason)
         _step(stylizer, pace)
@@ -139,7 +139,7 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
     return "finished"
 
 
-def _asked_to_end(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
+def _end_requested(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
     """Return the reason if the user or the time limit ends the run before the next step. Ranks may disagree."""
     if callbacks.stop and callbacks.stop():
         return "interrupted"

@@ -314,10 +314,10 @@ def test_job_that_is_finished_early_keeps_its_colors(service: Service, files: di
         job_id, cut = (submit(client, files, steps_sos=1_000_000) for _ in range(2))
         wait_for_step(service, client, job_id, 5)
         assert client.post(f"/v1/jobs/{job_id}/finish").json()["status"] == "finishing"
-        found = wait_until(service, client, job_id, "succeeded", "failed")
-        assert found["result"]["stopped"] == "on-request"
-        assert found["result"]["loss_after"] < found["result"]["loss_before"]
-        steps = found["result"]["steps"]
+        final = wait_until(service, client, job_id, "succeeded", "failed")
+        assert final["result"]["stopped"] == "on-request"
+        assert final["result"]["loss_after"] < final["result"]["loss_before"]
+        steps = final["result"]["steps"]
         assert 5 <= steps < 1_000_000
         report = client.get(f"/v1/jobs/{job_id}/artifacts/report.json").json()
         assert report["stopped"] == "on-request"
@@ -332,9 +332,9 @@ def test_job_that_is_finished_early_keeps_its_colors(service: Service, files: di
         running.suspend()
         client.post(f"/v1/jobs/{cut}/finish")
         running.kill()
-        found = wait_until(service, client, cut, "succeeded", "failed")
-        assert [attempt["outcome"] for attempt in found["attempts"]] == ["failed", "succeeded"]
-        assert found["result"]["stopped"] == "on-request"
+        final = wait_until(service, client, cut, "succeeded", "failed")
+        assert [attempt["outcome"] for attempt in final["attempts"]] == ["failed", "succeeded"]
+        assert final["result"]["stopped"] == "on-request"
 
 
 def test_queued_job_is_canceled_immediately(service: Service, files: dict[str, Path]) -> None:

@@ -79,7 +79,7 @@ def test_live_colors_are_those_of_the_step(
     scene.means[:5] += 1000  # no view shows them
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
     missing: list[str] = []
-    colors, found = LiveColors(tmp_path / "live", missing.append), {}
+    colors, by_step = LiveColors(tmp_path / "live", missing.append), {}
 
     def preview(stylizer: Stylizer) -> None:
         colors(stylizer)
@@ -89,12 +89,12 @@ def test_live_colors_are_those_of_the_step(
         wanted = stylizer.job.scene.sh_dc.clone()
         wanted[seen] = stylizer.shown().cpu()
         assert not seen[:5].any()
-        found[stylizer.step] = np.fromfile(tmp_path / "live" / "colors.f16", "<f2").reshape(-1, 3)
-        np.testing.assert_array_equal(found[stylizer.step], wanted.numpy().astype("<f2"))
+        by_step[stylizer.step] = np.fromfile(tmp_path / "live" / "colors.f16", "<f2").reshape(-1, 3)
+        np.testing.assert_array_equal(by_step[stylizer.step], wanted.numpy().astype("<f2"))
 
     run(stylizer, Callbacks(preview=preview, preview_seconds=0))
-    assert found.keys() == {1, 2, 3}
-    assert not np.array_equal(found[1], found[2])
+    assert by_step.keys() == {1, 2, 3}
+    assert not np.array_equal(by_step[1], by_step[2])
     assert not missing
     assert [path.name for path in (tmp_path / "live").iterdir()] == ["colors.f16"]
 

@@ -147,10 +147,10 @@ async def create_job(
 
     async def plan(show: Show) -> PlanView:
         async with receipt:
-            found = await context.inspector.inspect(
+            findings = await context.inspector.inspect(
                 "plan", caller.owner, job_request.inputs, job_request.rows, job_request.parameters, show
             )
-        return PlanView(**found, workers=job_request.parameters.workers)
+        return PlanView(**findings, workers=job_request.parameters.workers)
 
     return await answer_work(request, plan, "planning", "plan")
 
@@ -252,19 +252,19 @@ def _resolve_inputs(
     ids = [text for _, _, text in received.uploads if is_id(text)]
     uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
     jobs: dict[str, JobRow] = {}
-    found: list[tuple[str, str]] = []
+    resolved: list[tuple[str, str]] = []
     for _, role, text in received.uploads:
         reference = parse_reference(text)
         if reference is not None:
             entry = _referred_input(context, caller, *reference, role, jobs)
-            found.append((entry["name"], entry["sha256"]))
+            resolved.append((entry["name"], entry["sha256"]))
             continue
         upload = uploads.get(text)
         if upload is None:
             raise UnknownUploadError(text, role)
-        found.append((upload.filename, _upload_digest(context, upload, role)))
-    rows = context.store.inputs.hold(sorted({sha256 for _, sha256 in found} | {entry["sha256"] for entry in inputs}))
-    for number, ((index, role, _), (filename, sha256)) in enumerate(zip(received.uploads, found, strict=True)):
+        resolved.append((upload.filename, _upload_digest(context, upload, role)))
+    rows = context.store.inputs.hold(sorted({sha256 for _, sha256 in resolved} | {entry["sha256"] for entry in inputs}))
+    for number, ((index, role, _), (filename, sha256)) in enumerate(zip(received.uploads, resolved, strict=True)):
         name = clean_name(role, filename, number)
         # Keep the order of the request: style weights follow the order of the styles.
         inputs.insert(index, {"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})

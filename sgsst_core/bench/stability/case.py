@@ -235,19 +235,19 @@ class DecisionsOf(FeatureNetwork):
         super().__init__(weights, other.layers, torch.float64)
         self.other = other
         self.flips = 0
-        self._heard: deque[list[Tensor]] = deque()
+        self._recorded: deque[list[Tensor]] = deque()
 
     @contextmanager
     def listening(self) -> Iterator[None]:
         """Record the other network's forward passes in this block; later passes of this network use their decisions."""
         forward = self.other.forward
 
-        def heard(rgb: Tensor, *, cache: bool = True) -> Activations:
+        def recorded(rgb: Tensor, *, cache: bool = True) -> Activations:
             activations = forward(rgb, cache=cache)
-            self._heard.append(list(activations.outputs))
+            self._recorded.append(list(activations.outputs))
             return activations
 
-        self.other.forward = heard  # type: ignore[method-assign]
+        self.other.forward = recorded  # type: ignore[method-assign]
         yield
         del self.other.forward
 
@@ -267,7 +267,7 @@ class DecisionsOf(FeatureNetwork):
     def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
         """Run `FeatureNetwork.forward`; store the decisions of the next recorded pass for `backward`."""
         own = super().forward(rgb, cache=cache)
-        theirs = Activations({}, self._heard.popleft())
+        theirs = Activations({}, self._recorded.popleft())
         for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
             self.flips += int((mine != other).sum())
         own.outputs = [output.double() for output in theirs.outputs]

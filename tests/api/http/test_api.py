@@ -631,8 +631,8 @@ def test_keys_cannot_access_each_others_jobs(service: Service, client: httpx.Cli
             refused(caller.post("/v1/jobs", json=stolen), 422, "unknown-upload")
         store.keys.revoke(mine.id)
         assert refused(me.get("/v1/jobs"), 401, "unauthorized")
-    with service.client("sgsst_wrong") as nobody:
-        assert nobody.get("/v1/jobs").headers["www-authenticate"] == "Bearer"
+    with service.client("sgsst_wrong") as stranger:
+        assert stranger.get("/v1/jobs").headers["www-authenticate"] == "Bearer"
     store.close()
 
 

@@ -81,7 +81,7 @@ def share(client: httpx.Client, job_id: str, **body: Any) -> tuple[dict[str, Any
     return view, view["url"].partition("/shared#")[2]
 
 
-def gone(answer: httpx.Response, code: str = "not-found") -> None:
+def assert_missing(answer: httpx.Response, code: str = "not-found") -> None:
     assert (answer.status_code, answer.json()["code"]) == (404, code), answer.text
     check_documented(answer)
 
@@ -114,7 +114,7 @@ def test_link_shows_the_result_and_nothing_else(
         assert "sandbox" in answer.headers["content-security-policy"]
     part = visitor.get(f"/v1/shared/{token}/stylized.ply", headers={"Range": "bytes=4-7"})
     assert (part.status_code, part.content) == (206, PLY[4:8])
-    gone(visitor.get(f"/v1/shared/{token}/cameras:1"), "no-shared-file")
+    assert_missing(visitor.get(f"/v1/shared/{token}/cameras:1"), "no-shared-file")
     page = visitor.get("/shared")
     assert page.headers["referrer-policy"] == "no-referrer"
     assert "default-src 'none'" in page.headers["content-security-policy"]
@@ -187,8 +187,8 @@ def test_wrong_tokens_open_nothing(
     secret = token.partition(".")[2]
     changed = ("A" if secret[0] != "A" else "B") + secret[1:]
     for wrong in (f"{view['id']}.{changed}", view["id"], f"{view['id']}.", f"{token}x", f"x{token}", secret, "x" * 100):
-        gone(visitor.get(f"/v1/shared/{wrong}"))
-        gone(visitor.get(f"/v1/shared/{wrong}/scene"))
+        assert_missing(visitor.get(f"/v1/shared/{wrong}"))
+        assert_missing(visitor.get(f"/v1/shared/{wrong}/scene"))
     assert visitor.get(f"/v1/shared/{'x' * 200}").status_code == 422
     assert visitor.get(f"/v1/shared/{token}").status_code == 200
 
@@ -200,16 +200,16 @@ def test_link_ends_when_it_expires_or_is_revoked(
     (first, one), (second, two), (_, three) = (share(me, job_id) for _ in range(3))
     with store.database.writing() as session:
         session.get_one(ShareRow, first["id"]).expires_at = store.database.clock() - 1
-    gone(visitor.get(f"/v1/shared/{one}"))
-    gone(visitor.get(f"/v1/shared/{one}/stylized.ply"))
+    assert_missing(visitor.get(f"/v1/shared/{one}"))
+    assert_missing(visitor.get(f"/v1/shared/{one}/stylized.ply"))
     assert visitor.get(f"/v1/shared/{two}").status_code == 200
     assert me.delete(f"/v1/jobs/{job_id}/shares/{second['id']}").status_code == 204
-    gone(visitor.get(f"/v1/shared/{two}"))
-    gone(me.delete(f"/v1/jobs/{job_id}/shares/{second['id']}"))
-    gone(me.delete(f"/v1/jobs/{job_id}/shares/x"))
+    assert_missing(visitor.get(f"/v1/shared/{two}"))
+    assert_missing(me.delete(f"/v1/jobs/{job_id}/shares/{second['id']}"))
+    assert_missing(me.delete(f"/v1/jobs/{job_id}/shares/x"))
     assert visitor.get(f"/v1/shared/{three}").status_code == 200
     assert me.delete(f"/v1/jobs/{job_id}").status_code == 204
-    gone(visitor.get(f"/v1/shared/{three}"))
+    assert_missing(visitor.get(f"/v1/shared/{three}"))
 
 
 def test_link_ends_with_the_key_of_its_job(
@@ -220,7 +220,7 @@ def test_link_ends_with_the_key_of_its_job(
         _, token = share(client, finished(client, service, store, files, tmp_path))
     assert visitor.get(f"/v1/shared/{token}").status_code == 200
     store.keys.revoke(key.id)
-    gone(visitor.get(f"/v1/shared/{token}"))
+    assert_missing(visitor.get(f"/v1/shared/{token}"))
 
 
 def test_only_results_of_ones_own_can_be_shared(
@@ -229,11 +229,11 @@ def test_only_results_of_ones_own_can_be_shared(
     job_id = finished(me, service, store, files, tmp_path)
     with service.client(store.keys.create("other")[1]) as other:
         for method in ("GET", "POST"):
-            gone(other.request(method, f"/v1/jobs/{job_id}/shares", json={}))
+            assert_missing(other.request(method, f"/v1/jobs/{job_id}/shares", json={}))
         view, _ = share(me, job_id)
-        gone(other.delete(f"/v1/jobs/{job_id}/shares/{view['id']}"))
+        assert_missing(other.delete(f"/v1/jobs/{job_id}/shares/{view['id']}"))
     own = finished(me, service, store, files, tmp_path)
-    gone(me.delete(f"/v1/jobs/{own}/shares/{view['id']}"))
+    assert_missing(me.delete(f"/v1/jobs/{own}/shares/{view['id']}"))
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     waiting = me.post("/v1/jobs", files=body).json()["id"]
     refused = me.post(f"/v1/jobs/{waiting}/shares", json={})
@@ -261,7 +261,7 @@ def test_stored_digest_is_no_token_and_logs_contain_none(
     with store.database.reading() as session:
         row = session.get_one(ShareRow, view["id"])
     assert token.partition(".")[2] not in (row.id, row.sha256)
-    gone(visitor.get(f"/v1/shared/{row.id}.{row.sha256[:43]}"))
+    assert_missing(visitor.get(f"/v1/shared/{row.id}.{row.sha256[:43]}"))
     assert visitor.get(f"/v1/shared/{token}/scene").status_code == 200
     assert visitor.get(f"/v1/shared/{token}/a/b").status_code == 404
     assert token.partition(".")[2] not in service.log.read_text()
@@ -287,8 +287,8 @@ def test_client_shares_results(
     key = store.keys.create("client")[1]
     with service.client(key) as raw, Client(service.url, key) as client:
         job_id = finished(raw, service, store, files, tmp_path)
-        made = client.share(job_id, days=2)
-        assert made["url"].startswith(f"{service.url}/shared#shr_")
-        assert [each["id"] for each in client.shares(job_id)] == [made["id"]]
-        client.revoke_share(job_id, made["id"])
+        created = client.share(job_id, days=2)
+        assert created["url"].startswith(f"{service.url}/shared#shr_")
+        assert [each["id"] for each in client.shares(job_id)] == [created["id"]]
+        client.revoke_share(job_id, created["id"])
         assert client.shares(job_id) == []

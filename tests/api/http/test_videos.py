@@ -64,9 +64,9 @@ def names(client: httpx.Client, job_id: str) -> list[str]:
 
 def test_job_makes_the_video_that_its_parameters_ask_for(service: Service, job: str) -> None:
     with service.client() as client:
-        made = frames(client, job)
-        assert (len(made), made[0].shape) == (6, (48, 64, 3))
-        assert made[0].std() > 5
+        images = frames(client, job)
+        assert (len(images), images[0].shape) == (6, (48, 64, 3))
+        assert images[0].std() > 5
         ranged = client.get(f"/v1/jobs/{job}/artifacts/video.mp4", headers={"Range": "bytes=4-7"})
         assert (ranged.status_code, ranged.content) == (206, b"ftyp")
 
@@ -80,9 +80,9 @@ def test_finished_job_makes_another_video_with_progress(service: Service, job: s
         assert rendering[-1].json()["fraction"] == 1
         assert last.event == "video", last.data
         assert last.json()["name"] == "video.mp4"
-        made = frames(client, job)
-        assert len(made) == 8
-        assert max(made[0].shape) == 100
+        images = frames(client, job)
+        assert len(images) == 8
+        assert max(images[0].shape) == 100
         assert names(client, job).count("video.mp4") == 1
         again = client.post(f"/v1/jobs/{job}/video", json={"seconds": 0.1})
         assert (again.status_code, again.json()["media_type"]) == (200, "video/mp4")

@@ -65,8 +65,8 @@ def test_blend_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path
       return found;
     }""".replace("WEIGHTS", json.dumps(all_weights))
     watched, camera = visit("/#/jobs"), views[0]
-    found = shown(watched, tmp_path, camera.name, (camera.width, camera.height), steps)
-    for weights, png in zip(all_weights, found, strict=True):
+    images = shown(watched, tmp_path, camera.name, (camera.width, camera.height), steps)
+    for weights, png in zip(all_weights, images, strict=True):
         save(tmp_path / "blend.ply", blend_scenes(files, weights))
         assert psnr(decoded(png), rendered(tmp_path / "blend.ply", camera)) >= FAITHFUL, weights
     watched.check()
@@ -81,8 +81,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(scope="module")
 def pair(service: Service, files: dict[str, Path]) -> list[str]:
     """Return the ids of two finished jobs of one scene."""
-    made = [submit(service, files, name=f"run {weight}", content_weight=weight, **QUICK) for weight in (1, 900)]
-    return [done(service, each) for each in made]
+    job_ids = [submit(service, files, name=f"run {weight}", content_weight=weight, **QUICK) for weight in (1, 900)]
+    return [done(service, each) for each in job_ids]
 
 
 def move(watched: Watched, label: str, percent: int) -> None:
@@ -106,12 +106,12 @@ def test_slider_shows_what_is_saved(visit: Visit, files: dict[str, Path], pair: 
     stylized = watched.pixels()
     move(watched, "Amount of style", 150)
     page.locator(".side.right", has_text="150% style").wait_for(state="attached")
-    found, path = watched.pixels(), saved(watched, tmp_path)
+    drawn, path = watched.pixels(), saved(watched, tmp_path)
     assert path.name == "run_1-stylized_1.5.ply"
     camera = resized(read_cameras(files["cameras"])[1], 384)
     wanted = rendered(path, camera)
     assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered image
-    assert np.abs(found - stylized).mean() > 5
+    assert np.abs(drawn - stylized).mean() > 5
     move(watched, "Amount of style", 0)
     none = watched.pixels()
     watched.wipe("End")
@@ -135,8 +135,8 @@ def test_held_key_shows_the_original(visit: Visit, pair: list[str]) -> None:
     watched.settled()
     with page.expect_download() as download:
         page.locator("[aria-label='Save image']").evaluate("(button) => button.click()")  # the focus stays
-    with Image.open(download.value.path()) as picture:
-        assert np.array_equal(np.asarray(picture.convert("RGB"), dtype=np.float64), original)
+    with Image.open(download.value.path()) as image:
+        assert np.array_equal(np.asarray(image.convert("RGB"), dtype=np.float64), original)
     page.keyboard.up("o")
     assert np.array_equal(watched.pixels(), stylized)
     assert np.abs(stylized - original).mean() > 5
@@ -187,7 +187,7 @@ def test_blend_is_accessible(visit: Visit, service: Service, pair: list[str], sc
     watched = visit(f"/#/compare/{pair[0]}/{pair[1]}", width=width, height=740, color_scheme=scheme)
     watched.page.get_by_label("Amount of style").wait_for()
     watched.settled()
-    found = Axe().run(watched.page)
-    assert found.violations_count == 0, found.generate_report()
+    results = Axe().run(watched.page)
+    assert results.violations_count == 0, results.generate_report()
     assert watched.page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
     watched.check()

@@ -27,14 +27,14 @@ def night(tmp_path: Path) -> Path:
 
 def uploads_of(watched: Watched) -> list[str]:
     """Return a list to which the page's new uploads are added."""
-    found: list[str] = []
+    uploads: list[str] = []
     watched.page.on(
         "request",
         lambda request: (
-            found.append(request.url) if (request.method, request.url[-11:]) == ("POST", "/v1/uploads") else None
+            uploads.append(request.url) if (request.method, request.url[-11:]) == ("POST", "/v1/uploads") else None
         ),
     )
-    return found
+    return uploads
 
 
 def started(watched: Watched, service: Service, name: str = "Start") -> dict[str, Any]:
@@ -43,8 +43,8 @@ def started(watched: Watched, service: Service, name: str = "Start") -> dict[str
         watched.page.get_by_role("button", name=name, exact=True).click()
     assert answer.value.status == 202, answer.value.text()
     watched.page.wait_for_url(re.compile("#/jobs/job_"))
-    found: dict[str, Any] = httpx.get(f"{service.url}/v1/jobs/{answer.value.json()['id']}").json()
-    return found
+    job: dict[str, Any] = httpx.get(f"{service.url}/v1/jobs/{answer.value.json()['id']}").json()
+    return job
 
 
 def digests(job: dict[str, Any], role: str) -> list[str]:
@@ -78,8 +78,8 @@ def test_another_painting_and_changes_send_nothing_again(
     for role in ("scene", "cameras"):
         assert digests(other, role) == digests(before, role)
     assert digests(other, "style") != digests(before, "style")
-    kept = {name: value for name, value in before["parameters"].items() if name not in ("name", "background")}
-    assert {name: other["parameters"][name] for name in kept} == kept
+    unchanged = {name: value for name, value in before["parameters"].items() if name not in ("name", "background")}
+    assert {name: other["parameters"][name] for name in unchanged} == unchanged
     assert other["parameters"]["background"] == pytest.approx([40 / 255, 40 / 255, 48 / 255])
 
     page.goto(f"{service.url}/#/jobs/{before['id']}")
@@ -124,8 +124,8 @@ def test_each_painting_can_be_a_job_of_its_own(
     assert len(sent) == 4, "the scene is sent once for both"
     ids = page.url.split("/")[-2:]
     for job_id, name in zip(ids, ("scene · style", "scene · night"), strict=True):
-        found = httpx.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()
-        assert (found["name"], len(digests(found, "style"))) == (name, 1)
+        job = httpx.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()
+        assert (job["name"], len(digests(job, "style"))) == (name, 1)
     tiles = page.get_by_role("list", name="Jobs side by side").get_by_role("listitem")
     assert tiles.count() == 2
     watched.settled()

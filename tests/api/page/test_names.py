@@ -67,8 +67,8 @@ def test_compared_jobs_have_different_labels(visit: Visit, service: Service, fil
     assert page.get_by_label("Right").input_value() != ids[1]
     assert page.locator(".side.right").inner_text() != page.locator(".side.left").inner_text()
 
-    twin = done(service, submit(service, files, **quick, seed=1))
-    page.goto(f"{service.url}/#/compare/{ids[0]}/{twin}")
+    second = done(service, submit(service, files, **quick, seed=1))
+    page.goto(f"{service.url}/#/compare/{ids[0]}/{second}")
     page.locator(".side.right", has_text="style").wait_for()
     assert page.locator(".side.right").inner_text() != page.locator(".side.left").inner_text()
     watched.check()

@@ -473,10 +473,10 @@ def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) 
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     scrolled = page.evaluate("() => scrollY")
     touch(watched, [[(x - 40 + 8 * i, y)] for i in range(10)])
-    turned = watched.pixels()
-    assert np.abs(turned - first).mean() > 1
+    rotated = watched.pixels()
+    assert np.abs(rotated - first).mean() > 1
     touch(watched, [[(x - 60 + 4 * i, y), (x + 60 - 4 * i, y)] for i in range(10)])
-    assert 0 < shown(watched.pixels()) < 0.6 * shown(turned)
+    assert 0 < shown(watched.pixels()) < 0.6 * shown(rotated)
     assert page.evaluate("() => scrollY") == scrolled
     watched.check()
     watched.context.close()

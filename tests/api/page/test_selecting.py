@@ -55,12 +55,12 @@ def flags(watched: Watched, centers: NDArray[np.float32], *changes: dict[str, An
         colors.ravel().tolist(),
         {**view, "width": WIDTH, "height": HEIGHT},
     ]
-    found = []
+    selections = []
     for total, values, bits in watched.page.evaluate(_SELECTOR, [*given, list(changes)]):
-        found.append(np.array(values, bool))
+        selections.append(np.array(values, bool))
         assert total == sum(values)
-        assert bits == np.packbits(found[-1], bitorder="little").tolist()
-    return found
+        assert bits == np.packbits(selections[-1], bitorder="little").tolist()
+    return selections
 
 
 def projected(centers: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -121,7 +121,7 @@ def test_changes_are_undone_and_redone(watched: Watched) -> None:
         for x in (20.0, 50.0)
     ]
     bits = np.packbits(np.arange(2000) % 3 == 0, bitorder="little").tolist()
-    found = flags(
+    selections = flags(
         watched,
         centers,
         {"op": "load", "bits": bits},
@@ -136,7 +136,7 @@ def test_changes_are_undone_and_redone(watched: Watched) -> None:
         {"op": "undo"},
         {"op": "clear"},
     )
-    loaded, boxed, first, both, inverted, *after, cleared = (each.tolist() for each in found)
+    loaded, boxed, first, both, inverted, *after, cleared = (each.tolist() for each in selections)
     assert loaded == (np.arange(2000) % 3 == 0).tolist()
     assert boxed != first != both
     assert inverted == [not value for value in both]
@@ -296,8 +296,8 @@ def test_selected_region_stays_frozen(visit: Visit, service: Service, files: dic
     page.locator(".badge", has_text="Done").wait_for()
     job_id = page.url.rsplit("/", 1)[1]
     job = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()
-    (kept,) = job["parameters"]["regions"]
-    assert (kept["name"], kept["select"], kept["freeze"]) == ("near", "mask=near.bin", True)
+    (region,) = job["parameters"]["regions"]
+    assert (region["name"], region["select"], region["freeze"]) == ("near", "mask=near.bin", True)
     mask = httpx.get(f"{service.url}/v1/jobs/{job_id}/inputs/mask").content
     frozen = np.unpackbits(np.frombuffer(mask, np.uint8), bitorder="little").astype(bool)[:616]
     assert 10 < frozen.sum() == count < 600
@@ -320,8 +320,8 @@ def test_panel_works_by_keyboard_on_small_screens(visit: Visit, files: dict[str,
     for tool in ("Brush", "Lasso", "Similar", "Box", "Sphere"):
         page.get_by_label(tool, exact=True).check()
         assert page.evaluate("() => document.documentElement.scrollWidth") <= 360, tool
-        found = Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]})
-        assert not found.response["violations"], found.generate_report()
+        results = Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]})
+        assert not results.response["violations"], results.generate_report()
     page.get_by_label("Radius", exact=True).fill("0.8")
     page.get_by_role("button", name="Apply").press("Enter")
     some_selected(watched)

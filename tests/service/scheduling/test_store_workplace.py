@@ -55,7 +55,7 @@ def s3(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
 
 
 @dataclass
-class Heard:
+class Recorder:
     """Recorded notifications of stored files."""
 
     files: list[Published] = field(default_factory=list)
@@ -95,7 +95,7 @@ def checkpoint(folder: Path, step: int) -> None:
 def test_files_are_fetched_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: StoreWorkplace, tmp_path: Path) -> None:
     job = pickle.loads(pickle.dumps(StoreWorkplace.from_json(json.loads(json.dumps(job.as_json())))))
     before = len(s3.asked)
-    ranks = [job.open(number, Heard()) for number in (1, 2)]
+    ranks = [job.open(number, Recorder()) for number in (1, 2)]
     fetched = [path for method, path in s3.asked[before:] if method == "GET"]
     assert sorted(path.rpartition("/")[2] for path in fetched) == ["cameras", "scene", "style"]
     for rank in ranks:
@@ -107,26 +107,26 @@ def test_files_are_fetched_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: St
 
 
 def test_first_rank_uploads_files_while_it_runs(job: StoreWorkplace) -> None:
-    heard = Heard()
-    rank = job.open(0, heard)
+    recorder = Recorder()
+    rank = job.open(0, recorder)
     out = rank.folder / "out"
     (out / "stylized.plan.json").write_text("{}")
     checkpoint(rank.folder, 10)
-    wait_for(lambda: heard.names() == {"plan.json", CHECKPOINT}, "the files to be stored")
+    wait_for(lambda: recorder.names() == {"plan.json", CHECKPOINT}, "the files to be stored")
     checkpoint(rank.folder, 25)
-    wait_for(lambda: heard.steps[-1] == 25, "the checkpoint to be stored")
-    assert all(file.location.startswith("job_1/3/") for file in heard.files), "under the attempt's epoch"
+    wait_for(lambda: recorder.steps[-1] == 25, "the checkpoint to be stored")
+    assert all(file.location.startswith("job_1/3/") for file in recorder.files), "under the attempt's epoch"
     (out / "stylized.ply").write_bytes(b"ply")
     (out / "stylized.report.json").write_text("{}")
     rank.finish(done=True)
-    assert heard.names() == {"plan.json", CHECKPOINT, "stylized.ply", "report.json"}
-    result = next(file for file in heard.files if file.name == "stylized.ply")
+    assert recorder.names() == {"plan.json", CHECKPOINT, "stylized.ply", "report.json"}
+    result = next(file for file in recorder.files if file.name == "stylized.ply")
     assert b"".join(Artifacts(job.url).read(result.location, 0, result.size)) == b"ply"
     rank.close()
     assert not rank.folder.exists()
-    following = job.after(heard.files)
+    following = job.after(recorder.files)
     assert following.checkpoint is not None
-    again = following.open(0, Heard())
+    again = following.open(0, Recorder())
     assert (again.folder / "out" / "stylized.checkpoint.safetensors").stat().st_size == following.checkpoint.size
     again.close()
     assert job.after([]) == job
@@ -135,43 +135,43 @@ def test_first_rank_uploads_files_while_it_runs(job: StoreWorkplace) -> None:
 def test_damaged_checkpoint_is_not_used(job: StoreWorkplace, tmp_path: Path) -> None:
     saved = put(job.url, "job_1/1/x/checkpoint", b"state", tmp_path)
     for sha256, used in ((saved.sha256, True), ("e" * 64, False)):
-        rank = replace(job, checkpoint=replace(saved, sha256=sha256)).open(0, Heard())
+        rank = replace(job, checkpoint=replace(saved, sha256=sha256)).open(0, Recorder())
         assert (rank.folder / "out" / "stylized.checkpoint.safetensors").exists() == used
         rank.close()
 
 
 def test_no_file_is_lost_during_a_store_outage(s3: FaultyS3, job: StoreWorkplace) -> None:
-    heard = Heard()
-    rank = job.open(0, heard)
+    recorder = Recorder()
+    rank = job.open(0, recorder)
     s3.fail("reset", 10**6)
     checkpoint(rank.folder, 10)
     (rank.folder / "out" / "stylized.ply").write_bytes(b"ply")
     time.sleep(0.3)
-    assert heard.files == []
+    assert recorder.files == []
     healing = threading.Timer(1.0, s3.heal)
     healing.start()
     rank.finish(done=True)
     healing.join()
-    assert heard.names() == {CHECKPOINT, "stylized.ply"}
+    assert recorder.names() == {CHECKPOINT, "stylized.ply"}
     rank.close()
 
 
 def test_staging_failures_are_infrastructure_errors(
     s3: FaultyS3, job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gone = replace(job, files=(*job.files[:2], StoredFile("blobs/none", "e" * 64, 3)))
+    missing = replace(job, files=(*job.files[:2], StoredFile("blobs/none", "e" * 64, 3)))
     with pytest.raises(LostFileError) as lost:
-        gone.open(1, Heard())
+        missing.open(1, Recorder())
     assert pickle.loads(pickle.dumps(lost.value)).code == "file-lost", "it travels from rank to dispatcher"
     s3.fail("reset", 10**6)
     with pytest.raises(StoreError, match="does not answer") as raised:
-        job.open(1, Heard())
+        job.open(1, Recorder())
     assert pickle.loads(pickle.dumps(raised.value)).code == "store-unavailable", "it travels from rank to dispatcher"
     s3.heal()
     (tmp_path / "full").write_bytes(b"a file where the folder should be")
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "full" / "data"))
     with pytest.raises(InfrastructureError, match="cannot be laid out"):
-        job.open(1, Heard())
+        job.open(1, Recorder())
 
 
 def test_weights_are_fetched_by_digest(
@@ -183,14 +183,14 @@ def test_weights_are_fetched_by_digest(
     assert "vgg16.safetensors" in weights
     assert store_weights(Artifacts(job.url).objects) == weights
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "nothing is installed here"))
-    rank = replace(job, weights=weights).open(1, Heard())
+    rank = replace(job, weights=weights).open(1, Recorder())
     assert os.environ["SGSST_CACHE"] != str(tiny_cache)
     assert load_network_weights("auto").sha256 == expected
     rank.close()
 
 
 def _open_and_wait(job: StoreWorkplace, ready: Any) -> None:
-    rank = job.open(0, Heard())
+    rank = job.open(0, Recorder())
     ready.set()
     time.sleep(600)
     rank.close()
@@ -205,7 +205,7 @@ def test_folder_of_a_killed_rank_is_removed(job: StoreWorkplace, tmp_path: Path,
     process = spawned.Process(target=_open_and_wait, args=(job, ready))
     process.start()
     assert ready.wait(120)
-    own = job.open(1, Heard())
+    own = job.open(1, Recorder())
 
     def folders() -> int:
         return sum(path.is_dir() for path in (tmp_path / "node" / "ranks").iterdir())

@@ -50,14 +50,14 @@ class Receiver:
 
     def __init__(self, behave: Callable[[Any], None] | None = None, certificate: Path | None = None) -> None:
         self.status = 200
-        self.heard: list[tuple[dict[str, str], bytes]] = []
+        self.received: list[tuple[dict[str, str], bytes]] = []
         self.names: list[str | None] = []
         receiver = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["content-length"]))
-                receiver.heard.append(({name.lower(): value for name, value in self.headers.items()}, body))
+                receiver.received.append(({name.lower(): value for name, value in self.headers.items()}, body))
                 if behave is not None:
                     behave(self)
                     return
@@ -154,7 +154,7 @@ def _tries(store: Store) -> list[int]:
 def test_message_is_signed_as_in_standard_webhooks(tmp_path: Path, store: Store, receiver: Receiver) -> None:
     job_id = _end_job(store, receiver.url)
     _deliver(store, tmp_path)
-    ((headers, body),) = receiver.heard
+    ((headers, body),) = receiver.received
     assert json.loads(body)["type"] == "job.canceled"
     assert json.loads(body)["data"]["id"] == job_id
     assert headers["host"] == f"127.0.0.1:{receiver.port}"
@@ -163,7 +163,7 @@ def test_message_is_signed_as_in_standard_webhooks(tmp_path: Path, store: Store,
     expected = base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
     assert headers["webhook-signature"] == f"v1,{expected}"
     _deliver(store, tmp_path)
-    assert len(receiver.heard) == 1
+    assert len(receiver.received) == 1
 
 
 def test_rejected_message_is_retried(tmp_path: Path, store: Store, receiver: Receiver, clock: Clock) -> None:
@@ -172,11 +172,11 @@ def test_rejected_message_is_retried(tmp_path: Path, store: Store, receiver: Rec
     _deliver(store, tmp_path)
     assert _tries(store) == [1]
     _deliver(store, tmp_path)
-    assert len(receiver.heard) == 1  # not due yet
+    assert len(receiver.received) == 1  # not due yet
     receiver.status = 204
     clock.now += 5
     _deliver(store, tmp_path)
-    assert len(receiver.heard) == 2
+    assert len(receiver.received) == 2
     assert _tries(store) == []
 
 
@@ -184,7 +184,7 @@ def test_redirects_are_not_followed(tmp_path: Path, store: Store, receiver: Rece
     _end_job(store, receiver.url)
     receiver.status = 307
     _deliver(store, tmp_path)
-    assert len(receiver.heard) == 1
+    assert len(receiver.received) == 1
     assert _tries(store) == [1]
 
 
@@ -199,7 +199,7 @@ def test_invalid_rows_do_not_block_other_messages(tmp_path: Path, store: Store, 
         _end_job(store, url)
     _end_job(store, receiver.url)
     _deliver(store, tmp_path)
-    assert len(receiver.heard) == 1
+    assert len(receiver.received) == 1
     assert _tries(store) == [1] * 4
 
 
@@ -274,7 +274,7 @@ def test_slow_receiver_is_cut_off_at_the_deadline(
     _end_job(store, receiver.url)
     _deliver(store, tmp_path)
     assert cut_off.wait(PATIENCE)
-    assert len(receiver.heard) == 1
+    assert len(receiver.received) == 1
     assert _tries(store) == [1]
 
 
@@ -305,12 +305,12 @@ def test_slow_receivers_do_not_delay_other_messages(tmp_path: Path, store: Store
     """One owner has many messages to one unresponsive receiver, another one to many such receivers."""
     release = threading.Event()
     slow = start(lambda handler: release.wait(PATIENCE))
-    heard = threading.Semaphore(0)
+    received = threading.Semaphore(0)
 
     def answer(handler: Any) -> None:
         handler.send_response(200)
         handler.end_headers()
-        heard.release()
+        received.release()
 
     quick = start(answer)
     for index in range(20):
@@ -322,9 +322,9 @@ def test_slow_receivers_do_not_delay_other_messages(tmp_path: Path, store: Store
     thread = threading.Thread(target=deliverer.deliver_due, daemon=True)
     thread.start()
     try:
-        assert heard.acquire(timeout=PATIENCE)
-        assert heard.acquire(timeout=PATIENCE)
-        assert len(slow.heard) <= webhooks._MAX_PER_URL + webhooks._MAX_PER_OWNER
+        assert received.acquire(timeout=PATIENCE)
+        assert received.acquire(timeout=PATIENCE)
+        assert len(slow.received) <= webhooks._MAX_PER_URL + webhooks._MAX_PER_OWNER
     finally:
         deliverer.stop()
         release.set()
@@ -369,7 +369,7 @@ def test_private_addresses_are_refused(tmp_path: Path, store: Store, receiver: R
     _end_job(store, f"http://localhost:{receiver.port}/")
     _end_job(store, f"http://2130706433:{receiver.port}/")  # 127.0.0.1 to the system's resolver
     _deliver(store, tmp_path, webhook_private_addresses=False)
-    assert receiver.heard == []
+    assert receiver.received == []
     assert _tries(store) == [1] * 3
 
 
@@ -417,7 +417,7 @@ def test_connection_uses_the_checked_address(
     monkeypatch.setattr(socket, "getaddrinfo", resolve)
     _end_job(store, f"http://receiver.example:{receiver.port}/hook")
     _deliver(store, tmp_path)
-    ((headers, _),) = receiver.heard
+    ((headers, _),) = receiver.received
     assert headers["host"] == f"receiver.example:{receiver.port}"
     assert len(looked_up) == 1
 
@@ -432,7 +432,7 @@ def test_certificate_is_verified_for_the_host_name(
     _end_job(store, f"https://localhost:{receiver.port}/hook")
     Deliverer(_settings(tmp_path), store, tls).deliver_due()
     assert receiver.names == ["localhost"]
-    assert [headers["host"] for headers, _ in receiver.heard] == [f"localhost:{receiver.port}"] * delivered
+    assert [headers["host"] for headers, _ in receiver.received] == [f"localhost:{receiver.port}"] * delivered
     assert _tries(store) == [1] * (not delivered)
 
 
@@ -507,4 +507,4 @@ def test_thread_delivers_until_it_is_stopped(tmp_path: Path, store: Store, recei
     while _tries(store) and time.monotonic() < deadline:
         time.sleep(0.05)
     deliverer.stop()
-    assert len(receiver.heard) == 1
+    assert len(receiver.received) == 1

@@ -241,9 +241,9 @@ def test_last_of_concurrent_releases_deletes_the_blob(store: Store) -> None:
         for number, receipt in enumerate(receipts):
             for digest in digests[:: 1 if number % 2 else -1]:
                 store.inputs.add_blob(digest, f"aa/{digest}", 10, receipt)
-        gone: list[str] = []
-        at_once(lambda: gone.extend(store.inputs.end_receipt(receipts.pop())), 6)  # noqa: B023
-        assert sorted(gone) == [f"aa/{digest}" for digest in digests]
+        locations: list[str] = []
+        at_once(lambda: locations.extend(store.inputs.end_receipt(receipts.pop())), 6)  # noqa: B023
+        assert sorted(locations) == [f"aa/{digest}" for digest in digests]
         assert store.inputs.blobs(digests) == {}
 
 

@@ -103,14 +103,14 @@ def test_plan_lines_state_the_reasons_of_an_orbit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("room", "what"),
+    ("surroundings", "what"),
     [
         (scene_of(box((-4, -4, -4), (4, 4, 4), 1000), 0.05), "outside the frames"),
         (scene_of(box((-1, -1, -1), (1, 1, 1), 3000), 0.05), "lies inside"),
     ],
 )
-def test_plan_warns_that_a_room_is_not_a_single_object(room: Scene, what: str) -> None:
-    scene = joined(scene_of(ball((0, 0, 0), 0.5, 5000), 0.05), room)
+def test_plan_warns_that_a_room_is_not_a_single_object(surroundings: Scene, what: str) -> None:
+    scene = joined(scene_of(ball((0, 0, 0), 0.5, 5000), 0.05), surroundings)
     orbit = make_orbit(scene, OrbitRequest(count=12))
     warning = plan_lines(scene, orbit)["subject"]
     assert warning.decision.startswith("warning: ")

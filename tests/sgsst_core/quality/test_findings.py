@@ -35,7 +35,7 @@ def stored(folder: Path, scene: Scene) -> SceneFile:
     return read_scene(folder / "scene.ply", drop_invalid=True)
 
 
-def found_in(folder: Path, scene: Scene) -> dict[str, Finding]:
+def findings_in(folder: Path, scene: Scene) -> dict[str, Finding]:
     return {finding.what: finding for finding in scene_findings(stored(folder, scene))}
 
 
@@ -67,7 +67,7 @@ def finding_about(findings: dict[str, Finding], text: str) -> Finding:
 
 def test_ordinary_scene_has_no_findings(tmp_path: Path) -> None:
     scene = replace(wall(), opacities=torch.full((len(wall()),), -1.0))
-    assert found_in(tmp_path, scene) == {}
+    assert findings_in(tmp_path, scene) == {}
     # The wall extends beyond what its cameras see of it.
     findings = seen_by(tmp_path, wall(), cameras())
     assert {what.split(":")[0] for what in findings} == {"in no view", "hardly seen"}
@@ -93,7 +93,7 @@ def test_extreme_gaussians_are_counted_and_the_worst_is_named(
 ) -> None:
     scene = replace(wall(sh_degree=1), opacities=torch.full((len(wall()),), 2.0))
     getattr(scene, column)[rows] = value
-    finding = finding_about(found_in(tmp_path, scene), what)
+    finding = finding_about(findings_in(tmp_path, scene), what)
     assert (finding.count, finding.total) == (len(rows), len(scene))
     assert finding.worst.startswith(worst)
     assert finding.done
@@ -128,7 +128,7 @@ def test_needles_are_reported_and_discs_are_not(tmp_path: Path) -> None:
     scene = wall()
     scene.scales[:] = torch.tensor([0.1, 0.1, 1e-6]).log()
     scene.scales[6] = torch.tensor([0.5, 1e-5, 1e-6]).log()
-    finding = finding_about(found_in(tmp_path, scene), "needles")
+    finding = finding_about(findings_in(tmp_path, scene), "needles")
     assert (finding.count, finding.worst) == (1, "Gaussian 6: 5e+04")
 
 
@@ -138,7 +138,7 @@ def test_invalid_rows_are_reported_with_file_indices(tmp_path: Path) -> None:
     scene.sh_dc[5, 0] = math.inf
     scene.quats[20] = 0
     scene.scales[21, 1] = 5.0
-    findings = found_in(tmp_path, scene)
+    findings = findings_in(tmp_path, scene)
     invalid = finding_about(findings, "NaN or infinite")
     assert (invalid.count, invalid.total, invalid.worst) == (3, len(scene), "first: Gaussian 2")
     assert "--drop-invalid" in invalid.done
@@ -147,7 +147,7 @@ def test_invalid_rows_are_reported_with_file_indices(tmp_path: Path) -> None:
 
 def test_scene_far_from_origin_is_reported_with_its_resolution(tmp_path: Path) -> None:
     scene = replace(wall(), means=wall().means + torch.tensor([1e6, 0.0, 0.0]))
-    finding = finding_about(found_in(tmp_path, scene), "far from its origin")
+    finding = finding_about(findings_in(tmp_path, scene), "far from its origin")
     assert "positions are 0.0625 apart" in finding.worst
 
 

@@ -281,9 +281,9 @@ def test_gram_distance_is_relative_to_the_first_measurement(network):
 def test_caching_does_not_change_measurements(network, lpips):
     scene, views = wall(sh_degree=1), cameras(10)
     cached = novel_views(scene, views, network, weighted=True, lpips=lpips)
-    nothing_kept = novel_views(scene, views, network, weighted=True, lpips=lpips, memory=0)
+    uncached = novel_views(scene, views, network, weighted=True, lpips=lpips, memory=0)
     moment = cached.measure(scene.sh_dc)
-    assert moment == nothing_kept.measure(scene.sh_dc) == cached.measure(scene.sh_dc)
+    assert moment == uncached.measure(scene.sh_dc) == cached.measure(scene.sh_dc)
     assert {gap: len(pairs) for gap, pairs in cached.pairs.items()} == {SHORT_RANGE: MOST_VIEWS, LONG_RANGE: 2}
 
 
@@ -326,9 +326,9 @@ def test_view_inside_an_object_is_not_measured(network):
     shell = ball(400)
     centered = shell.means - torch.tensor([0.0, 0, 3])
     shell = replace(shell, means=centered * (0.4 / 0.7), scales=torch.full_like(shell.scales, math.log(0.04)))
-    room = wall()
-    both = Scene(*(torch.cat([getattr(room, f), getattr(shell, f)]) for f in TENSORS))
-    empty, filled = novel_views(room, views, network), novel_views(both, views, network)
+    background = wall()
+    both = Scene(*(torch.cat([getattr(background, f), getattr(shell, f)]) for f in TENSORS))
+    empty, filled = novel_views(background, views, network), novel_views(both, views, network)
     assert names(empty.cameras) == names(filled.cameras) == ["0–1", "1–2", "2–3"]
     assert (empty.views, empty.pairs[SHORT_RANGE]) == ([0, 1], [(0, 1), (1, 2)])
     assert (filled.views, filled.pairs[SHORT_RANGE]) == ([1], [(1, 2)])

@@ -25,7 +25,7 @@ def camera(center, rotation=None, focal=100.0, size=(64, 48)):
     return Camera("view", *size, focal, focal, size[0] / 2, size[1] / 2, pose)
 
 
-def turned(degrees, axis="y"):
+def rotated(degrees, axis="y"):
     """Return a rotation about an axis."""
     return Rotation.from_euler(axis, degrees, degrees=True)
 
@@ -89,7 +89,7 @@ def test_positions_and_velocities_are_continuous_at_the_cameras():
 
 
 def test_rotations_are_rotations_at_constant_speed_between_cameras():
-    path = CameraPath([camera((0, 0, 0), turned(10)), camera((1, 0, 0), turned(70))])
+    path = CameraPath([camera((0, 0, 0), rotated(10)), camera((1, 0, 0), rotated(70))])
     frames = path.evenly(7)
     rotations = np.stack([c.world_to_camera[:3, :3].numpy() for c in frames])
     assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-12)
@@ -100,12 +100,12 @@ def test_rotations_are_rotations_at_constant_speed_between_cameras():
 
 def test_rotation_takes_the_short_way_across_the_antipodal_sign():
     """Rotations of 170 and 190 degrees have quaternions of opposite signs, but are 20 degrees apart."""
-    middle = CameraPath([camera((0, 0, 0), turned(170)), camera((1, 0, 0), turned(190))]).evenly(3)[1]
-    assert np.allclose(middle.world_to_camera[:3, :3].numpy(), turned(180).as_matrix(), atol=1e-12)
+    middle = CameraPath([camera((0, 0, 0), rotated(170)), camera((1, 0, 0), rotated(190))]).evenly(3)[1]
+    assert np.allclose(middle.world_to_camera[:3, :3].numpy(), rotated(180).as_matrix(), atol=1e-12)
 
 
 def test_half_turn_is_a_rotation_all_the_way():
-    frames = CameraPath([camera((0, 0, 0)), camera((1, 0, 0), turned(180))]).evenly(5)
+    frames = CameraPath([camera((0, 0, 0)), camera((1, 0, 0), rotated(180))]).evenly(5)
     assert all(np.isclose(np.linalg.det(c.world_to_camera[:3, :3].numpy()), 1) for c in frames)
     steps = [
         (Rotation.from_matrix(a.world_to_camera[:3, :3].numpy()).inv()
@@ -116,7 +116,7 @@ def test_half_turn_is_a_rotation_all_the_way():
 
 
 def test_one_camera_stands_still():
-    only = camera((1, 2, 3), turned(40))
+    only = camera((1, 2, 3), rotated(40))
     frames = CameraPath([only]).evenly(4)
     assert len(frames) == 4
     assert all(np.allclose(c.world_to_camera, only.world_to_camera, atol=1e-15) and c.fx == only.fx for c in frames)
@@ -128,7 +128,7 @@ def test_two_cameras_are_joined_by_a_straight_line():
 
 
 def test_coinciding_cameras_count_once():
-    a, b = camera((0, 0, 0)), camera((2, 0, 0), turned(20))
+    a, b = camera((0, 0, 0)), camera((2, 0, 0), rotated(20))
     path = CameraPath([a, a, b, replace(b, name="again"), b])
     assert len(path.cameras) == 2
     assert np.isfinite(poses(path.evenly(9))).all()
@@ -136,7 +136,7 @@ def test_coinciding_cameras_count_once():
 
 
 def test_a_camera_that_turns_or_zooms_in_place_takes_time():
-    path = CameraPath([camera((0, 0, 0)), camera((0, 0, 0), turned(30)), camera((0, 0, 0), turned(30), focal=150)])
+    path = CameraPath([camera((0, 0, 0)), camera((0, 0, 0), rotated(30)), camera((0, 0, 0), rotated(30), focal=150)])
     assert np.allclose(path.knots, [0, 1, 2])
     assert np.isclose(path.at(np.array([1.5]))[0].fx, math.sqrt(100 * 150))
 
@@ -166,7 +166,7 @@ def test_no_cameras_are_refused():
     )
 )
 def test_any_cameras_make_a_finite_path(given_poses):
-    path = CameraPath([camera(center, turned(angle)) for center, angle in given_poses])
+    path = CameraPath([camera(center, rotated(angle)) for center, angle in given_poses])
     path_poses = poses(path.evenly(20))
     assert np.isfinite(path_poses).all()
     assert np.allclose(path_poses[:, :3, :3] @ path_poses[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-9)

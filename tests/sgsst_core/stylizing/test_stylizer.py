@@ -289,7 +289,7 @@ def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(tiny_weights: Ba
 
 
 @pytest.mark.parametrize(
-    ("thing", "preset", "values", "weighted"),
+    ("make_scene", "preset", "values", "weighted"),
     [
         (ball, "standard", {}, True),
         (wall, "standard", {}, False),
@@ -299,12 +299,12 @@ def test_phase_1_works_on_the_coarsest_scale_and_phase_2_on_all(tiny_weights: Ba
     ],
 )
 def test_position_weights_are_for_views_with_an_empty_background(
-    tiny_weights: BackboneWeights, thing: Any, preset: PresetName, values: dict[str, Any], weighted: bool
+    tiny_weights: BackboneWeights, make_scene: Any, preset: PresetName, values: dict[str, Any], weighted: bool
 ) -> None:
-    stylizer = make(tiny_weights, thing(), preset=preset, **values)
+    stylizer = make(tiny_weights, make_scene(), preset=preset, **values)
     assert stylizer.job.view_targets.weighted is weighted
     uncovered = stylizer.job.plan.survey.uncovered_fraction
-    assert uncovered > 0.3 if thing is ball else uncovered < 0.01
+    assert uncovered > 0.3 if make_scene is ball else uncovered < 0.01
     assert (stylizer.job.view_targets.target(0, [0]).coverage is not None) is weighted
 
 

@@ -88,7 +88,7 @@ class EventRecorder:
 def run(
     request: StylizeRequest,
     cluster: Cluster,
-    heard: EventRecorder | None = None,
+    events: EventRecorder | None = None,
     fault: Fault | None = None,
     workers: int = 2,
 ) -> RanksResult:
@@ -102,7 +102,7 @@ def run(
         preview_seconds=0.1,
         actor=FaultyRank,
     )
-    return stylize_on_ranks(request, workers, (heard or EventRecorder()).listener(), options=options, cluster=cluster)
+    return stylize_on_ranks(request, workers, (events or EventRecorder()).listener(), options=options, cluster=cluster)
 
 
 def loss_of(ended: RanksResult) -> float:
@@ -115,17 +115,17 @@ def loss_of(ended: RanksResult) -> float:
 def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> tuple[float, bytes]:
     """Return the final loss and the result file of a run on two ranks without a fault."""
     request = small_request(tmp_path_factory.mktemp("undisturbed"), STEPS)
-    heard = EventRecorder()
-    ended = run(request, cluster, heard)
+    events = EventRecorder()
+    ended = run(request, cluster, events)
     assert ended.attempts == []
-    assert heard.planned[-1] == 1.0
-    assert heard.planned == sorted(set(heard.planned))
-    assert heard.steps[-1] == ended.total == STEPS
+    assert events.planned[-1] == 1.0
+    assert events.planned == sorted(set(events.planned))
+    assert events.steps[-1] == ended.total == STEPS
     report = json.loads(request.out.with_name("s.report.json").read_text())
     assert report["workers"]["used"] == 2
     assert len(report["workers"]["ranks"]) == 2
-    assert heard.previews
-    for path in heard.previews:
+    assert events.previews
+    for path in events.previews:
         with Image.open(path) as image:
             assert image.format == "JPEG"
     return loss_of(ended), request.out.read_bytes()
@@ -150,14 +150,14 @@ def test_two_ranks_reach_the_loss_of_one_rank(undisturbed: tuple[float, bytes], 
 def test_lost_rank_costs_at_most_a_checkpoint_interval(
     fault: Fault, reason: str, undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path
 ) -> None:
-    request, heard = small_request(tmp_path, STEPS), EventRecorder()
-    ended = run(request, cluster, heard, fault)
+    request, events = small_request(tmp_path, STEPS), EventRecorder()
+    ended = run(request, cluster, events, fault)
     assert fired(request) is not None
     assert [reason in attempt.reason for attempt in ended.attempts] == [True]
     lost = ended.attempts[0]
     assert 0 < lost.saved_step <= lost.last_step
-    assert len(heard.prepared) == 1
-    assert "Resuming from step" in heard.happened[-1]
+    assert len(events.prepared) == 1
+    assert "Resuming from step" in events.happened[-1]
     # Two ranks again add in the same order, so the file is the same.
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
     assert request.out.read_bytes() == undisturbed[1]
@@ -170,18 +170,18 @@ def test_lost_rank_costs_at_most_a_checkpoint_interval(
 
 @pytest.mark.slow
 def test_job_survives_killed_raylet(undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path) -> None:
-    request, heard = small_request(tmp_path, STEPS), EventRecorder()
+    request, events = small_request(tmp_path, STEPS), EventRecorder()
     killed: list[int] = []
 
     def stop() -> bool:
-        if heard.steps and not killed:
+        if events.steps and not killed:
             raylet = next(child for child in psutil.Process().children() if child.name() == "raylet")
             killed.append(raylet.pid)
             raylet.kill()
         return False
 
     options = WorkerOptions(rank_timeout=5.0, checkpoint_seconds=0.2)
-    ended = stylize_on_ranks(request, 2, replace(heard.listener(), stop=stop), options=options, cluster=cluster)
+    ended = stylize_on_ranks(request, 2, replace(events.listener(), stop=stop), options=options, cluster=cluster)
     assert killed
     assert len(ended.attempts) == 1
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
@@ -191,17 +191,17 @@ def test_job_survives_killed_raylet(undisturbed: tuple[float, bytes], cluster: C
 def test_full_disk_skips_checkpoint_and_canceled_job_resumes(
     undisturbed: tuple[float, bytes], cluster: Cluster, tmp_path: Path
 ) -> None:
-    request, heard = small_request(tmp_path, STEPS), EventRecorder(stop_at=8)
-    ended = run(request, cluster, heard, Fault(0, "checkpoint", 1, "full"))
-    assert ["The checkpoint could not be written" in line for line in heard.warnings] == [True]
+    request, events = small_request(tmp_path, STEPS), EventRecorder(stop_at=8)
+    ended = run(request, cluster, events, Fault(0, "checkpoint", 1, "full"))
+    assert ["The checkpoint could not be written" in line for line in events.warnings] == [True]
     assert ended.interrupted
     assert ended.attempts == []
     assert 8 <= ended.step < STEPS
     assert ended.saved == ended.step
     assert not request.out.exists()
-    heard = EventRecorder()
-    ended = run(replace(request, resume=True), cluster, heard)
-    assert heard.prepared[0].step > 0
+    events = EventRecorder()
+    ended = run(replace(request, resume=True), cluster, events)
+    assert events.prepared[0].step > 0
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
 
 
@@ -220,11 +220,11 @@ def test_job_that_is_finished_early_keeps_its_colors(cluster: Cluster, tmp_path:
 
 @pytest.mark.slow
 def test_bad_input_is_reported_at_once_and_not_retried(cluster: Cluster, tmp_path: Path) -> None:
-    request, heard = small_request(tmp_path, STEPS), EventRecorder()
+    request, events = small_request(tmp_path, STEPS), EventRecorder()
     request.source.scene.write_bytes(request.source.scene.read_bytes()[:-1000])
     with pytest.raises(SceneError, match="truncated"):
-        run(request, cluster, heard)
-    assert heard.happened == []
+        run(request, cluster, events)
+    assert events.happened == []
     assert not request.out.parent.exists()
 
 

@@ -166,9 +166,9 @@ def test_gradient_of_some_scales_matches_one_rank(
     arguments = scene, cameras(1, 157, 131)[0], torch.float64, None, None, 1 << 34
     some = functools.partial(gradient, scales=scales, coarsest=coarsest, scale_weights=scale_weights)
     expected, loss, _ = some(ALONE, *arguments)
-    for found, found_loss, _ in on_ranks(3, some, *arguments):
-        assert relative_error(found, expected) < 1e-9
-        assert found_loss == pytest.approx(loss, rel=1e-9)
+    for actual, actual_loss, _ in on_ranks(3, some, *arguments):
+        assert relative_error(actual, expected) < 1e-9
+        assert actual_loss == pytest.approx(loss, rel=1e-9)
 
 
 def test_partly_cached_activations_preserve_the_gradient() -> None:

@@ -64,8 +64,8 @@ def image(rank: int, rows: int = HEIGHT) -> Tensor:
 
 def areas(ranks: int) -> list[Rectangle]:
     """Return disjoint parts of different shapes, of which one is empty with three or more ranks."""
-    found = [Rectangle(5, 2, 50, 9), Rectangle(50, 0, HEIGHT, 4), Rectangle(0, 0, 0, 0), Rectangle(0, 0, 5, 9)]
-    return found[:ranks]
+    rectangles = [Rectangle(5, 2, 50, 9), Rectangle(50, 0, HEIGHT, 4), Rectangle(0, 0, 0, 0), Rectangle(0, 0, 5, 9)]
+    return rectangles[:ranks]
 
 
 WHOLE, NOTHING = Rectangle(0, 0, HEIGHT, 9), Rectangle(0, 0, 0, 0)
