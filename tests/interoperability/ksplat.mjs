@@ -1,4 +1,4 @@
-// Converts a PLY to .ksplat at a compression level and an SH degree, with mkkellogg's viewer.
+// Converts a PLY or compressed PLY to .ksplat at a compression level and an SH degree, with mkkellogg's viewer.
 globalThis.window = globalThis.document = {};
 const { PlyParser, SplatBufferGenerator } = await import("@mkkellogg/gaussian-splats-3d");
 const [ply, out, level, degree] = process.argv.slice(1);

@@ -89,6 +89,20 @@ def test_gsplat_js_reads_ply(modules: Path, scene: Scene, tmp_path: Path) -> Non
     assert_same(replace(loaded, sh_dc=within.sh_dc, sh_rest=within.sh_rest), within, 0.01, opacities=0.51 / 255)
 
 
+@pytest.mark.parametrize("name", ["ply", "compressed.ply"])
+def test_ksplat_viewer_reads_written_scenes(modules: Path, scene: Scene, tmp_path: Path, name: str) -> None:
+    """mkkellogg's viewer reads SPZ up to version 2 only. Its colors and opacities are rounded down to bytes."""
+    ours, theirs = tmp_path / f"ours.{name}", tmp_path / "theirs.ksplat"
+    within = replace(scene, sh_dc=scene.sh_dc.clamp(-1.7, 1.7), opacities=scene.opacities.clamp(-5, 5))
+    write_scene(ours, within, by_name(name))
+    run_script(modules, "ksplat.mjs", ours, theirs, 0, 2)
+    expected = read_scene(ours).scene
+    loaded = matched(read_scene(theirs).scene, expected)
+    assert float((loaded.sh_dc - expected.sh_dc).abs().max()) <= 1.01 / 255 / 0.282
+    tolerance = VALUES.get(name, 1e-6)
+    assert_same(replace(loaded, sh_dc=expected.sh_dc), expected, tolerance, opacities=1.01 / 255)
+
+
 def test_babylon_reads_glb(modules: Path, scene: Scene, tmp_path: Path) -> None:
     """The Gaussians are those of the scene, rotated by 180 degrees about z, up to the rounding of 8 bits."""
     ours, theirs = tmp_path / "ours.glb", tmp_path / "theirs.splat"
