@@ -233,6 +233,45 @@ class InvalidWebhookError(RefusedInputError):
         )
 
 
+class UrlsOffError(RefusedInputError):
+    """Input by URL on a service that fetches none."""
+
+    code = "urls-off"
+    example = ("scene",)
+
+    def __init__(self, role: str) -> None:
+        super().__init__("Inputs by URL are switched off on this service. Upload the file instead.", input=role)
+
+
+class InvalidUrlError(RefusedInputError):
+    """URL, or redirect to one, that inputs may not be fetched from."""
+
+    code = "invalid-url"
+    example = (
+        "https://example.com/scene.ply",
+        "'example.com' is not among the hosts that its operator allows",
+        "scene",
+    )
+
+    def __init__(self, url: str, reason: object, role: str) -> None:
+        super().__init__(
+            f"{url[:100]!r} cannot be fetched: {reason}. Name a file of an allowed host, or upload the file.",
+            input=role,
+        )
+
+
+class FetchError(RefusedInputError):
+    """URL of an input that has not delivered the file."""
+
+    code = "url-not-fetched"
+    example = ("https://example.com/scene.ply", "the server answered 404", "scene")
+
+    def __init__(self, url: str, reason: object, role: str) -> None:
+        super().__init__(
+            f"{url[:100]!r} was not fetched: {reason}. Check the URL and try again, or upload the file.", input=role
+        )
+
+
 class ConflictError(ServiceError):
     """Operation that the state of the job or upload does not allow."""
 

@@ -6,8 +6,10 @@ import ipaddress
 from functools import cached_property
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from service.outgoing import parse_origins
 
 MB, GB = 1_000_000, 1_000_000_000
 
@@ -63,6 +65,11 @@ class ServiceSettings(BaseSettings):
         poll_seconds: Interval between a dispatcher's searches for jobs to start, stop or clean up after.
         webhooks: Whether jobs may name a URL that is notified when they end.
         webhook_private_addresses: Whether webhook URLs may lead to private networks.
+        url_hosts: Hosts that inputs named by URL may be fetched from, separated by commas; empty for none. `HOST` means
+            `https://HOST`; other schemes and ports are written out, as in `http://minio:9000`.
+        url_bytes: Size limit of all inputs that one request names by URL.
+        url_seconds: Time limit for fetching all inputs of one request, from the first name lookup to the last byte.
+        url_private_addresses: Whether `url_hosts` may have addresses in private networks.
         log_format: "json" or "text".
     """
 
@@ -113,7 +120,17 @@ class ServiceSettings(BaseSettings):
 
     webhooks: bool = False
     webhook_private_addresses: bool = False
+    url_hosts: str = ""
+    url_bytes: int = Field(1 * GB, gt=0)
+    url_seconds: float = Field(120, gt=0)
+    url_private_addresses: bool = False
     log_format: str = "text"
+
+    @field_validator("url_hosts")
+    @classmethod
+    def _check_hosts(cls, text: str) -> str:
+        parse_origins(text)
+        return text
 
     @cached_property
     def folder(self) -> Path:

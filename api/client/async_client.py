@@ -13,7 +13,7 @@ from httpx_sse import aconnect_sse
 from api.client import uploads
 from api.client.answers import Event, Job, checked, unreachable
 from api.client.downloads import Download, Progress
-from api.client.inputs import JobFiles
+from api.client.inputs import JobFiles, path_or_url
 from api.client.transport import TRIES, Transport
 
 #: Jobs per page of a list.
@@ -69,6 +69,8 @@ class AsyncClient:
     ) -> Job:
         """Queue a job. Large files are uploaded in parts, and resume after a lost connection.
 
+        Scene, styles and cameras may be URLs that the service fetches, if its operator allows their hosts.
+
         Args:
             scene: Scene file.
             style: Style image, or several that are mixed with the weights of the parameter `style_weights`.
@@ -83,7 +85,7 @@ class AsyncClient:
         Raises:
             RequestError: If an input cannot be used; the message says which and why.
         """
-        files = JobFiles(Path(scene), _paths(style), _path(cameras), _path(photos), _masks(masks))
+        files = _files(scene, style, cameras, photos, masks)
         created = await uploads.create_job(self._transport, files, parameters, webhook=webhook, progress=progress)
         return Job.of(created)
 
@@ -105,7 +107,7 @@ class AsyncClient:
         Args:
             planning: Callback that receives the number of surveyed views and the number of all views.
         """
-        files = JobFiles(Path(scene), _paths(style), _path(cameras), _path(photos), _masks(masks))
+        files = _files(scene, style, cameras, photos, masks)
         return await uploads.plan_job(self._transport, files, parameters, progress=progress, planning=planning)
 
     async def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> str:
@@ -249,13 +251,18 @@ class AsyncClient:
         await self._transport.call("DELETE", f"/v1/jobs/{job_id}")
 
 
-def _paths(value: str | Path | Sequence[str | Path]) -> list[Path]:
-    return [Path(value)] if isinstance(value, str | Path) else [Path(each) for each in value]
-
-
-def _masks(masks: Mapping[str, str | Path] | None) -> dict[str, Path]:
-    return {name: Path(path) for name, path in (masks or {}).items()}
-
-
-def _path(value: str | Path | None) -> Path | None:
-    return None if value is None else Path(value)
+def _files(
+    scene: str | Path,
+    style: str | Path | Sequence[str | Path],
+    cameras: str | Path | None,
+    photos: str | Path | None,
+    masks: Mapping[str, str | Path] | None,
+) -> JobFiles:
+    styles = [style] if isinstance(style, str | Path) else style
+    return JobFiles(
+        path_or_url(scene),
+        [path_or_url(each) for each in styles],
+        None if cameras is None else path_or_url(cameras),
+        None if photos is None else Path(photos),
+        {name: Path(path) for name, path in (masks or {}).items()},
+    )

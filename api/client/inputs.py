@@ -22,8 +22,16 @@ class InputFile:
 
 
 @dataclass(frozen=True)
+class InputUrl:
+    """File that the service fetches: its role in the job, and its URL."""
+
+    role: str
+    url: str
+
+
+@dataclass(frozen=True)
 class JobFiles:
-    """Local files of a job.
+    """Files of a job: paths of local files, or URLs as text.
 
     Attributes:
         scene: Scene file.
@@ -33,30 +41,45 @@ class JobFiles:
         masks: Mask files, or folders of mask images, by the names that the job's regions give them.
     """
 
-    scene: Path
-    styles: Sequence[Path]
-    cameras: Path | None = None
+    scene: Path | str
+    styles: Sequence[Path | str]
+    cameras: Path | str | None = None
     photos: Path | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
 
 
-def input_files(job: JobFiles) -> list[InputFile]:
+def path_or_url(value: str | Path) -> Path | str:
+    """Return the path of a local file, or an http or https URL unchanged."""
+    return value if isinstance(value, str) and value.lower().startswith(("http://", "https://")) else Path(value)
+
+
+def input_files(job: JobFiles) -> list[InputFile | InputUrl]:
     """Return all files that a job needs.
 
     Raises:
-        RequestError: If a file is missing.
+        RequestError: If a local file is missing.
     """
-    files = [("scene", job.scene, job.scene.name)]
-    files += [("style", path, name) for path, name in zip(job.styles, different_names(job.styles), strict=True)]
-    files += [("cameras", path, path.name) for path in (camera_files(job.cameras) if job.cameras else [])]
-    files += [("photos", path, name) for path, name in (image_files(job.photos) if job.photos else [])]
+    local_styles = [style for style in job.styles if isinstance(style, Path)]
+    names = iter(different_names(local_styles))
+    files: list[InputFile | InputUrl] = [_input("scene", job.scene)]
+    files += [_input("style", style, next(names) if isinstance(style, Path) else "") for style in job.styles]
+    if isinstance(job.cameras, str):
+        files.append(InputUrl("cameras", job.cameras))
+    elif job.cameras is not None:
+        files += [_input("cameras", path) for path in camera_files(job.cameras)]
+    files += [_input("photos", path, name) for path, name in (image_files(job.photos) if job.photos else [])]
     for mask, path in job.masks.items():
         images = [(each, f"{mask}/{name}") for each, name in image_files(path)] if path.is_dir() else [(path, mask)]
-        files += [("mask", each, name) for each, name in images]
-    for _, path, _ in files:
-        if not path.is_file():
-            raise RequestError(f"{path}: not a file. Check the path.")
-    return [InputFile(role, path, name, path.stat().st_size) for role, path, name in files]
+        files += [_input("mask", each, name) for each, name in images]
+    return files
+
+
+def _input(role: str, source: Path | str, name: str = "") -> InputFile | InputUrl:
+    if isinstance(source, str):
+        return InputUrl(role, source)
+    if not source.is_file():
+        raise RequestError(f"{source}: not a file. Check the path.")
+    return InputFile(role, source, name or source.name, source.stat().st_size)
 
 
 def different_names(paths: Sequence[Path]) -> list[str]:

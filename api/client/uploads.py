@@ -15,7 +15,7 @@ from httpx_sse import ServerSentEvent
 
 from api.client.answers import ApiError, RequestError, refusal
 from api.client.downloads import Progress
-from api.client.inputs import JobFiles, input_files
+from api.client.inputs import InputFile, InputUrl, JobFiles, input_files
 from api.client.transport import Transport, in_thread
 
 #: Maximum bytes of a part; larger files are uploaded in parts.
@@ -75,7 +75,7 @@ async def create_job(
 
     Args:
         transport: Connections to the service.
-        files: Local files of the job.
+        files: Files of the job.
         parameters: Parameters of the job; those that are None are not sent.
         webhook: URL that is called when the job has ended.
         progress: Callback that receives the uploaded bytes and the total bytes of all large files.
@@ -121,13 +121,15 @@ async def plan_job(
 async def _send_files(
     transport: Transport, files: JobFiles, parameters: Mapping[str, Any], progress: Progress
 ) -> list[tuple[str, Any]]:
-    """Upload the large files, and return the form fields of the request, which contain the small files."""
+    """Upload the large files, and return the form fields of the request, which contain the small files and the URLs."""
     inputs = await in_thread(input_files, files)
-    total = sum(file.size for file in inputs if file.size > PART_BYTES)
+    total = sum(file.size for file in inputs if isinstance(file, InputFile) and file.size > PART_BYTES)
     done = 0
     fields: list[tuple[str, Any]] = []
     for file in inputs:
-        if file.size > PART_BYTES:
+        if isinstance(file, InputUrl):
+            fields.append((file.role, (None, file.url)))
+        elif file.size > PART_BYTES:
             upload_id = await upload(transport, file.path, file.name, partial(_report_sum, progress, done, total))
             fields.append((file.role, (None, upload_id)))
             done += file.size

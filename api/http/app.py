@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.http.context import Context
 from api.http.documentation import complete
+from api.http.fetching import Fetcher
 from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers
@@ -63,6 +64,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         store = open_store(settings, patience=settings.start_seconds, answer_seconds=_ANSWER_SECONDS)
         results = Artifacts(settings.artifacts_url)
         blobs = open_blobs(settings, store.inputs, results)
+        threads = OwnerThreads()
         context = Context(
             settings=settings,
             store=store,
@@ -75,7 +77,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             sign_ins=SignIns(),
             rates=Rates(),
             receipts=Receipts(store.inputs, blobs),
-            threads=OwnerThreads(),
+            threads=threads,
+            fetcher=Fetcher(settings, blobs, threads),
             metrics=Metrics(store, settings.folder),
             readiness=Readiness(
                 {

@@ -20,6 +20,7 @@ from urllib.parse import urlsplit
 from fastapi import Depends, Request
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
+from api.http.fetching import Fetcher
 from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.rates import Rates
@@ -94,6 +95,7 @@ class Context:
     rates: Rates
     receipts: Receipts
     threads: OwnerThreads
+    fetcher: Fetcher
 
 
 @dataclass(frozen=True)

@@ -98,8 +98,8 @@ class Received:
 
     Attributes:
         files: `role`, `name`, `sha256`, `size` of each file.
-        uploads: Index and role of each file that the service already has, with the id of its upload or the path of an
-            input. The index counts all files together.
+        uploads: Index and role of each file that is not in the request, with the id of its upload, the path of an
+            input, or a URL. The index counts all files together.
         texts: Text fields by name.
     """
 

@@ -69,14 +69,17 @@ class Receipt:
         self._charged = self._received = 0
 
     def charge(self, declared: int) -> None:
-        """Charge the bytes that a request declares; 0 if it declares none.
+        """Charge bytes that the request, or a server it names, declares; 0 if it declares none.
 
         Raises:
             QuotaError: If the owner would exceed the quota.
         """
-        self.id = self._receipts.inputs.open_receipt(self.owner, declared, self._quotas)
-        self._receipts.active.add(self.id)
-        self._charged = declared
+        if self.id is None:
+            self.id = self._receipts.inputs.open_receipt(self.owner, declared, self._quotas)
+            self._receipts.active.add(self.id)
+        elif declared:
+            self._receipts.inputs.grow_receipt(self.id, declared, self.owner, self._quotas)
+        self._charged += declared
 
     def take(self, size: int) -> None:
         """Count received bytes, and charge those that were not declared.

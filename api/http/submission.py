@@ -12,9 +12,11 @@ from service.errors import (
     BusyError,
     DamagedFileError,
     DamagedWeightsError,
+    FetchError,
     IdempotencyError,
     ImageTooLargeError,
     InspectionLimitError,
+    InvalidUrlError,
     InvalidWebhookError,
     LockedError,
     LostFileError,
@@ -33,6 +35,7 @@ from service.errors import (
     UnfinishedUploadError,
     UnknownInputError,
     UnknownUploadError,
+    UrlsOffError,
     WebhooksOffError,
 )
 from service.examples import UPLOAD_ID
@@ -52,10 +55,10 @@ from sgsst_core.files.formats import TITLES
 
 
 class JobFromUploads(BaseModel):
-    """A job from files that the service already has.
+    """A job from files that the service already has, or that it fetches.
 
-    Each file is named by the id of its upload (`POST /v1/uploads`), or by the path of an input of an earlier job, such
-    as `/v1/jobs/JOB/inputs/style:1`.
+    Each file is named by the id of its upload (`POST /v1/uploads`), by the path of an input of an earlier job, such as
+    `/v1/jobs/JOB/inputs/style:1`, or by a URL that the service fetches, if its operator allows the host.
     """
 
     model_config = ConfigDict(
@@ -72,10 +75,12 @@ class JobFromUploads(BaseModel):
         },
     )
 
-    scene: str = Field(description=f"Id of the upload with the 3DGS scene: {TITLES}; or the path of an input.")
+    scene: str = Field(
+        description=f"Id of the upload with the 3DGS scene: {TITLES}; or the path of an input, or a URL."
+    )
     style: str | Annotated[list[str], Field(min_length=1, max_length=MOST_STYLES)] = Field(
-        description="Id of the upload with the style image, or the path of an input; or a list of several, which are "
-        "mixed by `style_weights`, or belong to `regions`."
+        description="Id of the upload with the style image, the path of an input, or a URL; or a list of several, "
+        "which are mixed by `style_weights`, or belong to `regions`."
     )
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
@@ -168,6 +173,9 @@ REFUSALS: tuple[type[ServiceError] | ServiceError, ...] = (
     UnknownUploadError,
     UnknownInputError,
     UnfinishedUploadError,
+    UrlsOffError,
+    InvalidUrlError,
+    FetchError,
     WebhooksOffError,
     InvalidWebhookError,
     IdempotencyError,

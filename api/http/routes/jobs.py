@@ -14,6 +14,7 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
+from api.http.fetching import file_name, is_url
 from api.http.input_references import input_entry, parse_reference
 from api.http.multipart import (
     BodyTypeError,
@@ -136,7 +137,12 @@ async def create_job(
         receipt = await stack.enter_async_context(context.receipts.of(caller.owner, caller.quotas))
         is_json = media_type(request) == "application/json"
         reading = _from_json(request, context) if is_json else _from_form(request, context, receipt)
-        job_request = await context.threads.run(caller.owner, _find_files, context, caller, await reading)
+        parts = await reading
+        fetched: dict[str, str] = {}
+        if urls := context.fetcher.urls(parts[0].uploads):
+            await context.threads.run(caller.owner, _find_inputs, context, caller, parts, fetched)
+            fetched = await context.fetcher.fetch(urls, receipt)
+        job_request = await context.threads.run(caller.owner, _find_files, context, caller, parts, fetched)
         if not job_request.checked:
             await context.inspector.inspect(
                 "validate", caller.owner, job_request.inputs, job_request.rows, job_request.parameters
@@ -175,15 +181,28 @@ class _JobRequest:
 Parts = tuple[Received, JobParameters, str | None]
 
 
-def _find_files(context: Context, caller: Caller, parts: Parts) -> _JobRequest:
-    """Find the files of a job, and run all checks that need no inspection process."""
+def _find_inputs(
+    context: Context, caller: Caller, parts: Parts, fetched: Mapping[str, str]
+) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
+    """Return the entries of all files of a job and their blobs, after the checks that need no file's content.
+
+    Args:
+        fetched: SHA-256 of each input by URL; missing ones are entries without a blob.
+    """
     received, parameters, webhook = parts
     check_weights()
-    inputs, rows = _resolve_inputs(context, caller, received)
+    inputs, rows = _resolve_inputs(context, caller, received, fetched)
     regions = parameters.region_requests
     check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights, regions=regions)
     if webhook:
         check_url(webhook, context.settings)
+    return inputs, rows
+
+
+def _find_files(context: Context, caller: Caller, parts: Parts, fetched: Mapping[str, str]) -> _JobRequest:
+    """Find the files of a job, and run all checks that need no inspection process."""
+    inputs, rows = _find_inputs(context, caller, parts, fetched)
+    _, parameters, webhook = parts
     checked = context.inspector.recall("validate", inputs, parameters) is not None
     if not checked:
         with context.blobs.local_files(rows) as paths:
@@ -241,12 +260,12 @@ async def _from_json(request: Request, context: Context) -> Parts:
 
 
 def _resolve_inputs(
-    context: Context, caller: Caller, received: Received
+    context: Context, caller: Caller, received: Received, fetched: Mapping[str, str]
 ) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
     """Return the entries of all files of a job, and their blobs by digest.
 
-    The files come from the request, from earlier uploads and from inputs of earlier jobs. Their blobs are protected
-    from deletion for some time.
+    The files come from the request, from earlier uploads, from inputs of earlier jobs and from URLs. Their blobs are
+    protected from deletion for some time.
     """
     inputs = list(received.files)
     ids = [text for _, _, text in received.uploads if is_id(text)]
@@ -254,6 +273,9 @@ def _resolve_inputs(
     jobs: dict[str, JobRow] = {}
     resolved: list[tuple[str, str]] = []
     for _, role, text in received.uploads:
+        if is_url(text):
+            resolved.append((file_name(text), fetched.get(text, "")))
+            continue
         reference = parse_reference(text)
         if reference is not None:
             entry = _referred_input(context, caller, *reference, role, jobs)
@@ -263,11 +285,13 @@ def _resolve_inputs(
         if upload is None:
             raise UnknownUploadError(text, role)
         resolved.append((upload.filename, _upload_digest(context, upload, role)))
-    rows = context.store.inputs.hold(sorted({sha256 for _, sha256 in resolved} | {entry["sha256"] for entry in inputs}))
+    digests = {sha256 for _, sha256 in resolved} | {entry["sha256"] for entry in inputs}
+    rows = context.store.inputs.hold(sorted(filter(None, digests)))
     for number, ((index, role, _), (filename, sha256)) in enumerate(zip(received.uploads, resolved, strict=True)):
         name = clean_name(role, filename, number)
         # Keep the order of the request: style weights follow the order of the styles.
-        inputs.insert(index, {"role": role, "name": name, "sha256": sha256, "size": rows[sha256].size})
+        size = rows[sha256].size if sha256 else 0
+        inputs.insert(index, {"role": role, "name": name, "sha256": sha256, "size": size})
     return inputs, rows
 
 

@@ -25,8 +25,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from sqlalchemy import select
 
 from service.errors import RefusedInputError
+from service.outgoing import is_public
 from service.scheduling import webhooks
-from service.scheduling.webhooks import Deliverer, check_url, is_public
+from service.scheduling.webhooks import Deliverer, check_url
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob

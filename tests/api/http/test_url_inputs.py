@@ -1,0 +1,593 @@
+"""Tests of inputs by URL: allowed hosts and addresses, limits of size and time, and what a refusal leaves."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import ipaddress
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from api.client import Client
+from api.client.answers import RequestError
+from api.http.fetching import Fetcher, file_name
+from api.http.receipts import Receipts
+from api.http.threads import OwnerThreads
+from service import outgoing
+from service.errors import BusyError, FetchError, InvalidUrlError, QuotaError, ServiceError, TooLargeError, UrlsOffError
+from service.files.artifacts import Artifacts
+from service.files.blobs import Blobs
+from service.files.stored_blobs import open_blobs
+from service.outgoing import parse_origins
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.quotas import Quotas
+from tests.api.service import Service, check_documented
+from tests.small_scenes import wall, write_files
+
+#: Time limit of a test's waits in seconds.
+PATIENCE = 60.0
+#: Bytes that a server tries to send to a client that must not read them all.
+ENDLESS = 64 << 20
+FILE = b"a file\n" * 1000
+PUBLIC = "8.8.8.8"
+#: Created once, because reading all certificates takes time.
+TLS = ssl.create_default_context()
+METADATA = "169.254.169.254"
+
+Answer = Callable[[BaseHTTPRequestHandler], object]
+
+
+class FileServer:
+    """HTTP server on loopback. Each path has its own answer; all requests are recorded."""
+
+    def __init__(self) -> None:
+        self.answers: dict[str, Answer] = {}
+        self.requests: list[tuple[str, str]] = []
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                server.requests.append((self.headers["host"], self.path))
+                server.answers[self.path](self)
+
+            def log_message(self, *ignored: object) -> None:
+                return
+
+        class Server(ThreadingHTTPServer):
+            daemon_threads = True
+            block_on_close = False
+
+            def handle_error(self, *ignored: object) -> None:  # clients that leave early
+                return
+
+        self._server = Server(("127.0.0.1", 0), Handler)
+        self.port = self._server.server_port
+        self.origin = f"http://127.0.0.1:{self.port}"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def url(self, path: str, answer: Answer) -> str:
+        """Set the answer of a path, and return its URL."""
+        self.answers[path] = answer
+        return self.origin + path
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+
+def sends(body: bytes, status: int = 200, **headers: str) -> Answer:
+    """Return an answer with a body; without `Content_Length`, the body ends with the connection."""
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(status)
+        for name, value in headers.items():
+            handler.send_header(name.replace("_", "-"), value)
+        handler.end_headers()
+        handler.wfile.write(body)
+
+    return answer
+
+
+def redirects(target: str) -> Answer:
+    return sends(b"moved", 302, Location=target)
+
+
+@pytest.fixture
+def files() -> Iterator[FileServer]:
+    server = FileServer()
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def names(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
+    """Return the addresses of host names, which tests change. Other names and addresses cannot be looked up."""
+    known: dict[str, list[str]] = {"127.0.0.1": ["127.0.0.1"]}
+    getaddrinfo = socket.getaddrinfo
+
+    def look_up(host: Any, *arguments: Any, **named: Any) -> Any:
+        host = host.decode() if isinstance(host, bytes) else host
+        if host not in known:
+            raise socket.gaierror(f"{host} was looked up")
+        return [entry for address in known[host] for entry in getaddrinfo(address, *arguments, **named)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    return known
+
+
+@pytest.fixture
+def public_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Treat 127.0.0.1 as a public address, so that a server of the test can be the first hop of a redirect."""
+    loopback, is_public = ipaddress.ip_address("127.0.0.1"), outgoing.is_public
+    monkeypatch.setattr(outgoing, "is_public", lambda address: address == loopback or is_public(address))
+
+
+@dataclass
+class Stored:
+    """Content store, which is empty between tests, and the database."""
+
+    folder: Path
+    store: Store
+    blobs: Blobs
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stored]:
+    folder = tmp_path_factory.mktemp("stored")
+    settings = ServiceSettings(data=folder, min_free_bytes=0)
+    store = open_store(settings)
+    yield Stored(folder, store, open_blobs(settings, store.inputs, Artifacts(settings.artifacts_url)))
+    store.close()
+
+
+def fetch(stored: Stored, *urls: str, requests: int = 1, bytes_quota: int | None = None, **values: Any) -> list[str]:
+    """Fetch files as inputs of one request, or of several at once, and return the SHA-256 of each file.
+
+    Checks that the request leaves neither a file nor a charge, as no job takes over its files.
+    """
+    settings = ServiceSettings(**{"url_private_addresses": True, **values})
+    quotas = Quotas(stored_bytes=bytes_quota)
+
+    async def request(fetcher: Fetcher) -> list[str]:
+        async with Receipts(stored.store.inputs, stored.blobs).of("me", quotas) as receipt:
+            checked = fetcher.urls([(index, "style", url) for index, url in enumerate(urls)])
+            digests = await fetcher.fetch(checked, receipt)
+            for sha256 in digests.values():
+                path = next(iter((stored.folder / "blobs").glob(f"*/{sha256}*")))
+                assert hashlib.sha256(path.read_bytes()).hexdigest() == sha256
+            return [digests[url] for url in urls]
+
+    async def all_requests() -> list[list[str]]:
+        fetcher = Fetcher(settings, stored.blobs, OwnerThreads(), TLS)
+        return await asyncio.gather(*(request(fetcher) for _ in range(requests)))
+
+    try:
+        return asyncio.run(all_requests())[0]
+    finally:
+        assert list((stored.folder / "incoming").iterdir()) == []
+        assert list((stored.folder / "blobs").glob("*/*")) == []
+        assert stored.store.usage.of("me").stored_bytes == 0
+
+
+# --- allowed hosts --------------------------------------------------------------------------------------------------
+
+
+def test_file_is_stored_with_its_digest(stored: Stored, files: FileServer) -> None:
+    url = files.url("/scene.ply", sends(FILE))
+    assert fetch(stored, url, url_hosts=files.origin) == [hashlib.sha256(FILE).hexdigest()]
+    assert files.requests == [(f"127.0.0.1:{files.port}", "/scene.ply")]
+
+
+def test_nothing_is_fetched_by_default(stored: Stored, files: FileServer) -> None:
+    with pytest.raises(UrlsOffError):
+        fetch(stored, files.url("/a", sends(FILE)))
+    assert files.requests == []
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *(
+            "https://allowed.example.evil.test/",
+            "https://evil.test/allowed.example",
+            "https://evil.test#allowed.example",
+        ),
+        *("https://evil.test?allowed.example", "https://evil-allowed.example/", "https://sub.allowed.example/"),
+        *("https://allowed.example@evil.test/", "https://user:pw@allowed.example/"),
+        *("https://allowed.example:444/", "http://allowed.example/", "http://allowed.example:443/"),
+        *("https://allowed.example./", "https://allowed.example..evil.test/", "https://allowed%2eexample/"),
+        *("https://allowed.example\\@evil.test/", "https://evil.test\\.allowed.example/", "https:///allowed.example/"),
+        *("https://\u0430llowed.example/", "https://allowed\u3002evil.test/", "https://allowed.example\0.evil.test/"),
+        *("https://127.0.0.1/", "https://2130706433/", "https://0x7f.1/", f"http://{METADATA}/", "https://[::1]/"),
+        *("https://", "https://[::1", "https://allowed.example:99999/", "https://allowed.example/" + "a" * 2000),
+    ],
+)
+def test_only_allowed_hosts_are_contacted(url: str, stored: Stored, names: dict[str, list[str]]) -> None:
+    """Names are compared as the client will look them up; `names` fails the test's lookup of any of them."""
+    with pytest.raises(InvalidUrlError) as caught:
+        fetch(stored, url, url_hosts="allowed.example, other.example")
+    assert (caught.value.code, caught.value.extra["input"]) == ("invalid-url", "style")
+    assert len(str(caught.value)) < 800
+
+
+@pytest.mark.parametrize(
+    "url", ["https://ALLOWED.example/a", "https://allowed.example:443/a", "HTTPS://allowed.example"]
+)
+def test_spellings_of_an_allowed_host(url: str, stored: Stored, names: dict[str, list[str]]) -> None:
+    with pytest.raises(FetchError, match=r"allowed\.example was looked up"):
+        fetch(stored, url, url_hosts=" allowed.example ,")
+
+
+@pytest.mark.parametrize(
+    "entry", ["*", "*.example", "files.example/folder", "ftp://a", "a b", "a?", "a:x", "u@a", "[::1"]
+)
+def test_lists_of_hosts_are_checked_at_the_start(entry: str) -> None:
+    with pytest.raises(ValueError, match="is not a host"):
+        ServiceSettings(url_hosts=f"files.example, {entry}")
+
+
+def test_origins_of_a_list() -> None:
+    expected = {("https", "files.example", 443), ("http", "minio", 9000), ("https", "2606:4700::1111", 443)}
+    assert parse_origins("files.example,http://minio:9000/, [2606:4700::1111]") == expected
+    assert parse_origins("") == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("url", "name"),
+    [
+        ("https://a/b/scene.ply?token=x#y", "scene.ply"),
+        ("https://a/b%20c.ply", "b c.ply"),
+        ("https://a/b%2F..%2Fc.ply", "c.ply"),
+        ("https://a", ""),
+    ],
+)
+def test_name_is_the_last_part_of_the_path(url: str, name: str) -> None:
+    assert file_name(url) == name
+
+
+# --- addresses ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "addresses",
+    [
+        *(["127.0.0.1"], ["10.0.0.1"], ["192.168.1.1"], [METADATA], ["100.64.0.1"], ["0.0.0.0"], ["192.0.0.192"]),
+        *(["::1"], ["fe80::1"], ["fc00::1"], ["::ffff:127.0.0.1"], [f"64:ff9b::{METADATA}"], ["2002:7f00:1::"]),
+        *([PUBLIC, "127.0.0.1"], ["2606:4700::1111", "::1"]),
+    ],
+)
+def test_names_with_private_addresses_are_refused(
+    addresses: list[str], stored: Stored, names: dict[str, list[str]]
+) -> None:
+    names["allowed.example"] = addresses
+    with pytest.raises(InvalidUrlError, match="not public") as caught:
+        fetch(stored, "http://allowed.example/", url_hosts="http://allowed.example", url_private_addresses=False)
+    assert not any(address in str(caught.value) for address in addresses)
+
+
+def test_connection_uses_the_checked_address(
+    stored: Stored, files: FileServer, names: dict[str, list[str]], public_loopback: None
+) -> None:
+    """A second lookup of the name would return another address, so there must not be one."""
+    names["allowed.example"] = ["127.0.0.1"]
+    host = f"allowed.example:{files.port}"
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        names["allowed.example"] = ["127.0.0.2"]
+        sends(FILE)(handler)
+
+    files.answers["/a"] = answer
+    fetch(stored, f"http://{host}/a", url_hosts=f"http://{host}", url_private_addresses=False)
+    assert files.requests == [(host, "/a")]
+
+
+# --- redirects ------------------------------------------------------------------------------------------------------
+
+
+def test_redirects_among_allowed_hosts_are_followed(
+    stored: Stored, files: FileServer, names: dict[str, list[str]], public_loopback: None
+) -> None:
+    names["allowed.example"] = ["127.0.0.1"]
+    other = f"http://allowed.example:{files.port}"
+    url = files.url("/a/b", redirects("../c?d=e"))
+    files.answers |= {"/c?d=e": redirects(f"{other}/f"), "/f": sends(FILE)}
+    hosts = f"{files.origin}, {other}"
+    digests = fetch(stored, url, url_hosts=hosts, url_private_addresses=False)
+    assert digests == [hashlib.sha256(FILE).hexdigest()]
+    hops = [(host.partition(":")[0], path) for host, path in files.requests]
+    assert hops == [("127.0.0.1", "/a/b"), ("127.0.0.1", "/c?d=e"), ("allowed.example", "/f")]
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        *(f"http://{METADATA}/latest/meta-data/", f"http://[::ffff:{METADATA}]/", "http://2852039166/"),
+        *("http://allowed.example.evil.test/", "//evil.test/", "http://127.0.0.1:1/", "http://localhost/"),
+        *(
+            "file:///etc/passwd",
+            "gopher://127.0.0.1/",
+            "ftp://127.0.0.1/",
+            "http://user@127.0.0.1/",
+        ),
+        *("http://metadata.allowed/", "http://rebound.allowed/"),
+    ],
+)
+def test_redirects_are_checked_like_urls(
+    target: str, stored: Stored, files: FileServer, names: dict[str, list[str]], public_loopback: None
+) -> None:
+    """Some targets are not allowed. Others are allowed names, but lead to addresses that are not public."""
+    names["metadata.allowed"], names["rebound.allowed"] = [METADATA], [PUBLIC, "10.0.0.1"]
+    url = files.url("/a", redirects(target))
+    hosts = f"{files.origin}, http://metadata.allowed, http://rebound.allowed"
+    with pytest.raises(InvalidUrlError) as caught:
+        fetch(stored, url, url_hosts=hosts, url_private_addresses=False)
+    assert str(caught.value).startswith(repr(url))
+    assert len(files.requests) == 1
+
+
+@pytest.mark.parametrize("location", ["http://[::1", "http://a:99999999/", "/\x7f", "data:text/plain,x"])
+def test_invalid_redirects_are_refused(location: str, stored: Stored, files: FileServer) -> None:
+    with pytest.raises((FetchError, InvalidUrlError)):
+        fetch(stored, files.url("/a", redirects(location)), url_hosts=files.origin)
+    assert len(files.requests) == 1
+
+
+def test_redirect_loops_end(stored: Stored, files: FileServer) -> None:
+    with pytest.raises(FetchError, match="redirects more than 5 times"):
+        fetch(stored, files.url("/a", redirects("/a")), url_hosts=files.origin)
+    assert len(files.requests) == 6
+
+
+# --- bodies ---------------------------------------------------------------------------------------------------------
+
+
+def test_declared_size_is_checked_first(stored: Stored, files: FileServer) -> None:
+    url = files.url("/a", sends(b"", Content_Length="1001"))
+    with pytest.raises(TooLargeError):
+        fetch(stored, url, url_hosts=files.origin, url_bytes=1000)
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_undeclared_size_is_limited(chunked: bool, stored: Stored, files: FileServer) -> None:
+    sent, cut_off = [0], threading.Event()
+
+    def endless(handler: BaseHTTPRequestHandler) -> None:
+        handler.wfile.write(b"HTTP/1.1 200 OK\r\n" + b"Transfer-Encoding: chunked\r\n" * chunked + b"\r\n")
+        try:
+            while sent[0] < ENDLESS:
+                sent[0] += handler.wfile.write(b"10000\r\n" + bytes(1 << 16) + b"\r\n" if chunked else bytes(1 << 16))
+        except OSError:
+            cut_off.set()
+
+    with pytest.raises(TooLargeError):
+        fetch(stored, files.url("/a", endless), url_hosts=files.origin, url_bytes=1_000_000)
+    assert cut_off.wait(PATIENCE), f"{sent[0]:,} bytes were read"
+
+
+def test_size_limit_counts_all_files_of_a_request(stored: Stored, files: FileServer) -> None:
+    urls = [files.url(f"/{index}", sends(FILE)) for index in range(3)]
+    assert len(fetch(stored, *urls, url_hosts=files.origin, url_bytes=3 * len(FILE))) == 3
+    with pytest.raises(TooLargeError):
+        fetch(stored, *urls, url_hosts=files.origin, url_bytes=3 * len(FILE) - 1)
+
+
+def test_bytes_count_toward_the_quota(stored: Stored, files: FileServer) -> None:
+    """The second file exceeds the quota, with and without a declared size."""
+    urls = [files.url("/a", sends(FILE, Content_Length=str(len(FILE)))), files.url("/b", sends(FILE + b"b"))]
+    for order in (urls, urls[::-1]):
+        with pytest.raises(QuotaError):
+            fetch(stored, *order, url_hosts=files.origin, bytes_quota=2 * len(FILE))
+
+
+def test_missing_bytes_are_noticed(stored: Stored, files: FileServer) -> None:
+    with pytest.raises(FetchError):
+        fetch(stored, files.url("/a", sends(FILE, Content_Length="10000000")), url_hosts=files.origin)
+
+
+def test_bytes_beyond_the_declared_size_are_ignored(stored: Stored, files: FileServer) -> None:
+    url = files.url("/a", sends(FILE, Content_Length="7"))
+    assert fetch(stored, url, url_hosts=files.origin) == [hashlib.sha256(FILE[:7]).hexdigest()]
+
+
+@pytest.mark.parametrize("length", ["-1", "x", "1_0", "7, 8", "9" * 5000, ""])
+def test_malformed_sizes_are_refused(length: str, stored: Stored, files: FileServer) -> None:
+    with pytest.raises((FetchError, TooLargeError)):
+        fetch(stored, files.url("/a", sends(FILE, Content_Length=length)), url_hosts=files.origin)
+
+
+@pytest.mark.parametrize("status", [204, 206, 304, 401, 404, 500])
+def test_other_answers_are_refused(status: int, stored: Stored, files: FileServer) -> None:
+    with pytest.raises(FetchError, match=f"answered {status}"):
+        fetch(stored, files.url("/a", sends(b"", status, Content_Length="0")), url_hosts=files.origin)
+
+
+def test_compressed_answers_are_refused(stored: Stored, files: FileServer) -> None:
+    with pytest.raises(FetchError, match="compresses"):
+        fetch(stored, files.url("/a", sends(FILE, Content_Encoding="gzip")), url_hosts=files.origin)
+
+
+def test_empty_files_are_refused(stored: Stored, files: FileServer) -> None:
+    with pytest.raises(ServiceError, match="a: is empty"):
+        fetch(stored, files.url("/a", sends(b"")), url_hosts=files.origin)
+
+
+def test_unreachable_servers_are_reported(stored: Stored, names: dict[str, list[str]]) -> None:
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        origin = f"http://127.0.0.1:{closed.getsockname()[1]}"
+        with pytest.raises(FetchError):
+            fetch(stored, f"{origin}/a", url_hosts=origin)
+
+
+# --- time -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("head", [b"", b"HTTP/1.1 200 OK\r\nX: ", b"HTTP/1.1 200 OK\r\nContent-Length: 99999\r\n\r\n"])
+def test_slow_answers_are_cut_off_at_the_deadline(head: bytes, stored: Stored, files: FileServer) -> None:
+    """No single read takes long, but one deadline covers the whole request."""
+    cut_off = threading.Event()
+
+    def drip(handler: BaseHTTPRequestHandler) -> None:
+        handler.wfile.write(head)
+        try:
+            while not cut_off.wait(0.02):
+                handler.wfile.write(b"x" if head else b"HTTP/1.1 100 Continue\r\n\r\n")
+        except OSError:
+            cut_off.set()
+
+    with pytest.raises(FetchError, match=r"within 0\.5 s"):
+        fetch(stored, files.url("/a", drip), url_hosts=files.origin, url_seconds=0.5)
+    assert cut_off.wait(PATIENCE)
+
+
+def test_deadline_covers_all_files_and_redirects(stored: Stored, files: FileServer) -> None:
+    """Each of the endlessly many hops is fast, but their requests are served slowly together."""
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        time.sleep(0.2)
+        sends(FILE)(handler)
+
+    urls = [files.url(f"/{index}", answer) for index in range(50)]
+    with pytest.raises(FetchError, match="within 1 s"):
+        fetch(stored, *urls, url_hosts=files.origin, url_seconds=1)
+    assert len(files.requests) < 50
+
+
+def test_deadline_covers_lookups(stored: Stored, monkeypatch: pytest.MonkeyPatch) -> None:
+    release = threading.Event()
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *arguments, **named: release.wait(PATIENCE) and [])
+    with pytest.raises(FetchError, match="within"):
+        fetch(stored, "https://allowed.example/", url_hosts="allowed.example", url_seconds=0.5)
+    release.set()
+
+
+def test_requests_of_one_owner_are_limited(stored: Stored, files: FileServer) -> None:
+    release = threading.Event()
+    url = files.url("/a", lambda handler: release.wait(PATIENCE))
+    with pytest.raises(BusyError):
+        fetch(stored, url, requests=5, url_hosts=files.origin)
+    release.set()
+
+
+# --- requests -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shared_files() -> Iterator[FileServer]:
+    server = FileServer()
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, shared_files: FileServer) -> Iterator[Service]:
+    settings = {"SGSST_URL_HOSTS": shared_files.origin, "SGSST_URL_PRIVATE_ADDRESSES": "true"}
+    with Service(tmp_path_factory.mktemp("urls") / "data", alone=True, **settings) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def urls(tmp_path_factory: pytest.TempPathFactory, shared_files: FileServer) -> dict[str, str]:
+    paths = write_files(tmp_path_factory.mktemp("files"), wall())
+    return {
+        role: shared_files.url(f"/{path.name}", sends(path.read_bytes()))
+        for role, path in zip(("scene", "cameras", "style"), paths, strict=True)
+    }
+
+
+def test_job_from_urls(service: Service, shared_files: FileServer, urls: dict[str, str]) -> None:
+    """JSON and forms may name URLs. The inputs have the names and the digests of the files."""
+    named = {"scene": urls["scene"], "style": urls["style"], "cameras": [urls["cameras"]]}
+    with service.client() as client:
+        by_json = client.post("/v1/jobs", json=named)
+        by_form = client.post("/v1/jobs", data=urls, files=[("webhook", (None, ""))])
+        for answer in (by_json, by_form):
+            assert answer.status_code == 202, answer.text
+            job = answer.json()
+            assert {entry["role"]: entry["name"] for entry in job["inputs"]} == {
+                role: url.rsplit("/", 1)[1] for role, url in urls.items()
+            }
+            for entry in job["inputs"]:
+                role = entry["role"]
+                content = client.get(f"/v1/jobs/{job['id']}/inputs/{role}").content
+                assert content == httpx.get(urls[role]).content
+                assert hashlib.sha256(content).hexdigest() == entry["sha256"]
+
+
+def test_client_submits_urls_and_files(service: Service, urls: dict[str, str], tmp_path: Path) -> None:
+    style = tmp_path / "local.png"
+    style.write_bytes(httpx.get(urls["style"]).content)
+    with Client(service.url) as client:
+        styles: list[str | Path] = [urls["style"], style]
+        job = client.submit(urls["scene"], styles, cameras=urls["cameras"], style_weights=[0.7, 0.3])
+        names = [entry["name"] for entry in job.data["inputs"] if entry["role"] == "style"]
+        assert names == [urls["style"].rsplit("/", 1)[1], "local.png"]
+        with pytest.raises(RequestError, match="not among the hosts"):
+            client.submit("https://evil.test/scene.ply", style, orbit=3)
+
+
+def test_requests_are_checked_before_anything_is_fetched(
+    service: Service, shared_files: FileServer, urls: dict[str, str]
+) -> None:
+    wrong: list[tuple[str, dict[str, Any]]] = [
+        ("invalid-cameras", {"scene": urls["scene"], "style": urls["style"]}),
+        ("unknown-upload", {"scene": urls["scene"], "style": "x", "cameras": [urls["cameras"]]}),
+        ("invalid-url", {"scene": urls["scene"], "style": "http://evil.test/", "cameras": [urls["cameras"]]}),
+        ("webhooks-off", {**urls, "cameras": [urls["cameras"]], "webhook": "https://example.com/"}),
+        ("invalid-request", {**urls, "cameras": [urls["cameras"]], "parameters": {"seed": -1}}),
+    ]
+    before = len(shared_files.requests)
+    with service.client() as client:
+        for code, body in wrong:
+            answer = client.post("/v1/jobs", json=body)
+            assert (answer.status_code, answer.json()["code"]) == (422, code)
+            check_documented(answer)
+    assert len(shared_files.requests) == before
+
+
+def test_failures_are_problem_documents(service: Service, shared_files: FileServer, urls: dict[str, str]) -> None:
+    """The style is missing, no image, or no file that may be fetched; nothing stays of the fetched scene."""
+    bad = {
+        "url-not-fetched": sends(b"", 404),
+        "invalid-url": redirects(f"http://{METADATA}/"),
+        "invalid-image": sends(b"no image"),
+    }
+    stored = sorted((service.data / "blobs").glob("*/*"))
+    scene = shared_files.url("/other.ply", sends(httpx.get(urls["scene"]).content + b"\n"))
+    with service.client() as client:
+        for code, answer in bad.items():
+            body = {"scene": scene, "style": shared_files.url("/bad", answer), "cameras": [urls["cameras"]]}
+            response = client.post("/v1/jobs", json=body)
+            assert (response.status_code, response.json()["code"]) == (422, code), response.text
+            check_documented(response)
+    assert list((service.data / "incoming").iterdir()) == []
+    assert sorted((service.data / "blobs").glob("*/*")) == stored
+
+
+def test_other_requests_do_not_wait(service: Service, shared_files: FileServer, urls: dict[str, str]) -> None:
+    """While servers keep fetching requests waiting, the service answers others."""
+    release = threading.Event()
+    slow = shared_files.url("/slow", lambda handler: release.wait(PATIENCE))
+    body = {"scene": slow, "style": slow, "cameras": [urls["cameras"]]}
+    with service.client() as client, ThreadPoolExecutor(4) as pool:
+        before = len(shared_files.requests)
+        waiting = [pool.submit(client.post, "/v1/jobs", json=body) for _ in range(4)]
+        deadline = time.monotonic() + PATIENCE
+        while len(shared_files.requests) < before + 4 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert client.post("/v1/jobs", json=body).json()["code"] == "busy"
+        assert client.get("/v1/jobs").status_code == 200
+        release.set()
+        assert {each.result().json()["code"] for each in waiting} == {"url-not-fetched"}
