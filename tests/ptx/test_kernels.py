@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from sgsst_core.constants import ALPHA_MIN
 from sgsst_core.features.pooling import fused_max_pool_backward, max_pool_backward_reference
 from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
 from sgsst_core.loss.statistics_terms import fused_add_style_gradient
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.rasterizer.triton_cached import CountedPieces
 from sgsst_core.rasterizer.triton_kernels import PAIRS
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import CLASSIC, Rendering
 from tests.ptx.driver import PtxDriver, compiled_kernels
 from tests.ptx.machine import Kernel
@@ -42,6 +47,36 @@ def test_images_and_gradients_agree_with_reference(capability: int, rendering: R
         for rasterizer in (uncached, CachedRasterizer(scene, uncached=uncached)):
             assert relative_error(rasterizer.render(colors, camera), image) < 3e-7
             assert relative_error(rasterizer.color_gradient(image_gradient, camera), gradient) < 5e-7
+
+
+def test_only_pixels_near_a_cutoff_have_larger_errors() -> None:
+    """The nearest Gaussian has, in one pixel, a value of alpha that is just above its cutoff, or just below it."""
+    scene, camera = replace(ball(60), opacities=torch.linspace(-2, 3, 60)), cameras(1, 19, 17)[0]
+    nearest = scene.means[:, 2].argmin()
+    alpha = make_rasterizer("reference", scene.subset(nearest[None])).coverage(camera)
+    at_cutoff = torch.logit(scene.opacities[nearest].double().sigmoid() * ALPHA_MIN / alpha[alpha > 0].min())
+    colors, image_gradient = torch.rand((60, 3)), synthetic_image(17, 19, dtype=torch.float32) - 0.5
+    errors = []
+    for change in (3e-7, -3e-7):
+        opacities = scene.opacities.clone()
+        opacities[nearest] = at_cutoff + change
+        changed = replace(scene, opacities=opacities)
+        reference = ReferenceRasterizer(changed)
+        near = reference.near_cutoff(camera, 1e-6)
+        assert int(near.sum()) == 1
+        elsewhere = image_gradient * ~near[..., None]
+        image, gradient = (
+            reference.render(colors.double(), camera),
+            reference.color_gradient(elsewhere.double(), camera),
+        )
+        with compiled_kernels(90):
+            rasterizer = make_rasterizer("triton", changed)
+            actual = rasterizer.render(colors, camera)
+            assert relative_error(rasterizer.color_gradient(elsewhere, camera), gradient) < 3e-7
+        assert relative_error(actual[~near], image[~near]) < 3e-7
+        errors.append(relative_error(actual, image))
+    assert max(errors) > 1e-5, "a Gaussian is blended in one of them only"
+    assert min(errors) < 3e-7
 
 
 def test_statistics_of_many_spans_agree_with_float64() -> None:
@@ -176,34 +211,72 @@ def other_lane(instruction: Instruction) -> Instruction | None:
     return replace(instruction, operands=(target, source, "0", *rest))
 
 
-@pytest.mark.parametrize("name", ["render", "slot_gradients"])
-def test_mutations_of_compositing_are_reported(name: str) -> None:
-    """Raster tiles at the border have pixels outside of the view, and more Gaussians than are prepared at once."""
-    scene, camera = replace(ball(60), opacities=torch.linspace(-2, 3, 60)), cameras(1, 19, 17)[0]
-    colors, image_gradient = torch.rand((len(scene), 3)), torch.rand((camera.height, camera.width, 3))
+def joined(tensors: Iterable[Tensor]) -> Tensor:
+    """Return all values of some tensors."""
+    return torch.cat([tensor.double().flatten() for tensor in tensors])
+
+
+def results_of(rasterizer: TritonRasterizer, camera: Camera) -> dict[str, Callable[[], Tensor]]:
+    """Return for each compositing kernel a function that runs it and returns all of its results."""
+    colors, image_gradient = torch.rand((len(rasterizer.scene), 3)), torch.rand((camera.height, camera.width, 3))
+    counted = CountedPieces(rasterizer, camera)
+
+    def count() -> Tensor:
+        pieces = CountedPieces(rasterizer, camera)
+        return joined((pieces.masks, pieces.slot_pieces, pieces.block_pieces, pieces.ends))
+
+    def store() -> Tensor:
+        pieces = counted.store("float32")
+        return joined((pieces.piece_gaussians, pieces.piece_slots, pieces.weights, pieces.transmittance))
+
+    return {
+        "render": lambda: rasterizer.render(colors, camera),
+        "slot_gradients": lambda: rasterizer.color_gradient(image_gradient, camera),
+        "survey": lambda: joined(rasterizer.survey(camera)),
+        "count_pieces": count,
+        "store_pieces": store,
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "broadcasts"),
+    [
+        ("render", 9),
+        ("slot_gradients", 6),
+        pytest.param("survey", 6, marks=pytest.mark.slow),
+        pytest.param("count_pieces", 8, marks=pytest.mark.slow),
+        pytest.param("store_pieces", 7, marks=pytest.mark.slow),
+    ],
+)
+def test_mutations_of_compositing_are_reported(name: str, broadcasts: int) -> None:
+    """Raster tiles at the border have pixels outside of the view, and more Gaussians than are prepared at once.
+
+    The view ends between two blocks, in the middle of the ball, so that a pixel too many has weights in another block.
+    """
+    scene = replace(ball(120), opacities=torch.linspace(-2, 3, 120))
+    camera = cameras(1, 40, 40)[0].cropped(0, 0, 20, 20)
     with compiled_kernels(90) as driver:
         rasterizer = make_rasterizer("triton", scene)
-        assert int(rasterizer.intersections(camera).starts.diff().max()) > PAIRS.value  # type: ignore[attr-defined]
-        run = {
-            "render": lambda: rasterizer.render(colors, camera),
-            "slot_gradients": lambda: rasterizer.color_gradient(image_gradient, camera),
-        }[name]
+        assert isinstance(rasterizer, TritonRasterizer)
+        assert int(rasterizer.intersections(camera).starts.diff().max()) > PAIRS.value
+        run = results_of(rasterizer, camera)[name]
         run()
         kernel = driver.kernels[name]
-        broadcasts = reports(kernel, other_lane, run)
-        assert len(broadcasts) >= {"render": 9, "slot_gradients": 6}[name]
-        assert all(broadcasts)
+        reported = reports(kernel, other_lane, run)
+        assert len(reported) >= broadcasts
+        assert all(reported)
         assert sum(reports(kernel, shifted, run)) >= 3
 
 
-def test_every_removed_barrier_of_rendering_is_reported() -> None:
-    scene, camera = ball(60), cameras(1, 19, 17)[0]
-    colors = torch.rand((len(scene), 3))
+@pytest.mark.parametrize("name", ["render", pytest.param("store_pieces", marks=pytest.mark.slow)])
+def test_every_removed_barrier_of_compositing_is_reported(name: str) -> None:
+    """Compositing kernels that sum over pixels have a single warp, which needs no barriers."""
     with compiled_kernels(90) as driver:
-        rasterizer = make_rasterizer("triton", scene)
-        rasterizer.render(colors, camera)
-        kernel = driver.kernels["render"]
-        reported = reports(kernel, without_barrier, lambda: rasterizer.render(colors, camera))
+        rasterizer = make_rasterizer("triton", ball(60))
+        assert isinstance(rasterizer, TritonRasterizer)
+        run = results_of(rasterizer, cameras(1, 19, 17)[0])[name]
+        run()
+        reported = reports(driver.kernels[name], without_barrier, run)
     assert len(reported) >= 2
     assert all(reported)
 
