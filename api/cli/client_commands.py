@@ -253,7 +253,14 @@ def jobs(
     console.print(table)
 
 
-COMMANDS = (submit, status, watch, download, finish, cancel, retry, delete, jobs)
+def mcp(url: UrlOption = None, key: KeyOption = None) -> None:
+    """Serve the tools of a language model on standard input and output, by the Model Context Protocol."""
+    from api.cli.mcp_server import serve
+
+    serve(url, key)
+
+
+COMMANDS = (submit, status, watch, download, finish, cancel, retry, delete, jobs, mcp)
 
 # --- shared --------------------------------------------------------------------------------------------------------
 

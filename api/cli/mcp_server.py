@@ -1,0 +1,243 @@
+"""MCP server of `sgsst mcp`: tools with which a language model uses the service, over the asynchronous client.
+
+The SDK evaluates the annotations of the tools, so that all of their names are imported when the module is loaded.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import anyio
+import anyio.to_thread
+from mcp.server.mcpserver import Image, MCPServer
+from mcp.server.mcpserver.exceptions import ToolError
+from mcp_types import CallToolResult, TextContent, ToolAnnotations
+from pydantic import BaseModel, Field
+
+from api.client import AsyncClient
+from api.client.answers import Job
+from service.parameters import JobParameters
+from sgsst_core.errors import SgsstError
+from sgsst_core.files.formats import RESULT_SUFFIXES, ResultName, format_of_name
+from sgsst_core.files.formats.ply import PLY
+
+_INSTRUCTIONS = """
+Style transfer for 3D Gaussian Splatting scenes: the colors of a scene are optimized so that its views look like a
+painting. Call `estimate` to learn how long a job takes, `submit` to queue it, `status` every few seconds until it has
+ended, and `result` for a preview and the stylized scene. `blend` mixes the scene with its result, or with several.
+"""
+#: Artifact with the stylized scene.
+_RESULT = "stylized.ply"
+_READS = ToolAnnotations(read_only_hint=True, open_world_hint=False)
+_CREATES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
+
+Scene = Annotated[str, Field(description="Scene: path of a PLY, SPZ, SOG, GLB, .ksplat or .splat file, or a URL.")]
+Styles = Annotated[list[str], Field(min_length=1, description="Style images: paths or URLs. Several are mixed.")]
+Cameras = Annotated[
+    str | None,
+    Field(description="Cameras: path of a cameras.json, transforms.json or COLMAP model. Null needs `orbit`."),
+]
+Photos = Annotated[str | None, Field(description="Folder of the photos of the cameras; null if there are none.")]
+Options = Annotated[
+    dict[str, Any] | None,
+    Field(
+        description="Options by name, such as `preset` (preview, standard or paper), `orbit` (number of views around "
+        "an object, in place of cameras), `content_weight` (light, balanced or strong), `style_weights`, "
+        "`preserve_colors`, `seconds` (time limit). /docs of the service lists all."
+    ),
+]
+JobId = Annotated[str, Field(description="ID of a job, from `submit`.")]
+Out = Annotated[
+    str | None,
+    Field(description=f"File to write the scene to, which must not exist: {RESULT_SUFFIXES}. Null writes none."),
+]
+
+
+class Estimate(BaseModel):
+    """Time, memory and size of a job that was not queued."""
+
+    total_seconds: float | None
+    memory_bytes: int | None
+    gaussians: int
+    views: int
+    warnings: list[str]
+
+
+class State(BaseModel):
+    """State of a job."""
+
+    job_id: str
+    name: str
+    status: str
+    stage: str | None
+    fraction: float | None
+    seconds_left: float | None
+    queue_position: int | None
+    result: dict[str, Any] | None
+    error: str | None
+    page: str
+
+
+class Result(BaseModel):
+    """Result of a job."""
+
+    job_id: str
+    status: str
+    urls: dict[str, str]
+    path: str | None
+
+
+class Blended(BaseModel):
+    """Stored blend."""
+
+    url: str
+    path: str | None
+
+
+class Tools:
+    """Tools of the MCP server. Expected errors become messages to the model."""
+
+    def __init__(self, client: AsyncClient) -> None:
+        self._client = client
+
+    async def estimate(
+        self, scene: Scene, style: Styles, cameras: Cameras = None, photos: Photos = None, options: Options = None
+    ) -> Estimate:
+        """Check the files of a job and estimate its time and memory, without queueing it."""
+        with _messages():
+            plan = await self._client.plan(scene, style, cameras=cameras, photos=photos, **_known(options))
+        return Estimate(**{name: plan[name] for name in Estimate.model_fields})
+
+    async def submit(
+        self, scene: Scene, style: Styles, cameras: Cameras = None, photos: Photos = None, options: Options = None
+    ) -> State:
+        """Queue a job that stylizes a scene. It continues on the service whatever happens here."""
+        with _messages():
+            return self._state(
+                await self._client.submit(scene, style, cameras=cameras, photos=photos, **_known(options))
+            )
+
+    async def status(self, job_id: JobId) -> State:
+        """Show the status and progress of a job."""
+        with _messages():
+            return self._state(await self._client.job(job_id))
+
+    async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, Result]:
+        """Show the newest image of a job and the addresses of its files, and write its scene to a file."""
+        with _messages():
+            job = await self._client.job(job_id)
+            artifacts = await self._client.artifacts(job_id)
+            path = await self._write(job_id, _RESULT, out, _format(out)) if out else None
+            preview = job.data["preview"]
+            image = await self._image(job_id, preview) if preview else None
+        urls = {each["name"]: f"{self._client.url}{each['url']}" for each in artifacts}
+        result = Result(job_id=job_id, status=job.status, urls=urls, path=path)
+        text = TextContent(type="text", text=result.model_dump_json())
+        content = [text] if image is None else [text, image.to_image_content()]
+        return CallToolResult(content=content, structured_content=result.model_dump(mode="json"))
+
+    async def blend(
+        self,
+        job_id: JobId,
+        weight: Annotated[float, Field(description="Weight of the result; the scene has the rest up to 1.")],
+        others: Annotated[
+            dict[str, float] | None, Field(description="Weights of results of other jobs of the scene by job ID.")
+        ] = None,
+        out: Out = None,
+    ) -> Blended:
+        """Blend the scene of a finished job with its result, and with results of other jobs of the scene."""
+        with _messages():
+            name = await self._client.blend(job_id, weight, others, _format(out) or PLY.name)
+            path = await self._write(job_id, name, out) if out else None
+        return Blended(url=f"{self._client.url}/v1/jobs/{job_id}/artifacts/{name}", path=path)
+
+    def _state(self, job: Job) -> State:
+        progress = job.progress or {}
+        return State(
+            job_id=job.id,
+            name=job.data["name"],
+            status=job.status,
+            stage=progress.get("stage"),
+            fraction=progress.get("fraction"),
+            seconds_left=progress.get("eta_s"),
+            queue_position=job.data["queue_position"],
+            result=job.data["result"],
+            error=job.error["message"] if job.error else None,
+            page=f"{self._client.url}/#/jobs/{job.id}",
+        )
+
+    async def _write(self, job_id: str, name: str, out: str, format: ResultName | None = None) -> str:
+        """Download an artifact to a new file, and return the file's absolute path."""
+        target = await anyio.to_thread.run_sync(_new_file, out)
+        return str(await self._client.download(job_id, target, name, format=None if format == PLY.name else format))
+
+    async def _image(self, job_id: str, name: str) -> Image:
+        """Download a preview image."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = await self._client.download(job_id, Path(folder) / "preview.jpg", name)
+            return Image(data=await anyio.to_thread.run_sync(path.read_bytes), format="jpeg")
+
+
+def _new_file(out: str) -> Path:
+    """Return the absolute path of a file that does not exist yet, in a folder that does."""
+    path = Path(out).absolute()
+    if path.exists():
+        raise ToolError(f"{path}: exists. Name another file.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _format(out: str | None) -> ResultName | None:
+    """Return the format of a file to write, from its name; None for no file."""
+    if out is None:
+        return None
+    format = format_of_name(Path(out).name)
+    if format is None or not format.write:
+        raise ToolError(f"{out}: has no extension of a scene. Use {RESULT_SUFFIXES}.")
+    return format.name
+
+
+def _known(options: dict[str, Any] | None) -> dict[str, Any]:
+    """Return options after checking their names, among which may be no other arguments of the client."""
+    unknown = sorted(set(options or {}) - set(JobParameters.model_fields))
+    if unknown:
+        raise ToolError(f"Unknown options: {', '.join(unknown)}. /docs of the service lists all.")
+    return options or {}
+
+
+@contextmanager
+def _messages() -> Iterator[None]:
+    """Raise ToolError, whose message is passed to the model, in place of expected errors."""
+    try:
+        yield
+    except (SgsstError, OSError) as error:
+        raise ToolError(str(error)) from error
+
+
+def make_server(client: AsyncClient) -> MCPServer[None]:
+    """Return the server with its tools."""
+    server: MCPServer[None] = MCPServer(
+        "sgsst", instructions=_INSTRUCTIONS, version=version("sgsst-service"), log_level="WARNING"
+    )
+    tools = Tools(client)
+    server.add_tool(tools.estimate, annotations=_READS)
+    server.add_tool(tools.submit, annotations=_CREATES)
+    server.add_tool(tools.status, annotations=_READS)
+    server.add_tool(tools.result, annotations=_CREATES)
+    server.add_tool(tools.blend, annotations=_CREATES)
+    return server
+
+
+def serve(url: str | None, key: str | None) -> None:
+    """Serve on standard input and output until the input ends."""
+    anyio.run(_serve, url, key)
+
+
+async def _serve(url: str | None, key: str | None) -> None:
+    async with AsyncClient(url, key) as client:
+        await make_server(client).run_stdio_async()

@@ -1,0 +1,138 @@
+"""Tests of `sgsst mcp`: the SDK's own client over standard input and output, against a real service."""
+
+from __future__ import annotations
+
+import base64
+import io
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from mcp import Client as McpClient
+from mcp import StdioServerParameters
+from mcp_types import CallToolResult, ImageContent, TextContent
+from PIL import Image
+
+from api.client import AsyncClient
+from tests.api.service import ROOT, Service
+from tests.small_scenes import wall, write_files
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
+    return {"scene": str(ply), "cameras": str(cameras), "style": str(style)}
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
+    with Service(tmp_path_factory.mktemp("mcp") / "data") as running:
+        yield running
+
+
+@asynccontextmanager
+async def tools(url: str) -> AsyncIterator[McpClient]:
+    """Start `sgsst mcp` as an application with a language model would, and connect to it."""
+    arguments = ["-m", "api.cli", "mcp", "--url", url]
+    command = StdioServerParameters(command=sys.executable, args=arguments, env={"PYTHONPATH": str(ROOT)})
+    async with McpClient(command) as client:
+        yield client
+
+
+async def call(client: McpClient, name: str, **arguments: Any) -> dict[str, Any]:
+    """Call a tool, and return its structured result."""
+    result = await client.call_tool(name, arguments)
+    assert not result.is_error, result.content
+    assert result.structured_content is not None
+    return result.structured_content
+
+
+async def refusal(client: McpClient, name: str, **arguments: Any) -> str:
+    """Call a tool that refuses its arguments, and return the message."""
+    result: CallToolResult = await client.call_tool(name, arguments)
+    assert result.is_error
+    return "".join(each.text for each in result.content if isinstance(each, TextContent))
+
+
+def test_tools_describe_themselves(service: Service) -> None:
+    async def run() -> None:
+        async with tools(service.url) as client:
+            listed = {tool.name: tool for tool in (await client.list_tools()).tools}
+            assert "estimate" in (client.instructions or "")
+        assert listed.keys() == {"estimate", "submit", "status", "result", "blend"}
+        for tool in listed.values():
+            assert tool.description
+            assert tool.output_schema
+            assert all(each.get("description") for each in tool.input_schema["properties"].values())
+        reading = {name for name, tool in listed.items() if tool.annotations and tool.annotations.read_only_hint}
+        assert reading == {"estimate", "status"}
+
+    anyio.run(run)
+
+
+def test_scene_is_estimated_stylized_and_blended(service: Service, files: dict[str, str], tmp_path: Path) -> None:
+    inputs = {**files, "style": [files["style"]], "options": {"steps_coarse": 0, "steps_sos": 5}}
+
+    async def run() -> None:
+        async with tools(service.url) as client, AsyncClient(service.url) as direct:
+            estimate = await call(client, "estimate", **inputs)
+            assert (estimate["gaussians"], estimate["views"]) == (616, 3)
+            assert [job async for job in direct.jobs()] == []
+            job_id = (await call(client, "submit", **inputs))["job_id"]
+            await direct.wait(job_id)
+            state = await call(client, "status", job_id=job_id)
+            assert (state["status"], state["page"]) == ("succeeded", f"{service.url}/#/jobs/{job_id}")
+            assert state["result"]["loss_after"] < state["result"]["loss_before"]
+
+            answer = await client.call_tool("result", {"job_id": job_id, "out": str(tmp_path / "new" / "a.ply")})
+            image = next(each for each in answer.content if isinstance(each, ImageContent))
+            assert Image.open(io.BytesIO(base64.b64decode(image.data))).format == "JPEG"
+            result = answer.structured_content or {}
+            expected = await direct.download(job_id, tmp_path / "expected.ply")
+            assert Path(result["path"]).read_bytes() == expected.read_bytes()
+            assert result["urls"]["stylized.ply"] == f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply"
+
+            blend = await call(client, "blend", job_id=job_id, weight=0.5, out=str(tmp_path / "half.spz"))
+            name = await direct.blend(job_id, 0.5, format="spz")
+            assert blend["url"].endswith(f"/{job_id}/artifacts/{name}")
+            stored = await direct.download(job_id, tmp_path / "stored.spz", name)
+            assert Path(blend["path"]).read_bytes() == stored.read_bytes()
+
+    anyio.run(run)
+
+
+def test_refusals_are_messages(service: Service, files: dict[str, str], tmp_path: Path) -> None:
+    missing = "job_1a1fe701a104f943e9d4d8cce5b818c"
+    inputs = {**files, "style": [files["style"]]}
+
+    async def run() -> None:
+        async with tools(service.url) as client:
+            assert "no job" in await refusal(client, "status", job_id=missing)
+            assert "Check the path" in await refusal(client, "submit", **inputs | {"scene": "/missing.ply"})
+            assert "switched off" in await refusal(client, "submit", **inputs | {"scene": "https://evil.test/a.ply"})
+            assert "Unknown options: webhook" in await refusal(client, "submit", **inputs, options={"webhook": "x"})
+            assert "seed" in await refusal(client, "estimate", **inputs, options={"seed": -1})
+            assert "extension" in await refusal(client, "blend", job_id=missing, weight=1, out="a.txt")
+        async with tools("http://127.0.0.1:1") as client:
+            assert "cannot be reached" in await refusal(client, "status", job_id=missing)
+
+    anyio.run(run)
+
+
+def test_existing_files_are_kept(service: Service, files: dict[str, str], tmp_path: Path) -> None:
+    kept = tmp_path / "kept.ply"
+    kept.write_bytes(b"mine")
+
+    async def run() -> None:
+        async with tools(service.url) as client:
+            job_id = (await call(client, "submit", **files | {"style": [files["style"]]}))["job_id"]
+            assert "Name another file" in await refusal(client, "result", job_id=job_id, out=str(kept))
+
+    anyio.run(run)
+    assert kept.read_bytes() == b"mine"
