@@ -296,12 +296,12 @@ def modes() -> Iterator[None]:
 
 
 def _let_tensors_be_on_cuda() -> None:
-    """Register the CPU's device guard, which does nothing, for CUDA if PyTorch was built without CUDA.
+    """Register the CPU's device guard, which does nothing, for CUDA.
 
-    Indexing and a few other operations need a guard before they reach `dispatch`. PyTorch stores pointers to guards in
-    a table by device type (c10/core/impl/DeviceGuardImplInterface.h); the second entry is CUDA's.
+    Indexing and a few other operations need a guard before they reach `dispatch`. PyTorch without CUDA has none, and
+    that of PyTorch with CUDA asks the driver, which is missing here. Pointers to guards are stored in a table by device
+    type (c10/core/impl/DeviceGuardImplInterface.h); the second entry is CUDA's.
     """
     library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / "libc10.so"))
     guards = (ctypes.c_void_p * 2).in_dll(library, "_ZN3c104impl26device_guard_impl_registryE")
-    if not guards[1]:
-        guards[1] = guards[0]
+    guards[1] = guards[0]
