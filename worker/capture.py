@@ -138,7 +138,7 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
 
 
 def about_rendering(file: SceneFile) -> list[Decision]:
-    """Return the lines about a render mode that is not the usual one, and about doubts in what the file states."""
+    """Return the lines about a render mode other than classic, and about doubtful statements in the file."""
     tag, rendering = file.tag, file.scene.rendering
     lines = []
     if rendering != tag.rendering:

@@ -203,7 +203,7 @@ class Stylizer:
         return record
 
     def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult], int]:
-        """Return dE/dsh_dc [n, 3], mean over some views, the results of this group's views, and their cost.
+        """Return the mean of dE/dsh_dc [n, 3] over some views, the results of this group's own views, and a cost.
 
         The cost is the number of pixels that this rank passes through the network.
         """

@@ -252,7 +252,7 @@ class DecisionsOf(FeatureNetwork):
         del self.other.forward
 
     def beside(self, evaluate: Callable[[FeatureNetwork], SosResult]) -> tuple[SosResult, SosResult]:
-        """Return the results of a function by the other network, and by this one with the same decisions."""
+        """Evaluate with the other network, then with this one and the same decisions; return both results."""
         with self.listening():
             actual = evaluate(self.other)
         return actual, evaluate(self)
