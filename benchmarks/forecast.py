@@ -291,7 +291,7 @@ def statistics(channels: int, positions: int, size: int, cache: float) -> Work:
     # Each pair of channel tiles reads both tiles, or one on the diagonal. Spans are the outer loop, so a layer larger
     # than the L2 cache is read from memory each time.
     reads = tiles if channels * positions * size > cache else 1
-    spans = -(-positions // span_positions(channels))
+    spans = -(-positions // span_positions(positions, channels))
     moved = reads * channels * positions * size + 2 * spans * channels**2 * 4
     return Work(2.0 * min(TILE, channels) ** 2 * pairs * positions, moved, "matrix")
 

@@ -32,12 +32,11 @@ from sgsst_core.features import pooling_triton_kernels as pooling_kernels
 from sgsst_core.features import statistics_kernels
 from sgsst_core.features.statistics import (
     FLUSH,
-    POSITIONS,
     TILE,
     block_of_channels,
     block_of_entries,
+    block_positions,
     matrix_precision,
-    span_positions,
 )
 from sgsst_core.loss import statistics_terms
 from sgsst_core.loss import statistics_terms_kernels as loss_kernels
@@ -65,8 +64,9 @@ _TYPES = {
     **dict.fromkeys(("piece_gaussians", "piece_slots"), "*i32"),
     **dict.fromkeys(("weights", "shift", "firsts", "seconds", "matrix", "mean", "own_mean", "offset"), "*fp32"),
     **dict.fromkeys(("count", "centered", "target_gram", "target_mean", "target_std", "terms"), "*fp64"),
-    **dict.fromkeys(("positions", "row_step", "column_step", "weight_row_step", "weight_column_step", "spans"), "i32"),
-    **dict.fromkeys(("out_row_step", "out_column_step"), "i32"),
+    **dict.fromkeys(
+        ("positions", "row_cells", "out_row_cells", "weight_row_step", "weight_column_step", "span"), "i32"
+    ),
     **dict.fromkeys(("total", "visible", "width", "height", "across"), "i32"),
 }
 _FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (cached_kernels.HALF_SCALE, "*fp16")}
@@ -98,13 +98,14 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
     """Return the kernels that read features and position weights."""
     features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
     matrix = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
-    moments = {**matrix, "SPAN": span_positions(channels), "FLUSH": FLUSH, "P": POSITIONS}
+    block = block_positions(_DTYPES[form])
+    moments = {**matrix, "P": block, "PARTS": FLUSH // block}
     return {
         f"shifted_moments_{of}": Target(
             statistics_kernels.shifted_moments,
             moments,
             4,
-            {"features": features, "sums": "*fp32"},
+            {"features": features, "shift": features, "sums": "*fp32"},
         ),
         f"add_style_gradient_{of}": Target(
             loss_kernels.add_style_gradient,
@@ -153,12 +154,13 @@ KERNELS: dict[str, Target] = {
     "slot_gradients": Target(kernels.slot_gradients, _CUTS, kernels.SUMMING_WARPS),
     "add_slots": Target(kernels.add_slots, _ADDED, 4, {"slots": "*fp32"}),
     **{
-        f"max_pool_backward_{form}": Target(
-            pooling_kernels.max_pool_backward,
+        f"{kernel.__name__}_{form}": Target(
+            kernel,
             {"CHANNELS": 64, "MASK": torch.iinfo(integers).max, "BLOCK": pooling_kernels.BLOCK.value},
             4,
             {"gradient": types, "source": types, "out": types, "height": "i32", "entries": "i32"},
         )
+        for kernel in (pooling_kernels.max_pool, pooling_kernels.max_pool_backward)
         for form, integers, types in (("float32", torch.int32, "*i32"), ("bfloat16", torch.int16, "*i16"))
     },
     "survey": Target(kernels.survey, _CUTS, kernels.SUMMING_WARPS, {"height": "i32"}),

@@ -1,8 +1,6 @@
-"""Every convolution of the network by direction, precision, memory layout and cuDNN's search, in TFLOP/s."""
+"""Every convolution of the network by direction, precision and memory layout, in TFLOP/s."""
 
 from __future__ import annotations
-
-import itertools
 
 import torch
 
@@ -35,18 +33,18 @@ def run(sizes: Sizes, findings: Findings) -> None:
 
 
 def _rates(weight: torch.Tensor, size: tuple[int, int], precision: str, direction: str) -> dict[str, float]:
-    """Return TFLOP/s by layout and by whether cuDNN searches."""
+    """Return TFLOP/s by layout."""
     dtype, rates = torch.bfloat16 if precision == "bfloat16" else torch.float32, {}
     kernel = weight if direction == "forward" else weight.transpose(0, 1).flip(2, 3)
     flop = 2 * weight.numel() * size[0] * size[1]
-    for (layout, memory_format), search in itertools.product(_LAYOUTS.items(), (False, True)):
+    for layout, memory_format in _LAYOUTS.items():
         x = (
             torch.rand((1, int(kernel.shape[1]), *size), device=device())
             .to(dtype)
             .contiguous(memory_format=memory_format)
         )
         own = kernel.to(device(), dtype).contiguous(memory_format=memory_format)
-        with convolutions(device(), tf32=precision == "tf32", search=search), torch.no_grad():
+        with convolutions(device(), tf32=precision == "tf32"), torch.no_grad():
             taken = seconds(lambda x=x, own=own: torch.nn.functional.conv2d(x, own, padding=1), device(), _REPEATS)  # type: ignore[misc]
-        rates[f"{layout}{'_searched' if search else ''}"] = flop / taken / 1e12
+        rates[layout] = flop / taken / 1e12
     return rates

@@ -23,6 +23,8 @@ _INTEGERS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 def max_pool(source: Tensor) -> Tensor:
     """Return the maxima [1, c, h // 2, w // 2] of 2x2 windows of a ReLU output [1, c, h, w], both channels last."""
+    if has_kernel(source):
+        return fused_max_pool(source)
     if not _is_compiled_for(source):
         pooled: Tensor = F.max_pool2d(source, 2, return_indices=True)[0]
         return pooled
@@ -59,6 +61,22 @@ def max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
     return out.permute(2, 0, 1).unsqueeze(0)
 
 
+def fused_max_pool(source: Tensor) -> Tensor:
+    """Compute `max_pool` in one launch of a Triton kernel. PyTorch also writes 8-byte indices of the maxima."""
+    from sgsst_core.features import pooling_triton_kernels as kernels
+
+    cells = _cells(source).view(_INTEGERS[source.element_size()])
+    height, width, channels = cells.shape
+    out, block = source.new_empty((height // 2, width // 2, channels)), kernels.BLOCK.value
+    if entries := out.numel():
+        with on_device(source.device):
+            kernels.max_pool[(-(-entries // block),)](
+                cells, out.view(cells.dtype), width, width // 2, entries,
+                CHANNELS=channels, MASK=torch.iinfo(cells.dtype).max, BLOCK=block,
+            )  # fmt: skip
+    return out.permute(2, 0, 1).unsqueeze(0)
+
+
 def fused_max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
     """Compute `max_pool_backward` in one launch of a Triton kernel, which reads and writes each value once."""
     from sgsst_core.features import pooling_triton_kernels as kernels
@@ -77,7 +95,7 @@ def fused_max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
 
 
 def has_kernel(source: Tensor) -> bool:
-    """Return whether there is a Triton kernel for the backward pass of a ReLU output."""
+    """Return whether there are Triton kernels for a ReLU output."""
     return source.device.type == "cuda" and source.element_size() <= 4 and triton_runs_on(source.device)
 
 

@@ -1,6 +1,7 @@
-"""GPU kernel for the backward pass through max pooling and the ReLU before it, in one pass over memory.
+"""GPU kernels for max pooling, and for the backward pass through it and the ReLU before it.
 
-It also runs on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before the first import).
+Each reads and writes every value once. They also run on the CPU in Triton's interpreter (set TRITON_INTERPRET=1 before
+the first import).
 """
 
 # Arguments are untyped: Triton compiles one version per argument type.
@@ -15,7 +16,31 @@ import triton.language as tl
 BLOCK = tl.constexpr(512)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["width", "across", "entries"])
+def max_pool(source, out, width, across, entries, CHANNELS: tl.constexpr, MASK: tl.constexpr, BLOCK: tl.constexpr):
+    """Write the maxima of 2x2 windows, as `pooling_kernels.max_pool` does.
+
+    Args:
+        source: [height, width, CHANNELS], ReLU output.
+        out: [height // 2, across, CHANNELS].
+        width: Columns of the ReLU output.
+        across: Columns of the output, width // 2.
+        entries: Number of values of the output.
+        CHANNELS, MASK, BLOCK: As in `max_pool_backward`.
+    """
+    entry = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    there = entry < entries
+    channel, window = entry % CHANNELS, entry // CHANNELS
+    at = (2 * (window // across) * width + 2 * (window % across)) * CHANNELS + channel
+    below = at + width.to(tl.int64) * CHANNELS
+    a = tl.load(source + at, mask=there, other=0) & MASK
+    b = tl.load(source + at + CHANNELS, mask=there, other=0) & MASK
+    c = tl.load(source + below, mask=there, other=0) & MASK
+    d = tl.load(source + below + CHANNELS, mask=there, other=0) & MASK
+    tl.store(out + entry, tl.maximum(tl.maximum(a, b), tl.maximum(c, d)), mask=there)
+
+
+@triton.jit(do_not_specialize=["height", "width", "entries"])
 def max_pool_backward(
     gradient, source, out, height, width, entries, CHANNELS: tl.constexpr, MASK: tl.constexpr, BLOCK: tl.constexpr
 ):

@@ -31,16 +31,17 @@ _GPU_BLOCK_VALUES = 1 << 21
 _SHIFT_POSITIONS = 1024
 #: Maximum distance of a channel's mean from the shift in standard deviations; cancellation grows with its square.
 _FAR = 8.0
-#: Positions per span on a GPU, at least. A span is summed by one program in float32; spans are added in float64. Layers
-#: of many channels have longer spans, so that the sums of all spans are small compared to the features.
-_GPU_SPAN_POSITIONS, _SPAN_POSITIONS_PER_CHANNEL = 2048, 16
+#: Limits of the positions per span on a GPU. A span is summed by one program in float32; spans are added in float64.
+_GPU_SPANS = 256, 4096
+#: Programs that occupy a GPU. Spans are as long as this number permits, because the sums of spans take time to add.
+_GPU_PROGRAMS = 1024
 #: Positions after which a program starts a new accumulator of second moments. Longer float32 chains round too much:
 #: one over 3,500 positions is off by 1e-5.
 FLUSH = 128
 #: Minimum number of feature rows averaged for the shift.
 _SHIFT_ROWS = 64
-#: Channels and positions per step of a program.
-TILE, POSITIONS = 64, 32
+#: Channels per block of a program.
+TILE = 64
 #: Matrix entries per program, rounded to whole rows.
 ENTRIES = 1024
 #: Minimum channels per block, as required for matrix products. Layers with fewer channels fill part of a block.
@@ -270,9 +271,17 @@ def matrix_precision(dtype: torch.dtype) -> str:
     return "tf32" if dtype == torch.bfloat16 and torch.version.hip is None else "ieee"
 
 
-def span_positions(channels: int) -> int:
+def block_positions(dtype: torch.dtype) -> int:
+    """Return the number of positions per block of a program."""
+    return 64 if dtype == torch.bfloat16 else 32
+
+
+def span_positions(positions: int, channels: int) -> int:
     """Return the number of positions per span of a layer."""
-    return max(_GPU_SPAN_POSITIONS, _SPAN_POSITIONS_PER_CHANNEL * channels)
+    tiles = -(-channels // TILE)
+    span = positions * tiles * (tiles + 1) // 2 // _GPU_PROGRAMS
+    least, most = _GPU_SPANS
+    return min(max(least, 1 << max(span.bit_length() - 1, 0)), most)
 
 
 def block_of_positions(usual: int) -> int:
@@ -311,15 +320,17 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
 
     height, width, channels = features.shape
     device, positions = features.device, height * width
-    span, tile = span_positions(channels), block_of_channels(channels, TILE)
-    shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1), dtype=torch.float32)
+    span, tile = span_positions(positions, channels), block_of_channels(channels, TILE)
+    block = block_of_positions(block_positions(features.dtype))
+    # In bfloat16, the shift is rounded like the features, so that TF32 holds most differences.
+    shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1))
     sums = torch.empty((-(-positions // span), channels**2 + channels + 1), device=device)
     weights = features if position_weights is None else position_weights
     with on_device(device):
         kernels.shifted_moments[(len(sums), (-(-channels // tile)) ** 2)](
             features, weights, shift, sums,
-            positions, width, *features.stride()[:2], *weights.stride()[:2],
-            CHANNELS=channels, TILE=tile, SPAN=span, FLUSH=FLUSH, P=block_of_positions(POSITIONS),
+            positions, width, row_cells(features), *weights.stride()[:2], span,
+            CHANNELS=channels, TILE=tile, P=block, PARTS=max(1, FLUSH // block),
             WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
         )  # fmt: skip
     count = torch.empty((), dtype=torch.float64, device=device)
@@ -337,10 +348,18 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
 def can_be_fused(features: Tensor) -> bool:
     """Return whether there are kernels for features [h, w, c].
 
-    The kernels need a supported GPU, contiguous channels and a dtype other than float64.
+    The kernels need a supported GPU, contiguous channels and columns, and a dtype other than float64.
     """
-    side_by_side = features.stride(2) == 1 and features.dtype != torch.float64
-    return side_by_side and has_kernels(features.device, int(features.shape[2]))
+    height, width, channels = features.shape
+    rows, columns, _ = features.stride()
+    in_cells = (width <= 1 or columns == channels) and (height <= 1 or rows % channels == 0)
+    contiguous = in_cells and features.stride(2) == 1
+    return contiguous and features.dtype != torch.float64 and has_kernels(features.device, int(channels))
+
+
+def row_cells(features: Tensor) -> int:
+    """Return the distance of two rows of features [h, w, c] in cells of c values."""
+    return features.stride(0) // int(features.shape[2])
 
 
 def has_kernels(device: torch.device, channels: int) -> bool:

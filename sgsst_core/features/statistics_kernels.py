@@ -23,12 +23,19 @@ def mask_of(there, channel, CHANNELS: tl.constexpr):
 
 
 @triton.jit
-def load_centered(features, shift, row_step, column_step, width, position, channel, there, CHANNELS: tl.constexpr):
-    """Load features minus shift [P, C] as float32, at row-major positions; invalid features count as 0."""
-    offset = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
-    mask = mask_of(there, channel, CHANNELS)
-    values = tl.load(features + offset[:, None] + channel[None, :], mask=mask, other=0.0).to(tl.float32)
-    return values - tl.load(shift + channel, mask=channel < CHANNELS, other=0.0)[None, :]
+def cells_of(position, width, row_cells):
+    """Return the offsets in cells [P], int64, of row-major positions in a layer whose rows are row_cells apart."""
+    return (position // width).to(tl.int64) * row_cells + position % width
+
+
+@triton.jit
+def load_centered(features, shift, cell, channel, there, CHANNELS: tl.constexpr):
+    """Load features minus shift [P, C] as float32 from cells; features of invalid cells and channels count as 0."""
+    inside = channel < CHANNELS
+    values = tl.load(
+        features + cell[:, None] * CHANNELS + channel[None, :], mask=mask_of(there, channel, CHANNELS), other=0.0
+    )
+    return values.to(tl.float32) - tl.load(shift + channel, mask=inside, other=0.0).to(tl.float32)[None, :]
 
 
 @triton.jit
@@ -50,54 +57,73 @@ def rounded(x, PRECISION: tl.constexpr):
 
 
 @triton.jit
-def shifted_moments(
-    features, weights, shift, sums,
-    positions, width, row_step, column_step, weight_row_step, weight_column_step,
-    CHANNELS: tl.constexpr, TILE: tl.constexpr, SPAN: tl.constexpr, FLUSH: tl.constexpr, P: tl.constexpr,
-    WEIGHTED: tl.constexpr, PRECISION: tl.constexpr,
-):  # fmt: skip
-    """Compute moments about the shift over SPAN positions, for one TILE x TILE block of channel pairs.
+def product(left, right, sums, PRECISION: tl.constexpr):
+    """Return sums + left @ right."""
+    return tl.dot(rounded(left, PRECISION), rounded(right, PRECISION), sums, input_precision=PRECISION)
 
-    Only blocks on and above the diagonal are computed. Second moments are accumulated over FLUSH positions at a time,
-    so that no float32 chain is long. Below, a_p is a position weight and x_p = F_p - shift.
+
+@triton.jit
+def add_block(
+    features, weights, shift, start, end, width, row_cells, weight_row_step, weight_column_step,
+    own, other, second, first, count,
+    CHANNELS: tl.constexpr, TILE: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Add the moments of P positions to `second` [TILE, TILE], `first` [TILE] and `count` [P], and return the sums."""
+    position = start + tl.arange(0, P)
+    there = position < end
+    cell = cells_of(position, width, row_cells)
+    a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
+    left = load_centered(features, shift, cell, own, there, CHANNELS)
+    right = left if CHANNELS <= TILE else load_centered(features, shift, cell, other, there, CHANNELS)
+    left = left * a[:, None]
+    return product(tl.trans(left), right, second, PRECISION), first + tl.sum(left, 0), count + a
+
+
+@triton.jit(do_not_specialize=["positions", "width", "row_cells", "weight_row_step", "weight_column_step", "span"])
+def shifted_moments(
+    features, weights, shift, sums, positions, width, row_cells, weight_row_step, weight_column_step, span,
+    CHANNELS: tl.constexpr, TILE: tl.constexpr, P: tl.constexpr, PARTS: tl.constexpr, WEIGHTED: tl.constexpr,
+    PRECISION: tl.constexpr,
+):  # fmt: skip
+    """Compute moments about the shift over `span` positions, for one TILE x TILE block of channel pairs.
+
+    Only blocks on and above the diagonal are computed. Second moments are accumulated over PARTS * P positions at a
+    time, so that no float32 chain is long. Below, a_p is a position weight and x_p = F_p - shift.
 
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
         weights: Position weights [h, width]; ignored if WEIGHTED is false.
-        shift: [CHANNELS] float32.
+        shift: [CHANNELS] in the dtype of the features.
         sums: Output [spans, CHANNELS^2 + CHANNELS + 1] float32: the sum of a_p x_p x_p^T, of a_p x_p, and of a_p.
             Entries of lower blocks are not written.
         positions: Number of positions, h * width.
+        row_cells: Distance of two rows in cells of CHANNELS values.
     """
     tiles: tl.constexpr = (CHANNELS + TILE - 1) // TILE
-    span, pair = tl.program_id(0), tl.program_id(1)
+    number, pair = tl.program_id(0), tl.program_id(1)
     down, across = pair // tiles, pair % tiles
     if down <= across:
         own, other = down * TILE + tl.arange(0, TILE), across * TILE + tl.arange(0, TILE)
         second = tl.zeros([TILE, TILE], tl.float32)
         first = tl.zeros([TILE], tl.float32)
         count = tl.zeros([P], tl.float32)
-        start = span * SPAN
-        end = tl.minimum(start + SPAN, positions)
-        while start < end:
+        end = tl.minimum((number + 1) * span, positions)
+        for start in tl.range(number * span, end, P * PARTS, num_stages=2):
             some = tl.zeros([TILE, TILE], tl.float32)
-            stop = tl.minimum(start + FLUSH, end)
-            while start < stop:
-                position = start + tl.arange(0, P)
-                there = position < end
-                a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
-                left = load_centered(features, shift, row_step, column_step, width, position, own, there, CHANNELS)
-                left = left * a[:, None]
-                right = load_centered(features, shift, row_step, column_step, width, position, other, there, CHANNELS)
-                products = tl.dot(
-                    tl.trans(rounded(left, PRECISION)), rounded(right, PRECISION), input_precision=PRECISION
-                )
-                some += products
-                first += tl.sum(left, 0)
-                count += a
-                start += P
+            if PRECISION == "tf32":
+                for part in tl.static_range(PARTS):  # unrolled, so that loads overlap with products
+                    some, first, count = add_block(
+                        features, weights, shift, start + part * P, end, width, row_cells, weight_row_step,
+                        weight_column_step, own, other, some, first, count, CHANNELS, TILE, P, WEIGHTED, PRECISION,
+                    )  # fmt: skip
+            else:
+                for part in tl.range(PARTS, num_stages=1):  # unrolled, it would take too many registers
+                    some, first, count = add_block(
+                        features, weights, shift, start + part * P, end, width, row_cells, weight_row_step,
+                        weight_column_step, own, other, some, first, count, CHANNELS, TILE, P, WEIGHTED, PRECISION,
+                    )  # fmt: skip
             second += some
-        row = sums + span.to(tl.int64) * (CHANNELS * CHANNELS + CHANNELS + 1)
+        row = sums + number.to(tl.int64) * (CHANNELS * CHANNELS + CHANNELS + 1)
         entry = own[:, None] * CHANNELS + other[None, :]
         tl.store(row + entry, second, mask=(own < CHANNELS)[:, None] & (other < CHANNELS)[None, :])
         if down == across:
@@ -118,7 +144,7 @@ def combine_moments(
     Args:
         sums: [CHANNELS^2 + CHANNELS + 1] float64, the sum of the outputs of `shifted_moments` over all spans; with a
             single span its output, float32.
-        shift: [CHANNELS] float32, shift of these moments.
+        shift: [CHANNELS], shift of these moments.
         count: Output [] float64. All outputs are 0 if no position has weight.
         mean: Output [CHANNELS] float64.
         centered: Output [CHANNELS, CHANNELS] float64.

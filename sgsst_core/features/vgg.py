@@ -129,25 +129,23 @@ def _is_nvidia(device: torch.device | str) -> bool:
 
 
 @contextmanager
-def convolutions(device: torch.device, *, tf32: bool = False, search: bool = False) -> Iterator[None]:
+def convolutions(device: torch.device, *, tf32: bool = False) -> Iterator[None]:
     """Set the precision of float32 convolutions on a GPU inside a `with` block.
 
-    Settings are restored afterwards. Do nothing if the device is not a GPU.
+    cuDNN chooses deterministic algorithms by its heuristics: on an H100, benchmarking all algorithms is no faster
+    afterwards, and takes seconds and up to all of the free memory. Settings are restored after the block. Do nothing if
+    the device is not a GPU.
 
     Args:
         device: Device of the convolutions.
         tf32: Whether to use TF32 instead of full float32.
-        search: Whether cuDNN benchmarks all of its algorithms at the first convolution of each shape. Otherwise it uses
-            its heuristics, restricted to deterministic algorithms.
     """
     if device.type != "cuda":
         yield
         return
     before = _CUDNN.benchmark, _CUDNN.deterministic, _CUDNN.conv.fp32_precision
     try:
-        # PyTorch caches the algorithm of each shape under a key that contains `deterministic` but not `benchmark`.
-        # Setting both keeps a search from reusing what heuristics have chosen for another network of this process.
-        _CUDNN.benchmark, _CUDNN.deterministic = search, not search
+        _CUDNN.benchmark, _CUDNN.deterministic = False, True
         _CUDNN.conv.fp32_precision = "tf32" if tf32 else "ieee"
         yield
     finally:
@@ -210,8 +208,6 @@ class FeatureNetwork:
         unit: Factor of the content layer's features relative to the units of a 0-255 input.
         pixel_weight: Weight of the terms of `PIXELS`: the layer's factor squared. The features of `PIXELS` are not
             multiplied by this factor.
-        search: Whether cuDNN benchmarks its algorithms for every new image size, which takes about ten passes. Off by
-            default; worthwhile for sizes that recur often enough. Decided before the first image of such a size.
     """
 
     def __init__(
@@ -230,7 +226,6 @@ class FeatureNetwork:
         self.dtype = dtype
         self.device = torch.device(device)
         self.tf32 = tf32
-        self.search = False
         self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
         self.pixel_weight = weights.scales.get(PIXELS, 1.0) ** 2
         self._input = _Input.of(weights, self.device, dtype)
@@ -325,7 +320,7 @@ class FeatureNetwork:
             activations.features[PIXELS] = pixels * PIXEL_UNIT
         # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
         x = self._input.normalized(pixels).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
-        with convolutions(self.device, tf32=self.tf32, search=self.search):
+        with convolutions(self.device, tf32=self.tf32):
             self._forward_steps(x, activations, cache)
         for layer in self.layers:
             if layer not in activations.features:
@@ -379,7 +374,7 @@ class FeatureNetwork:
         Returns:
             dL/drgb, [h, w, 3], float32 (float64 for a float64 network).
         """
-        with convolutions(self.device, tf32=self.tf32, search=self.search):
+        with convolutions(self.device, tf32=self.tf32):
             gradient = self._backward_steps(activations, feature_gradient)
         shape = (*activations.size, 3)
         if gradient is None:

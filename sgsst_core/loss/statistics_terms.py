@@ -31,6 +31,7 @@ from sgsst_core.features.statistics import (
     has_kernels,
     layer_statistics,
     matrix_precision,
+    row_cells,
 )
 from sgsst_core.features.vgg import PIXELS, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.position_term import StyledRegion, TermInputs
@@ -330,7 +331,7 @@ def fused_add_style_gradient(
     with on_device(features.device):
         kernels.add_style_gradient[(-(-positions // block), -(-channels // tile))](
             features, weights, gradient, matrix, mean, offset,
-            positions, width, *features.stride()[:2], *weights.stride()[:2], *gradient.stride()[:2],
+            positions, width, row_cells(features), *weights.stride()[:2], row_cells(gradient),
             CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEP), P=block,
             WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
         )  # fmt: skip

@@ -11,7 +11,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sgsst_core.features.statistics_kernels import load_centered, load_weights, mask_of, rounded
+from sgsst_core.features.statistics_kernels import cells_of, load_centered, load_weights, mask_of, product
 
 
 @triton.jit
@@ -63,10 +63,12 @@ def compare(
     tl.store(terms + 3 * i + 2, present * (STD / CHANNELS) * std_error * std_error, mask=row)
 
 
-@triton.jit
+@triton.jit(
+    do_not_specialize=["positions", "width", "row_cells", "weight_row_step", "weight_column_step", "out_row_cells"]
+)
 def add_style_gradient(
     features, weights, gradient, matrix, mean, offset,
-    positions, width, row_step, column_step, weight_row_step, weight_column_step, out_row_step, out_column_step,
+    positions, width, row_cells, weight_row_step, weight_column_step, out_row_cells,
     CHANNELS: tl.constexpr, TILE: tl.constexpr, K: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
@@ -77,26 +79,25 @@ def add_style_gradient(
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
         weights: Position weights [h, width]; ignored if WEIGHTED is false.
-        gradient: [h, width, CHANNELS] in the dtype of the features, updated in cell.
+        gradient: [h, width, CHANNELS] in the dtype of the features, updated in place.
         matrix, mean, offset: Outputs of `compare`; the matrix is symmetric.
         positions: Number of positions, h * width.
+        row_cells, out_row_cells: Distances of two rows of features and gradient in cells of CHANNELS values.
     """
     position = tl.program_id(0) * P + tl.arange(0, P)
     there = position < positions
     own = tl.program_id(1) * TILE + tl.arange(0, TILE)
+    cell = cells_of(position, width, row_cells)
     sums = tl.zeros([P, TILE], tl.float32)
-    k = tl.zeros([], tl.int32)
-    while k < CHANNELS:
+    for k in tl.range(0, CHANNELS, K, num_stages=1):
         channel = k + tl.arange(0, K)
-        centered = load_centered(features, mean, row_step, column_step, width, position, channel, there, CHANNELS)
+        centered = load_centered(features, mean, cell, channel, there, CHANNELS)
         part_of = mask_of(channel < CHANNELS, own, CHANNELS)
         part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :], mask=part_of, other=0.0)
-        sums += tl.dot(rounded(centered, PRECISION), rounded(part, PRECISION), input_precision=PRECISION)
-        k += K
+        sums = product(centered, part, sums, PRECISION)
     a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
     sums = (sums + tl.load(offset + own, mask=own < CHANNELS, other=0.0)[None, :]) * a[:, None]
-    cell = (position // width).to(tl.int64) * out_row_step + (position % width).to(tl.int64) * out_column_step
-    target = gradient + cell[:, None] + own[None, :]
+    target = gradient + cells_of(position, width, out_row_cells)[:, None] * CHANNELS + own[None, :]
     mask = mask_of(there, own, CHANNELS)
     before = tl.load(target, mask=mask, other=0.0)
     tl.store(target, (before.to(tl.float32) + sums).to(before.dtype), mask=mask)

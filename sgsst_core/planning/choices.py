@@ -34,9 +34,6 @@ _UNCOVERED = 0.01
 _SCAN = 0.2
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
-#: Minimum passes per image size for which benchmarking cuDNN's algorithms pays off. It takes as long as about ten
-#: passes, and makes later passes a few percent faster.
-LEAST_PASSES = 200
 ANOTHER_LOSS = "differs from the paper's loss"
 
 
@@ -285,10 +282,6 @@ class Visits:
         different = len(views) if weighted else len({sizes[index] for index in views})
         return Visits(visits / len(views), visits // different)
 
-    def search(self, device: str) -> bool:
-        """Return whether cuDNN benchmarks its algorithms for the network on a device, "cpu" or "cuda"."""
-        return device == "cuda" and self.of_a_size >= LEAST_PASSES
-
 
 # --- network -------------------------------------------------------------------------------------------------------
 
@@ -357,17 +350,6 @@ def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decisio
         )
     what = {"bfloat16": "features in bfloat16", "tf32": "convolutions in TF32"}[requested]
     return chosen, [Decision("precision", what, f"requested, {ratio:.1f} times faster here", error=known)]
-
-
-def convolutions(probe: Probe, visits: Visits) -> tuple[bool, list[Decision]]:
-    """Choose whether cuDNN benchmarks its algorithms on a GPU."""
-    if probe.machine.device != "cuda":
-        return False, []
-    search, item = visits.search(probe.machine.device), "convolutions"
-    reason = f"the network evaluates images of one size about {visits.of_a_size:,} times"
-    if not search:
-        return search, [Decision(item, "cuDNN does not benchmark its algorithms", reason)]
-    return search, [Decision(item, "cuDNN benchmarks its algorithms", reason, error="runs may round differently")]
 
 
 def launches(probe: Probe, settings: Settings, visits: Visits, phases: int) -> tuple[bool, list[Decision]]:

@@ -36,7 +36,6 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
     cached_weights, weights_line = choices.blend_weights(probe, settings, visits)
     caches = cached_weights != "none"
     precision, precision_lines = choices.precision(probe, settings)
-    search, search_lines = choices.convolutions(probe, visits)
     phases = bool(steps_coarse) + bool(settings.steps_sos)
     graphs, launch_lines = choices.launches(probe, settings, visits, phases)
     plan = Plan(
@@ -53,7 +52,6 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
         rasterizer="cached" if caches else probe.rasterizer,
         uncached=probe.rasterizer,
         precision=precision,
-        search=search,
         graphs=graphs,
         cached_weights=cached_weights,
         measured=measured,
@@ -79,7 +77,6 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
         *choices.about_colors(settings),
         *choices.about_network(model, probe, settings),
         *choices.about_rasterizer(probe, cached=caches),
-        *search_lines,
         *launch_lines,
         weights_line,
         *choices.about_scales([tiling.scale_count(size) for size in model.sizes], settings),

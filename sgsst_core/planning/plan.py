@@ -71,7 +71,6 @@ class Plan:
         rasterizer: Rasterizer of the job; "cached" stores blend weights in the format `cached_weights`.
         uncached: Rasterizer that computes blend weights, and recomputes those that are not cached.
         precision: Precision of the feature network.
-        search: Whether cuDNN benchmarks its algorithms first (`FeatureNetwork.search`).
         graphs: Whether the loss of a view is captured as a CUDA graph where possible (`LossGraphs`).
         cached_weights: Format of blend weights that are cached between iterations.
         measured: Whether the prediction includes measurements between steps and the report.
@@ -99,7 +98,6 @@ class Plan:
     rasterizer: str = "cpu"
     uncached: str = "cpu"
     precision: Precision = "float32"
-    search: bool = False
     graphs: bool = False
     cached_weights: CachedWeights = "none"
     measured: bool = False

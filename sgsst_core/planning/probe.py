@@ -24,7 +24,7 @@ from sgsst_core.loss.nearest import nearest_layers, search
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.choices import Visits, rendered_gaussians
+from sgsst_core.planning.choices import rendered_gaussians
 from sgsst_core.planning.context import PlanningContext
 from sgsst_core.planning.facts import (
     LEAST_VISITS,
@@ -86,8 +86,6 @@ def measure(context: PlanningContext, survey: Survey, link: Link, maps: int = 0)
     scene, device = context.scene, context.network.device
     views = [context.cameras[index] for index in survey.covered]
     sizes = tuple((camera.height, camera.width) for camera in context.cameras)
-    # Measure with the algorithms of the job, and let cuDNN choose them once: it caches its choice for every shape.
-    context.network.search = Visits.of(survey, sizes, context.settings).search(context.machine.device)
     return Probe(
         SceneFacts(
             len(scene),

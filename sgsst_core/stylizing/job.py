@@ -287,7 +287,6 @@ def prepare_job(
     network = (
         planning_context.network if planning_context else make_network(weights, settings, plan.precision, plan.device)
     )
-    network.search = plan.search
     team = Team(plan, settings, collectives)
     memory_limit = settings.memory_limit or plan.memory_limit
     memory = memory_limit // sharing_memory(team.everybody, plan.device)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.ptx.copies import AsyncCopies
 from tests.ptx.memory import FaultError, GlobalMemory, SharedMemory
 from tests.ptx.operations import (
     UNSIGNED,
@@ -51,6 +52,7 @@ class State:
     global_memory: GlobalMemory
     shared: SharedMemory
     numbers: np.ndarray
+    copies: AsyncCopies
     registers: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -82,7 +84,14 @@ def reader(operand: str, type_: str) -> Read:
         if type_ == "pred":
             return lambda state: state.registers[operand]
         unsigned = UNSIGNED[8 * dtype.itemsize]
-        return lambda state: state.registers[operand].astype(unsigned, copy=False).view(dtype)
+
+        def read(state: State) -> np.ndarray:
+            value = state.registers.get(operand)
+            if value is None:  # the compiler fills unused parts of vectors with undefined registers
+                value = np.full(state.count, unsigned(-1 % (1 << 8 * dtype.itemsize)))
+            return value.astype(unsigned, copy=False).view(dtype)
+
+        return read
     if operand == "global_smem":
         value = 0
     elif re.match(r"0[fFdD]", operand):
@@ -123,6 +132,7 @@ def compile_instruction(instruction: Instruction) -> Execute:
     if opcode[:2] in (("ld", "global"), ("ld", "shared"), ("st", "global"), ("st", "shared")):
         return _memory_access(instruction)
     special = {"shfl": _shuffle, "redux": _redux, "ldmatrix": _load_matrix, "stmatrix": _store_matrix, "mma": _mma}
+    special["cp"] = _async_copy
     if name in special:
         return special[name](instruction)
     if opcode[:2] == ("ld", "param"):
@@ -242,6 +252,36 @@ def _memory_access(instruction: Instruction) -> Execute:
         values = loaded.view(UNSIGNED[bits])
         for number, part in enumerate(parts):
             write(state, part, values[:, number], mask)
+
+    return execute
+
+
+def _async_copy(instruction: Instruction) -> Execute:
+    """Return the execution of `cp.async` and of the instructions that end its groups and wait for them."""
+    opcode, operands = instruction.opcode, instruction.operands
+
+    def lanes_of(state: State, mask: np.ndarray | None) -> np.ndarray:
+        return np.arange(state.count) if mask is None else np.nonzero(mask)[0]
+
+    if opcode[2] == "commit_group":
+        return lambda state, mask: state.copies.commit(lanes_of(state, mask))
+    if opcode[2] == "wait_group":
+        latest = int(operands[0], 0)
+        return lambda state, mask: state.copies.wait(state.shared, lanes_of(state, mask), latest)
+    target, source, width = _address(operands[0], "s32"), _address(operands[1], "u64"), int(operands[2], 0)
+    read = reader(operands[3] if len(operands) > 3 else operands[2], "u32")  # bytes to read; the rest is 0
+
+    def execute(state: State, mask: np.ndarray | None) -> None:
+        lanes = lanes_of(state, mask)
+        if not len(lanes):
+            return
+        size, values = read(state)[lanes], np.zeros((len(lanes), width), np.uint8)
+        if not np.isin(size, (0, width)).all():
+            raise UnsupportedError(f"partly filled copy: {instruction}")
+        there = size == width
+        if there.any():
+            values[there] = state.global_memory.load(source(state)[lanes][there], width, state.numbers[lanes][there])
+        state.copies.start(state.shared, lanes, target(state)[lanes].astype(np.int64), values)
 
     return execute
 
@@ -415,7 +455,8 @@ class Kernel:
             shared = SharedMemory(len(some), self.shared_bytes, threads)
             numbers = np.repeat(np.arange(start, start + len(some)) + 1, threads).astype(np.int32)
             with np.errstate(all="ignore"):
-                self._run(State(some, threads, arguments, memory, shared, numbers))
+                copies = AsyncCopies(len(numbers))
+                self._run(State(some, threads, arguments, memory, shared, numbers, copies))
 
     def _run(self, state: State) -> None:
         """Execute until all threads have returned."""

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MIN
-from sgsst_core.features.pooling import fused_max_pool_backward, max_pool_backward_reference
+from sgsst_core.features.pooling import fused_max_pool, fused_max_pool_backward, max_pool_backward_reference
 from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
 from sgsst_core.loss.statistics_terms import fused_add_style_gradient
 from sgsst_core.rasterizer import make_rasterizer
@@ -91,7 +92,7 @@ def test_statistics_of_many_spans_agree_with_float64() -> None:
 @pytest.mark.parametrize("capability", [80, 90])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("size", [(12, 10), (13, 11), (1, 5)])
-def test_gradients_of_pooling_are_those_of_the_reference(
+def test_pooling_and_its_gradients_are_those_of_the_reference(
     capability: int, dtype: torch.dtype, size: tuple[int, int]
 ) -> None:
     """Values on a coarse grid, so that most windows have ties, and some are all zero."""
@@ -99,7 +100,9 @@ def test_gradients_of_pooling_are_those_of_the_reference(
     source = torch.randn((1, *size, 64), generator=generator).round().to(dtype).permute(0, 3, 1, 2).relu_()
     gradient = torch.randn((1, size[0] // 2, size[1] // 2, 64), generator=generator).to(dtype).permute(0, 3, 1, 2)
     with compiled_kernels(capability):
-        actual = fused_max_pool_backward(gradient, source)
+        actual, pooled = fused_max_pool_backward(gradient, source), fused_max_pool(source)
+    assert torch.equal(pooled, torch.zeros_like(gradient) if min(size) < 2 else F.max_pool2d(source, 2))
+    assert pooled.is_contiguous(memory_format=torch.channels_last)
     expected = torch.zeros_like(source) if min(size) < 2 else max_pool_backward_reference(gradient, source)
     assert actual.is_contiguous(memory_format=torch.channels_last)
     assert torch.equal(actual, expected)
@@ -189,7 +192,7 @@ def test_shifted_masks_are_reported() -> None:
     features = torch.randn((5, 29, 16), generator=torch.Generator().manual_seed(0)).contiguous()
     with compiled_kernels(80) as driver:
         kernel = statistics_kernel(driver, features)
-        assert sum(reports(kernel, shifted, lambda: fused_statistics(features).centered)) >= 3
+        assert sum(reports(kernel, shifted, lambda: fused_statistics(features).centered)) >= 2
 
 
 def test_shifted_masks_of_pooling_are_reported() -> None:

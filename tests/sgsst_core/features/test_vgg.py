@@ -84,20 +84,17 @@ def on_a_gpu(device: torch.device, **flags: bool) -> contextlib.AbstractContextM
     return convolutions(CUDA, **flags)
 
 
-@pytest.mark.parametrize("search", [False, True])
 @pytest.mark.parametrize("tf32", [False, True])
 def test_flags_are_set_only_within_the_network(
-    tiny_weights: BackboneWeights, tf32: bool, search: bool, monkeypatch: pytest.MonkeyPatch
+    tiny_weights: BackboneWeights, tf32: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The network runs on the CPU, but sets the flags as on a GPU."""
     use_whole_float32()
     network = Watched(tiny_weights, tf32=tf32)
-    network.search = search
     monkeypatch.setattr(vgg, "convolutions", on_a_gpu)
     pixel_gradient(network)
-    assert network.flags == {("tf32" if tf32 else "ieee", search, not search)}
+    assert network.flags == {("tf32" if tf32 else "ieee", False, True)}
     assert not CUDNN.allow_tf32
-    assert not CUDNN.benchmark
     assert not CUDNN.deterministic
     assert not torch.backends.cuda.matmul.allow_tf32
     assert network.precision == ("tf32" if tf32 else "float32")
@@ -118,18 +115,18 @@ def test_statistics_are_summed_in_full_float32(tiny_weights: BackboneWeights, mo
 @pytest.mark.parametrize("before", ["ieee", "tf32", "none"])
 def test_flags_are_restored_after_an_error(before: str) -> None:
     CUDNN.conv.fp32_precision = before
-    with contextlib.suppress(KeyError), convolutions(CUDA, tf32=True, search=True):
-        assert CUDNN.benchmark
+    with contextlib.suppress(KeyError), convolutions(CUDA, tf32=True):
+        assert CUDNN.deterministic
         assert CUDNN.conv.fp32_precision == "tf32"
         raise KeyError
     assert CUDNN.conv.fp32_precision == before
-    assert not CUDNN.benchmark
+    assert not CUDNN.deterministic
 
 
 def test_flags_are_unchanged_on_a_cpu() -> None:
-    before = CUDNN.benchmark, CUDNN.conv.fp32_precision
-    with convolutions(torch.device("cpu"), tf32=True, search=True):
-        assert (CUDNN.benchmark, CUDNN.conv.fp32_precision) == before
+    before = CUDNN.deterministic, CUDNN.conv.fp32_precision
+    with convolutions(torch.device("cpu"), tf32=True):
+        assert (CUDNN.deterministic, CUDNN.conv.fp32_precision) == before
 
 
 def test_full_float32_overrides_a_global_tf32_setting(monkeypatch: pytest.MonkeyPatch) -> None:

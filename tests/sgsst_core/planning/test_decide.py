@@ -14,7 +14,6 @@ from sgsst_core.decision import Decision
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import MOST_VECTORS
-from sgsst_core.planning.choices import LEAST_PASSES
 from sgsst_core.planning.cost import (
     CUDNN_BYTES,
     MEASURING_BYTES,
@@ -277,26 +276,6 @@ def test_lower_precision_is_used_if_requested_and_faster(
     plan = plan_of(probe(precision_ratio=ratio), precision=asked)
     assert plan.precision == precision
     assert (text_of(plan, "precision") if text else line(plan, "precision")) == text
-
-
-@pytest.mark.parametrize(
-    ("device", "weights", "steps", "search"),
-    [
-        ("cuda", "off", LEAST_PASSES, True),
-        ("cuda", "off", LEAST_PASSES - 1, False),
-        ("cuda", "on", LEAST_PASSES, False),  # every view is cropped to a size of its own
-        ("cuda", "on", VIEWS * LEAST_PASSES, True),
-        ("cpu", "off", LEAST_PASSES, False),
-    ],
-)
-def test_cudnn_benchmarks_algorithms_if_sizes_recur_often(device: str, weights: str, steps: int, search: bool) -> None:
-    measurements = probe(device=device, raster=RasterCost(0.01))
-    plan = plan_of(measurements, steps_coarse=0, steps_sos=steps, position_weights=weights)
-    assert plan.search is search
-    decision = line(plan, "convolutions")
-    assert (decision is not None) is (device == "cuda")
-    if decision:
-        assert ("does not benchmark" in decision.decision) is not search
 
 
 def test_ranks_that_share_a_gpu_are_reported() -> None:
@@ -653,7 +632,6 @@ def test_decisions_have_a_fixed_order() -> None:
         "partition",
         "second forward",
         "rasterizer",
-        "convolutions",
         "launches",
         "blend weights",
         "scales",
