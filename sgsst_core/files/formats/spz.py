@@ -247,7 +247,7 @@ def _stated_axes(path: Path, data: bytes) -> Axes | None:
             if number not in _AXES_NUMBERS:
                 raise SceneError(
                     f"{path}: has the axes of SPZ's coordinate system {number}; RUB (4) and RDF (6) can be read. "
-                    f"{advice('scene.spz')}"
+                    "Export it with one of these."
                 )
             return _AXES_NUMBERS[number]
     return None
