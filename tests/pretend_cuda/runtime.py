@@ -169,6 +169,7 @@ def pretend_cuda() -> Iterator[Counts]:
     current.index = 0
     with (
         mock.patch.multiple(torch.cuda, **instead),
+        mock.patch.object(torch.distributed, "is_nccl_available", return_value=False),
         mock.patch.object(GridExecutor, "__call__", _count_launch(GridExecutor.__call__)),
         device.modes(),
     ):
