@@ -215,6 +215,21 @@ class AsyncClient:
         name: str = (await self._transport.call("POST", f"/v1/jobs/{job_id}/blends", json=body)).json()["name"]
         return name
 
+    async def video(self, /, job_id: str, progress: Progress = no_progress, **options: Any) -> str:
+        """Render a video of a finished job's result, and return its name for `download`. It takes minutes.
+
+        Args:
+            job_id: Job whose result is shown, and whose earlier video is replaced.
+            progress: Callback that receives the number of rendered frames and the number of all frames.
+            options: Options of `POST /v1/jobs/{id}/video`, such as `path="cameras"`, `seconds=8` and `compare=True`.
+
+        Raises:
+            RequestError: If the job has no result, or an option is invalid.
+        """
+        made = await self._transport.work(f"/v1/jobs/{job_id}/video", "rendering", progress, json=options)
+        name: str = made["name"]
+        return name
+
     async def rename(self, job_id: str, name: str) -> Job:
         """Change the display name of a job; an empty name restores the names of scene and style."""
         return Job.of((await self._transport.call("PATCH", f"/v1/jobs/{job_id}", json={"name": name})).json())

@@ -111,6 +111,7 @@ class Client:
     artifacts = _blocking(AsyncClient.artifacts)
     download = _blocking(AsyncClient.download)
     blend = _blocking(AsyncClient.blend)
+    video = _blocking(AsyncClient.video)
     rename = _blocking(AsyncClient.rename)
     finish = _blocking(AsyncClient.finish)
     cancel = _blocking(AsyncClient.cancel)

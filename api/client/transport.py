@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Awaitable, Callable
 from typing import Any, ParamSpec, TypeVar
@@ -11,8 +12,8 @@ import httpx
 import stamina
 from httpx_sse import ServerSentEvent, aconnect_sse
 
-from api.client.answers import checked, is_temporary, unreachable
-from api.client.downloads import BLOCK, Download
+from api.client.answers import ApiError, checked, is_temporary, refusal, unreachable
+from api.client.downloads import BLOCK, Download, Progress
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
@@ -94,6 +95,38 @@ class Transport:
                 return None
 
         return await self._retry(once)
+
+    async def work(self, path: str, step: str, progress: Progress, **options: Any) -> dict[str, Any]:
+        """Request some work, and return its result.
+
+        Args:
+            path: Path of the POST request.
+            step: Name of the events that report progress.
+            progress: Callback that receives the number of completed steps and of all steps.
+            options: Other options of the request.
+
+        Raises:
+            RequestError, ApiError: As for `call`.
+        """
+        result: dict[str, Any] = {}
+
+        def take(event: ServerSentEvent) -> None:
+            if not event.data:
+                return
+            data = json.loads(event.data)
+            if event.event == step:
+                progress(data["step"], data["total"])
+            elif event.event == "problem":
+                raise refusal(data["detail"], data["status"], data)
+            else:
+                result.update(data)
+
+        response = await self.listen("POST", path, take, **options)
+        if response is not None:
+            result = response.json()
+        if not result:  # the service was stopped, or a proxy cut the response off
+            raise ApiError("The connection ended before the result arrived. Try again.", 502)
+        return result
 
     async def fetch(self, download: Download) -> None:
         """Download a file; a broken download is resumed.

@@ -11,9 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from httpx_sse import ServerSentEvent
-
-from api.client.answers import ApiError, RequestError, refusal
+from api.client.answers import ApiError, RequestError
 from api.client.downloads import Progress
 from api.client.inputs import InputFile, InputUrl, JobFiles, input_files
 from api.client.transport import Transport, in_thread
@@ -97,25 +95,7 @@ async def plan_job(
         planning: Callback that receives the number of surveyed views and the number of all views.
     """
     fields = await _send_files(transport, files, parameters, progress)
-    plan: dict[str, Any] = {}
-
-    def take(event: ServerSentEvent) -> None:
-        if not event.data:
-            return
-        data = json.loads(event.data)
-        if event.event == "planning":
-            planning(data["step"], data["total"])
-        elif event.event == "problem":
-            raise refusal(data["detail"], data["status"], data)
-        else:
-            plan.update(data)
-
-    response = await transport.listen("POST", "/v1/jobs", take, params={"dry_run": True}, files=fields)
-    if response is not None:
-        plan = response.json()
-    if not plan:  # the service was stopped, or a proxy cut the response off
-        raise ApiError("The connection ended before the plan arrived. Try again.", 502)
-    return plan
+    return await transport.work("/v1/jobs", "planning", planning, params={"dry_run": True}, files=fields)
 
 
 async def _send_files(

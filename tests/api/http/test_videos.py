@@ -12,6 +12,8 @@ import httpx
 import pytest
 from httpx_sse import ServerSentEvent, connect_sse
 
+from api.client import Client
+from api.client.answers import RequestError
 from tests.api.service import Service, wait_for
 from tests.small_scenes import wall, write_files
 
@@ -86,6 +88,18 @@ def test_finished_job_makes_another_video_with_progress(service: Service, job: s
         assert names(client, job).count("video.mp4") == 1
         again = client.post(f"/v1/jobs/{job}/video", json={"seconds": 0.1})
         assert (again.status_code, again.json()["media_type"]) == (200, "video/mp4")
+
+
+def test_client_makes_a_video(service: Service, job: str) -> None:
+    reported: list[tuple[int, int]] = []
+    with Client(service.url) as client:
+        name = client.video(job, lambda *rendered: reported.append(rendered), path="orbit", fps=3, seconds=1)
+        assert name == "video.mp4"
+        with pytest.raises(RequestError, match="less than or equal to 30"):
+            client.video(job, seconds=31)
+    assert reported[-1] == (3, 3)
+    with service.client() as client:
+        assert len(frames(client, job)) == 3
 
 
 def test_video_that_nobody_waits_for_is_completed(service: Service, job: str) -> None:
