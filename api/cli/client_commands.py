@@ -249,7 +249,8 @@ def jobs(
         table.add_column(heading, no_wrap=True, width=width)
     for job in page:
         created = datetime.fromisoformat(job.data["created_at"]).astimezone()
-        table.add_row(job.id, job.data["name"], _short_status(job), f"{created:%m-%d %H:%M}")
+        name = _shortened(job.data["name"], widths["name"])
+        table.add_row(job.id, name, _short_status(job), f"{created:%m-%d %H:%M}")
     console.print(table)
 
 
@@ -272,6 +273,13 @@ def _client(url: str | None, key: str | None) -> Client:
 
     stamina.instrumentation.set_on_retry_hooks([_print_retry])
     return Client(url, key)
+
+
+def _shortened(name: str, width: int) -> str:
+    """Return a name without its middle if it is too wide; names of one scene's jobs differ at their ends."""
+    if len(name) <= width:
+        return name
+    return f"{name[: (width - 1) // 2]}…{name[-(width // 2) :]}"
 
 
 def _print_retry(details: RetryDetails) -> None:

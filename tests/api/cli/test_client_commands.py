@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -179,12 +180,12 @@ def test_list_of_jobs_fits_80_columns(
     files: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    job_id = submit(files, capsys, "--name", "a name that is longer than its column, " * 3)
+    job_id = submit(files, capsys, "--name", "a scene · " + "a name that is longer than its column, " * 3 + "waves")
     assert main(["jobs", "--limit", "3"]) == 0
     heading, *rows = capsys.readouterr().out.splitlines()
     assert all(len(line) <= 80 for line in (heading, *rows))
     assert rows[0].startswith(job_id)
-    assert "queued, #" in rows[0]
+    assert re.search(r"  a sc\S*….*waves  queued, #", rows[0])
     assert len(rows) <= 3
 
 
