@@ -7,6 +7,7 @@ import { labels, nameOf } from "./names.js";
 import { decisions } from "./plan.js";
 import { ResultStage } from "./result_stage.js";
 import { ShareCard } from "./share_card.js";
+import { titleOf } from "./options.js";
 import { resultFormats } from "./scene_formats.js";
 import { startFrom } from "./submit.js";
 import { actionsOf, titles, UNFINISHED } from "./statuses.js";
@@ -46,6 +47,7 @@ export class JobView {
     this.picture = h("figure.preview");
     this.show = h("div.show", this.picture);
     this.plan = h("section.card", { hidden: true });
+    this.planTitle = h("h2");
     this.download = h("section.card", { hidden: true });
     this.film = h("div", { hidden: true });
     /** @type {VideoCard | undefined} */
@@ -185,6 +187,7 @@ export class JobView {
     for (const stage of [this.result, this.live]) if (stage) stage.stage.title = this.title;
     this.heading.textContent = this.title;
     put(this.badge, badge(job.status));
+    this.planTitle.textContent = UNFINISHED.has(job.status) ? words.plan.decided : words.plan.ran;
     const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
     this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
     this.error.hidden = !job.error;
@@ -236,7 +239,8 @@ export class JobView {
     }
     const { stage, step, total, fraction, eta_s } = progress;
     this.stateText.textContent = [say.stages[stage] ?? stage, total ? (stage === "video" ? say.frame : stage === "planning" || stage === "measuring" ? say.view : say.step)(step, total) : ""].filter(Boolean).join(" · ");
-    this.leftText.textContent = eta_s === null || eta_s === undefined ? "" : say.left(eta_s);
+    // while views are analyzed, the time of the steps is unknown
+    this.leftText.textContent = eta_s === null || eta_s === undefined || stage === "planning" ? "" : say.left(eta_s);
     if (total) this.bar.value = fraction;
     else this.bar.removeAttribute("value");
   }
@@ -351,7 +355,7 @@ export class JobView {
     try {
       const plan = await get(artifactPath(this.id, "plan.json"), this.leaving.signal);
       this.plan.hidden = false;
-      put(this.plan, h("h2", words.plan.decided), decisions(plan.decisions ?? []));
+      put(this.plan, this.planTitle, decisions(plan.decisions ?? []));
     } catch {
       // the job is shown without its plan
     }
@@ -370,7 +374,7 @@ export class JobView {
     const { job } = this, told = Object.entries(job.parameters).filter(([name, value]) => value !== null && value !== "" && name !== "name" && value !== false);
     const fact = (/** @type {string} */ name, /** @type {string} */ value) => h("div", h("dt", name), h("dd", value));
     put(this.facts, h("h2", say.inputs), h("dl.facts", job.inputs.slice(0, 12).map((/** @type {any} */ input) => fact(input.role, `${input.name} · ${size(input.size)}`)), job.inputs.length > 12 ? fact("", words.submit.nFiles(job.inputs.length)) : null),
-      h("details.fold", h("summary", say.settings), h("dl.facts", told.map(([name, value]) => fact(name.replaceAll("_", " "), typeof value === "object" ? JSON.stringify(value) : String(value))))));
+      h("details.fold", h("summary", say.settings), h("dl.facts", told.map(([name, value]) => fact(titleOf(name), typeof value === "object" ? JSON.stringify(value) : String(value))))));
   }
 
   /**

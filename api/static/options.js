@@ -43,7 +43,8 @@ export const GROUPS = {
  */
 export function optionControl(name, schema, { title = titleOf(name), hint = true } = {}) {
   const id = newId(), kinds = variants(schema), shown = words.options.defaults[name];
-  const fallback = shown ?? String(schema["x-default"] ?? schema.default ?? "");
+  const preset = schema["x-default"] ?? schema.default ?? "", onOff = preset === true ? words.submit.on : preset === false ? words.submit.off : preset;
+  const fallback = shown ?? String(onOff);
   const [input, read, suggest] = inputFor(kinds, id);
   suggest(fallback);
   const error = h("p.wrong", { id: `${id}e`, hidden: true });

@@ -7,6 +7,7 @@ import { words } from "./words.js";
 const say = words.submit, hand = words.select;
 
 /** @typedef {import("./select_panel.js").Mask} Mask */
+/** @typedef {import("./stored.js").Chosen} Chosen */
 /** @typedef {{element: HTMLElement, value: () => any, mask: () => Mask | null, setMask: (mask: Mask | null) => void, set: (region: any) => void, setStyles: (names: string[]) => void, wrong: (text: string, field?: string) => void}} Row */
 
 export class RegionList {
@@ -15,7 +16,7 @@ export class RegionList {
     this.select = select;
     /** @type {Row[]} */
     this.rows = [];
-    /** Files of masks, which stay the same while name and mask do. @type {Map<Uint8Array, File>} */
+    /** Files of masks, which stay the same while name and mask do. @type {Map<Uint8Array, Chosen>} */
     this.files = new Map();
     /** @type {string[]} */
     this.styles = [];
@@ -42,7 +43,7 @@ export class RegionList {
     let mask = null;
     const text = () => (mask ? `mask=${name.value.trim()}.bin` : select.value.trim());
     const value = () => ({ name: name.value.trim(), ...(text() ? { select: text() } : {}), ...(freeze.checked || weight.value === "1" ? {} : { weight: Number(weight.value) }), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(freeze.checked ? { freeze: true } : {}) });
-    const selectField = field("Select", select), picked = h("span");
+    const selectField = field(say.regionSelect, select), picked = h("span");
     const pick = h("button.quiet.small", { type: "button", hidden: !this.select, onclick: () => this.select?.(row) });
     const drop = h("button.quiet.small", { type: "button", onclick: () => setMask(null) }, hand.forget);
     const handmade = h("div.handmade", picked, pick, drop);
@@ -54,7 +55,7 @@ export class RegionList {
       picked.textContent = mask ? hand.made(mask.total) : "";
     };
     setMask(null);
-    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field("Name", name), selectField, handmade, field(say.style, style), field(hand.weight, weight), h("label.check", freeze, h("span", "Freeze")));
+    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field(say.regionName, name), selectField, handmade, field(say.style, style), field(hand.weight, weight), h("label.check", freeze, h("span", say.freeze)));
     const error = h("p.wrong", { id: newId(), hidden: true });
     const inputs = /** @type {Record<string, any>} */ ({ name, select, style, weight, freeze });
     for (const input of Object.values(inputs)) input.setAttribute("aria-describedby", error.id);
@@ -92,6 +93,20 @@ export class RegionList {
       this.files.set(mask.bits, file);
       return [file];
     });
+  }
+
+  /**
+   * Show a mask of an earlier job as a selection by hand.
+   *
+   * @param {Row} row region that names the mask
+   * @param {Uint8Array} bits
+   * @param {Chosen} file the mask's file, which is not sent again
+   */
+  restoreMask(row, bits, file) {
+    let total = 0;
+    for (let byte of bits) for (; byte; byte &= byte - 1) total++;
+    row.set({ ...row.value(), mask: { bits, total } });
+    this.files.set(bits, file);
   }
 
   /** Remove masks, which belong to another scene. */

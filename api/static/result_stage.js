@@ -36,7 +36,7 @@ export class ResultStage {
     this.stage = new Stage();
     this.left = this.chooser(say.left);
     this.right = this.chooser(say.right);
-    this.pickers = h("div.row.sides", { hidden: jobs.length < 2 }, this.left.element, this.right.element);
+    this.pickers = h("div.row.sides", { hidden: jobs.length < 2 || !this.stage.viewer }, this.left.element, this.right.element);
     this.blend = new Blend(jobs, jobs.length > 1 ? labels(jobs) : [nameOf(jobs[0])], () => this.showBlend());
     this.blend.element.hidden = true;
     this.blends = blend && jobs.length <= 2;

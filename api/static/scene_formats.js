@@ -17,8 +17,8 @@ export const sceneFormats = /** @type {any} */ ("{{scene_formats}}");
 /** Formats of results, PLY first. */
 export const resultFormats = sceneFormats.filter(({ result }) => result);
 
-/** Titles of all formats: "PLY, compressed PLY, SPZ or .splat". */
-export const titles = sceneFormats.map(({ title }) => title).join(", ").replace(/, ([^,]*)$/, " or $1");
+/** Titles of all formats, without variants such as compressed PLY: "PLY, SPZ or .splat". */
+export const titles = sceneFormats.filter(({ suffix }) => suffix.lastIndexOf(".") === 0).map(({ title }) => title).join(", ").replace(/, ([^,]*)$/, " or $1");
 
 /** Value of the attribute `accept` of a file input: the last part of each suffix. */
 export const accepted = [...new Set(sceneFormats.map(({ suffix }) => suffix.slice(suffix.lastIndexOf("."))))].join();

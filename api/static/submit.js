@@ -120,13 +120,22 @@ export class SubmitView {
     for (const [role, files] of Object.entries(kept.expired ?? {})) if (files.length) this.slots[/** @type {keyof typeof this.slots} */ (role)].askAgain(files.map(({ name }) => name));
     kept = null;
     this.styleChanged();
+    this.restoreMasks().catch(() => {}); // a region without its mask still names the file
+  }
+
+  async restoreMasks() {
+    const { shown } = this;
+    for (const row of this.regions.rows) {
+      const file = this.masks.find(({ name }) => row.value().select === `mask=${name}` && /\.bin$/i.test(name));
+      if (!file || row.mask()) continue;
+      const bits = new Uint8Array(await (await contentOf(file)).arrayBuffer());
+      if (this.shown === shown) this.regions.restoreMask(row, bits, file);
+    }
   }
 
   /** Let the user select the Gaussians of a region. @param {import("./regions.js").Row} row */
-  async selectRegion(row) {
-    const { name, select } = row.value(), stored = this.masks.find((file) => select === `mask=${file.name}` && /\.bin$/i.test(file.name));
-    const before = row.mask() ?? (stored ? { bits: new Uint8Array(await (await contentOf(stored)).arrayBuffer()), total: 0 } : null);
-    const opened = this.selecting.open(name, before, (mask) => {
+  selectRegion(row) {
+    const opened = this.selecting.open(row.value().name, row.mask(), (mask) => {
       if (mask) row.setMask(mask);
       /** @type {HTMLElement} */ (row.element.querySelector(".handmade button")).focus();
     });
@@ -134,9 +143,9 @@ export class SubmitView {
   }
 
   build() {
-    this.invite = h("label.invite", { htmlFor: this.slots.scene.input.id }, h("span.plus", icon("plus")), h("strong", say.drop), h("span", say.dropMore));
+    this.invite = h("label.invite", { htmlFor: this.slots.scene.input.id }, h("span.plus", icon("plus")), h("strong.pointer", say.drop), h("strong.touch", say.dropTouch), h("span", say.dropMore));
     this.stage.overlay.append(this.invite);
-    this.presets = h("fieldset.presets", h("legend", "Preset"));
+    this.presets = h("fieldset.presets", h("legend", say.preset));
     this.main = h("div.options");
     this.ring = h("div.options");
     this.around = this.choice("views", say.around, false);
@@ -212,7 +221,7 @@ export class SubmitView {
       return;
     }
     for (const [name, each] of Object.entries(schema)) {
-      if (["name", "style_weights", "regions", "preset"].includes(name)) continue;
+      if (["name", "style_weights", "regions", "preset", "video"].includes(name)) continue;
       this.controls.set(name, optionControl(name, each, name === "orbit" ? { title: say.howMany } : {}));
     }
     this.schema = schema;
@@ -236,7 +245,7 @@ export class SubmitView {
   makePresets(schema) {
     const name = newId();
     this.choosePreset(schema.default);
-    put(this.presets, h("legend", "Preset"), schema.enum.map((/** @type {string} */ value) => h("label",
+    put(this.presets, h("legend", say.preset), schema.enum.map((/** @type {string} */ value) => h("label",
       h("input", { type: "radio", name, value, checked: value === schema.default, onchange: () => this.choosePreset(value) }),
       h("span", h("strong", value), h("small", say.presets[value] ?? ""), this.times.get(value) ?? this.newTime(value)))));
   }

@@ -41,6 +41,8 @@ def test_form_fits_with_two_paintings_and_during_an_upload(
     page.get_by_label(paintings[0].name, exact=True).wait_for()
     page.locator("[data-name=resolution]").wait_for()
     assert page.evaluate(_CUT_OFF) == []
+    choices = page.locator(".strengths span").evaluate_all("(all) => all.map((it) => it.scrollWidth <= it.clientWidth)")
+    assert choices == [True] * 3, "a picture of a strength is wider than its choice"
     held: list[Any] = []
     page.route(
         "**/v1/uploads/*", lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_()

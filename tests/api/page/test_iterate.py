@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,31 @@ def test_another_painting_and_changes_send_nothing_again(
     assert len(sent) == 1, "nothing is sent"
     assert digests(again, "style") == digests(before, "style")
     assert (again["parameters"]["steps_coarse"], before["parameters"]["steps_coarse"]) == (2, 3)
+    watched.check()
+
+
+def test_changes_restore_regions_with_masks(
+    visit: Visit, service: Service, files: dict[str, Path], night: Path, tmp_path: Path
+) -> None:
+    mask = tmp_path / "left.bin"
+    mask.write_bytes(bytes([0b00001111] * 77))
+    region = {"name": "left", "select": "mask=left.bin", "weight": 0.25, "style": "night.png"}
+    body = [(role, (path.name, path.read_bytes())) for role, path in [*files.items(), ("style", night), ("mask", mask)]]
+    values = STEPS | {"steps_sos": 2, "regions": [region]}
+    answer = httpx.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(values)}, timeout=60)
+    before = httpx.get(f"{service.url}/v1/jobs/{done(service, answer.json()['id'])}").json()
+    watched = visit(f"/#/jobs/{before['id']}")
+    page, sent = watched.page, uploads_of(watched)
+    page.get_by_role("button", name="Same with changes").click()
+    watched.settled()
+    row = page.get_by_role("group", name="Region 1")
+    for name, value in {"Name": "left", "Weight": "0.25", "Style": "night.png"}.items():
+        assert row.get_by_label(name).input_value() == value
+    row.get_by_text("308 Gaussians selected by hand").wait_for()
+    again = started(watched, service)
+    assert not sent
+    assert again["parameters"]["regions"] == before["parameters"]["regions"]
+    assert digests(again, "mask") == digests(before, "mask")
     watched.check()
 
 

@@ -50,7 +50,7 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.get_by_role("button", name="Start").click()
     page.locator("h1", has_text="scene").wait_for()
     page.locator(".badge", has_text="Done").wait_for()
-    page.get_by_role("img", name="Loss against seconds").wait_for()
+    page.get_by_role("img", name="Loss over time").wait_for()
     page.get_by_role("heading", name="How it will run").wait_for()
     page.get_by_label("Wipe", exact=True).wait_for()
     job_id = page.url.rsplit("/", 1)[1]
@@ -158,7 +158,7 @@ def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str,
     watched = visit(f"/#/jobs/{job_id}")
     page = watched.page
     page.get_by_text("Adding detail · step").wait_for()
-    page.get_by_role("img", name="Loss against seconds").wait_for()
+    page.get_by_role("img", name="Loss over time").wait_for()
     service.kill("api.http.server")
     page.get_by_text("Connection lost").wait_for()
     wait_for(service.ready, "the API to be back", service.said)
@@ -166,7 +166,7 @@ def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str,
     step = page.locator(".state").inner_text()
     wait_for(lambda: page.locator(".state").inner_text() != step, "news of the job", service.said)
     page.reload()
-    page.get_by_role("img", name="Loss against seconds").wait_for()
+    page.get_by_role("img", name="Loss over time").wait_for()
     page.get_by_role("button", name="Cancel").click()
     page.get_by_role("button", name="Retry").wait_for()
     watched.check("net::ERR", "Failed to load resource")

@@ -30,7 +30,7 @@ def test_result_is_downloaded_in_every_format(visit: Visit, finished: str) -> No
     page = watched.page
     button = page.get_by_role("link", name="Download", exact=True)
     button.wait_for()
-    chart = page.get_by_role("img", name="Loss against seconds")
+    chart = page.get_by_role("img", name="Loss over time")
     chart.wait_for()
     assert button.bounding_box()["y"] < chart.bounding_box()["y"]
     formats = page.get_by_label("Format")
@@ -59,7 +59,7 @@ def test_chart_ends_with_the_loss_of_the_result(visit: Visit, service: Service, 
     legend = watched.page.locator(".legend")
     legend.get_by_text("mean of all views").wait_for()
     legend.get_by_text("single views").wait_for()
-    label = watched.page.get_by_role("img", name="Loss against seconds").get_attribute("aria-label")
+    label = watched.page.get_by_role("img", name="Loss over time").get_attribute("aria-label")
     shown = float(label.split(" to ")[1].split(" in ")[0].replace(",", ""))
     assert shown == pytest.approx(job["result"]["loss_after"], rel=0.01)
     watched.check()
