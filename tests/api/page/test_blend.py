@@ -171,6 +171,22 @@ def test_two_results_are_blended(
     watched.check()
 
 
+def test_long_labels_stay_within_the_triangle(visit: Visit, service: Service, pair: list[str]) -> None:
+    for job_id in pair:
+        name = f"a name that is longer than the triangle {job_id[-4:]}"
+        httpx.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": name}).raise_for_status()
+    watched = visit(f"/#/compare/{pair[0]}/{pair[1]}", width=1100, height=800)
+    triangle = watched.page.locator(".triangle")
+    triangle.locator(".corner").nth(1).wait_for()
+    boxes = [each.bounding_box() for each in triangle.locator(".corner").all()]
+    whole = triangle.bounding_box()
+    assert all(box["x"] + box["width"] <= whole["x"] + whole["width"] for box in boxes)
+    watched.settled()
+    for job_id, name in zip(pair, ("run 1", "run 900"), strict=True):
+        httpx.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": name}).raise_for_status()
+    watched.check()
+
+
 def test_refined_result_offers_no_blend(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     job_id = done(service, submit(service, files, refine=2, **QUICK))
     watched = visit(f"/#/jobs/{job_id}")

@@ -43,6 +43,7 @@ def test_form_fits_with_two_paintings_and_during_an_upload(
     assert page.evaluate(_CUT_OFF) == []
     choices = page.locator(".strengths span").evaluate_all("(all) => all.map((it) => it.scrollWidth <= it.clientWidth)")
     assert choices == [True] * 3, "a picture of a strength is wider than its choice"
+    assert page.locator("[data-name=video]").count() == 0, "a video is not a line of text"
     held: list[Any] = []
     page.route(
         "**/v1/uploads/*", lambda route: held.append(route) if route.request.method == "PATCH" else route.continue_()

@@ -44,6 +44,11 @@ def test_job_is_renamed(visit: Visit, service: Service, files: dict[str, Path]) 
     page.get_by_label("New name").fill("third")
     page.keyboard.press("Escape")
     page.get_by_role("heading", name="second").wait_for()
+    httpx.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": "point_cloud · wheat_field_with_cypresses"})
+    tile = visit("/#/jobs", width=390, height=844).page.locator(".tile", has_text="wheat_field_with_cypresses")
+    assert tile.locator("strong").evaluate(
+        "(it) => it.scrollWidth <= it.clientWidth && it.scrollHeight <= it.clientHeight"
+    )
     page.get_by_role("button", name="Rename").click()
     page.get_by_label("New name").fill("")
     page.keyboard.press("Enter")

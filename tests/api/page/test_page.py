@@ -51,7 +51,7 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.locator("h1", has_text="scene").wait_for()
     page.locator(".badge", has_text="Done").wait_for()
     page.get_by_role("img", name="Loss over time").wait_for()
-    page.get_by_role("heading", name="How it will run").wait_for()
+    page.get_by_role("heading", name="How it ran").wait_for()
     page.get_by_label("Wipe", exact=True).wait_for()
     job_id = page.url.rsplit("/", 1)[1]
 
@@ -466,6 +466,8 @@ def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) 
     page = watched.page
     page.goto(service.url)
     ply, _, _ = write_files(tmp_path, ball())
+    page.get_by_text("Tap to choose a scene").wait_for()
+    assert page.get_by_text("Drop your scene here").is_hidden()
     page.get_by_label("Scene", exact=True).set_input_files(ply)
     page.locator("canvas.view").scroll_into_view_if_needed()
     first = watched.pixels()

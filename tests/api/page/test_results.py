@@ -76,6 +76,26 @@ def test_result_comes_before_deletion_on_a_phone(visit: Visit, finished: str) ->
     ]
     tops = [place.bounding_box()["y"] for place in places]
     assert tops == sorted(tops)
+    page.get_by_role("heading", name="How it ran").wait_for()
+    watched.check()
+
+
+def test_no_remaining_time_is_shown_while_views_are_analyzed(visit: Visit, finished: str) -> None:
+    """The survey's own remaining time, which ends at 0, is not that of the job."""
+
+    def planning(route: Any) -> None:
+        progress = {"stage": "planning", "step": 9, "total": 9, "fraction": 1.0, "eta_s": 0.0}
+        job = route.fetch().json() | {"status": "running", "progress": progress}
+        route.fulfill(json=job)
+
+    watched = visit("/#/jobs")
+    page = watched.page
+    page.route(f"**/v1/jobs/{finished}", planning)
+    page.goto(f"{watched.url}/#/jobs/{finished}")
+    page.get_by_text("Analyzing views · view 9 of 9").wait_for()
+    assert page.locator(".state .left").inner_text() == ""
+    page.get_by_role("heading", name="How it will run").wait_for()
+    page.unroute_all(behavior="ignoreErrors")
     watched.check()
 
 
@@ -132,6 +152,9 @@ def test_result_without_webgl_is_the_sheet(browser: Any, service: Service, finis
     page.get_by_text("needs WebGL 2").wait_for()
     assert page.locator(".stage").bounding_box()["height"] < 200
     assert httpx.get(f"{service.url}/v1/jobs/{finished}").json()["preview"] == "previews/thumbnail.jpg"
+    page.goto(f"{service.url}/#/compare/{finished}/{finished}")
+    page.get_by_text("needs WebGL 2").wait_for()
+    assert page.get_by_label("Left", exact=True).is_hidden()
     watched.check("WebGL")
     bare.close()
 
