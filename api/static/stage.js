@@ -50,7 +50,7 @@ export class Stage {
       this.message(error instanceof Error ? error.message : String(error));
       return;
     }
-    this.controls = new Controls(this.viewer, { toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home(), hold: (held) => this.hold(held) });
+    this.controls = new Controls(this.viewer, { moved: () => this.leaveCamera(), toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home(), hold: (held) => this.hold(held) });
     this.makeTools();
     this.canvas.addEventListener("pointerdown", () => this.leaveCamera());
     this.divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => event.buttons && this.wipeTo(event.clientX));

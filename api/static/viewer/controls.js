@@ -11,7 +11,7 @@ const STEPS = { a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0], w: [0,
 export class Controls {
   /**
    * @param {Viewer} viewer
-   * @param {{toggle?: () => void, camera?: (by: number) => void, home?: () => void, hold?: (held: boolean) => void}} keys actions of other keys; `hold` is called when O is pressed and released
+   * @param {{moved?: () => void, toggle?: () => void, camera?: (by: number) => void, home?: () => void, hold?: (held: boolean) => void}} keys actions of other keys; `moved` is called when keys or the wheel move the camera, `hold` is called when O is pressed and released
    */
   constructor(viewer, keys = {}) {
     this.viewer = viewer;
@@ -88,6 +88,7 @@ export class Controls {
     event.preventDefault();
     const pixels = event.deltaY * (event.deltaMode === 1 ? 16 : 1);
     this.approach(Math.exp(Math.max(-400, Math.min(400, pixels)) / 900));
+    this.keys.moved?.();
     this.viewer.moved();
   }
 
@@ -105,6 +106,7 @@ export class Controls {
     else if (key === "," || key === ".") return this.other(event, () => this.keys.camera?.(key === "," ? -1 : 1));
     else return;
     event.preventDefault();
+    this.keys.moved?.();
     viewer.moved();
   }
 

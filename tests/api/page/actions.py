@@ -77,5 +77,6 @@ _DROP = """(files) => {
 
 def drop(watched: Watched, files: dict[str, Path]) -> None:
     """Drop all files at once on the page."""
+    watched.page.locator(".frame").wait_for()
     carried = [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in files.values()]
     watched.page.evaluate(_DROP, carried)

@@ -316,6 +316,7 @@ def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) 
     page.keyboard.press("ArrowRight")
     page.keyboard.press("w")
     wait_for(lambda: int(page.locator(".stage").get_attribute("data-frames")) > frames, "the view to move")
+    assert page.get_by_label("Camera", exact=True).input_value() == "-1", "the view is that of no camera"
     page.keyboard.press(" ")
     page.locator("#said", has_text="Stylized").or_(page.locator("#said", has_text="Original")).wait_for()
     page.keyboard.press(".")
