@@ -32,6 +32,9 @@ _UNCOVERED = 0.01
 #: Above this fraction of uncovered pixels, views are assumed to show an object without background. (Views of a room
 #: that was captured from only some places have holes of a few percent.)
 _SCAN = 0.2
+#: Fraction of the color energy that depends on the view direction, from which on attenuating it is recommended: it
+#: then shows beside the style (docs/quality.md).
+_VIEW_DEPENDENT = 0.1
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
 ANOTHER_LOSS = "differs from the paper's loss"
@@ -88,10 +91,16 @@ def _about_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
                 error="colors depend less on the view direction",
             )
         ]
+    lines = []
+    if scene.harmonics_energy >= _VIEW_DEPENDENT:
+        advice = "unchanged, so highlights keep their tint; --sh-attenuation 1 removes it"
+        reason = f"{scene.harmonics_energy:.0%} of the color variance depends on the view direction"
+        lines = [Decision("view-dependent color", advice, reason)]
     degree = scene.used_degree
     if "sh" in settings.keep or degree == scene.sh_degree:
-        return []
+        return lines
     return [
+        *lines,
         Decision(
             item,
             f"evaluated up to degree {degree}",

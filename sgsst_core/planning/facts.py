@@ -30,12 +30,14 @@ class SceneFacts:
         sh_degree: SH degree of its file.
         used_degree: Highest SH degree with a non-zero coefficient after SH attenuation, among the rendered Gaussians.
         held_degree: SH degree in memory; 0 if coefficients stay in the file.
+        harmonics_energy: See `spherical_harmonics.harmonics_energy`, with the views' blend weights.
     """
 
     gaussians: int
     sh_degree: int
     used_degree: int
     held_degree: int
+    harmonics_energy: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
-from sgsst_core.scene.spherical_harmonics import rest_colors, scene_colors
+from sgsst_core.scene.spherical_harmonics import harmonics_energy, rest_colors, scene_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
@@ -92,6 +92,7 @@ def measure(context: PlanningContext, survey: Survey, link: Link, maps: int = 0)
             context.sh_degree,
             used_degree=scene.used_degree(rendered_gaussians(survey, context.settings)),
             held_degree=0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree,
+            harmonics_energy=harmonics_energy(scene, survey.total_blend_weights),
         ),
         sizes,
         survey,

@@ -20,7 +20,7 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
 from sgsst_core.devices import on_device
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import StoredHarmonics
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 
 #: Gaussians per chunk: limits the basis [chunk, 15] and the float64 copies to some tens of megabytes.
 _CHUNK = 1 << 17
@@ -196,6 +196,25 @@ def triton_runs_on(device: torch.device) -> bool:
     except Exception:  # the tensor functions are used instead
         return False
     return abs(float(colors[0, 0]) - SH_C1) < 1e-6
+
+
+def harmonics_energy(scene: Scene, weights: Tensor) -> float:
+    """Return the fraction of a scene's color energy, without the mean color, that depends on the view direction.
+
+    Spherical harmonics are orthonormal, so the mean square of a Gaussian's color over all directions is the sum of its
+    squared coefficients, up to a factor that all degrees share. All sums are float64.
+
+    Args:
+        scene: Scene with N Gaussians.
+        weights: [N] float64, weight of each Gaussian; at least one is positive.
+    """
+    weights = weights / weights.sum()
+    energy = 0.0
+    for rows in torch.arange(len(scene)).split(_CHUNK):
+        energy += float(weights[rows] @ held(scene.sh_rest[rows]).double().square().sum(dim=(1, 2)))
+    colors = scene.sh_dc.double()
+    variance = float(weights @ (colors - weights @ colors).square().sum(dim=1))
+    return energy / (energy + variance) if energy else 0.0
 
 
 def view_colors(

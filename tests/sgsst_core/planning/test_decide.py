@@ -107,6 +107,19 @@ def test_unused_spherical_harmonics_are_skipped(
     assert (text_of(plan, "spherical harmonics") if expected else line(plan, "spherical harmonics")) == expected
 
 
+def test_attenuation_is_recommended_where_much_color_depends_on_the_view() -> None:
+    strong, item = probe(harmonics_energy=0.25), "view-dependent color"
+    assert text_of(plan_of(strong), item) == (
+        "unchanged, so highlights keep their tint; --sh-attenuation 1 removes it: "
+        "25% of the color variance depends on the view direction"
+    )
+    assert line(plan_of(probe(harmonics_energy=0.01)), item) is None
+    assert line(plan_of(strong, sh_attenuation=0.5), item) is None
+    both = probe(harmonics_energy=0.25, used_degree=1)
+    assert line(plan_of(both), item) is not None
+    assert line(plan_of(both), "spherical harmonics") is not None
+
+
 # --- views ---------------------------------------------------------------------------------------------------------
 
 

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
+from sgsst_core.scene import spherical_harmonics
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import (
     basis,
+    harmonics_energy,
     kernel_rest_colors,
     reference_rest_colors,
     rest_colors,
@@ -54,6 +56,32 @@ def test_basis_is_orthonormal() -> None:
     values = torch.cat([torch.full((len(directions), 1), SH_C0, dtype=torch.float64), basis(directions, 3)], dim=1)
     products = values.T @ (weights[:, None] * values)
     assert torch.allclose(products, torch.eye(16, dtype=torch.float64), atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("chunk", [7, 1 << 17])
+def test_harmonics_energy_is_that_over_all_directions(
+    degree: int, chunk: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spherical_harmonics, "_CHUNK", chunk)
+    scene = cloud(20, degree=degree)
+    weights = torch.rand(20, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights[:3] = 0
+    directions, quadrature = sphere()
+    colors = SH_C0 * scene.sh_dc.double() - (weights @ (SH_C0 * scene.sh_dc.double())) / weights.sum()
+    rest = basis(directions, degree) @ held(scene.sh_rest).double().permute(1, 0, 2).reshape(-1, 60)
+    squares = (quadrature @ rest.square() / (4 * math.pi)).reshape(20, 3).sum(dim=1)
+    energy, variance = weights @ squares, weights @ colors.square().sum(dim=1)
+    assert harmonics_energy(scene, weights) == pytest.approx(float(energy / (energy + variance)), rel=1e-9)
+
+
+def test_harmonics_energy_has_no_division_by_zero() -> None:
+    scene, weights = cloud(5, degree=1), torch.ones(5, dtype=torch.float64)
+    same = replace(scene, sh_dc=torch.full_like(scene.sh_dc, 0.5))
+    assert harmonics_energy(same, weights) == 1
+    assert harmonics_energy(replace(same, sh_rest=torch.zeros_like(held(same.sh_rest))), weights) == 0
+    huge = replace(scene, sh_rest=torch.full_like(held(scene.sh_rest), 1e30))
+    assert harmonics_energy(huge, weights) == 1
 
 
 def test_basis_has_signs_and_order_of_3dgs_files() -> None:
