@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
+from annotated_types import Ge, Le
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -59,6 +60,10 @@ Resolution = Annotated[
 ]
 
 
+#: Factor of `Settings.refine`.
+RefineFactor = Annotated[float, Ge(1), Le(16)]
+#: Maximum growth with `refine` "auto".
+_AUTO_GROWTH = 2.0
 ScaleWeight = Annotated[float, Field(ge=0, le=_MAX_WEIGHT, allow_inf_nan=False)]
 
 
@@ -210,12 +215,10 @@ class Settings(BaseModel):
         description="Weight of each scale in the loss, starting at full size, each scale half as large as the one "
         "before; scales without a weight, or with weight 0, are not computed.",
     )
-    refine: Annotated[float, Option(unit="factor", metavar="N")] = Field(
+    refine: Annotated[RefineFactor | Literal["auto"], Option(unit="factor", metavar="N")] = Field(
         1.0,
-        ge=1,
-        le=16,
         description="Split Gaussians that are large on screen, for finer strokes: up to N times as many in total "
-        "(1 = off).",
+        "(1 = off); auto: only those too large for the strokes of the finest scale, up to twice as many in total.",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed for the order of views and for random training backgrounds.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
@@ -282,6 +285,11 @@ class Settings(BaseModel):
         description="Measure novel views, which lie between the cameras, for S of the steps' predicted time, or 30 s "
         "if that is more; 0 measures none.",
     )
+
+    @property
+    def growth(self) -> float:
+        """Maximum factor by which refinement multiplies the number of Gaussians; 1 if it is off."""
+        return _AUTO_GROWTH if self.refine == "auto" else self.refine
 
     def learning_rate_at(self, fraction: float) -> float:
         """Return Adam's learning rate after a fraction (0..1) of all steps."""

@@ -89,7 +89,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
         source.scene,
         collectives,
         drop_invalid=source.drop_invalid,
-        growth=settings.refine,
+        growth=settings.growth,
         spz_axes=axes,
     )
     scene_file = scene_file.rendered(source.render_mode, source.eps2d)

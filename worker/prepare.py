@@ -87,7 +87,7 @@ def prepare(
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
     refinement, scene_file = resumed.plan.refinement if resumed else None, inputs.scene_file
-    if settings.refine > 1:
+    if settings.growth > 1:
         with timer("refining"):
             refinement = refinement if resumed else _refine(inputs, settings, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))

@@ -123,7 +123,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     source = scene_request(staged, parameters)
     with _errors_of("scene"):
         header = read_scene_header(staged.scene)
-        declared = int(header.count * settings.refine)
+        declared = int(header.count * settings.growth)
         if declared > limits["gaussians"]:
             raise TooManyGaussiansError(declared, limits["gaussians"], _refinement_note(settings))
     with _errors_of("cameras"):
@@ -186,7 +186,7 @@ def _pixels(cameras: Sequence[Camera]) -> int:
 
 def _refinement_note(settings: Settings) -> str:
     """Return a note that a reported number of Gaussians includes refinement; empty without refinement."""
-    return f" once it is refined to at most {settings.refine:g} times as many" if settings.refine > 1 else ""
+    return f" once it is refined to at most {settings.growth:g} times as many" if settings.growth > 1 else ""
 
 
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:

@@ -85,8 +85,8 @@ def estimated_size(parameters: Mapping[str, Any], inputs: Sequence[Mapping[str, 
         parameters: Stored parameters.
         inputs: `role`, `name` and `size` of each file.
     """
-    settings = _settings(parameters)
-    gaussians = sum(_gaussians(entry) for entry in inputs if entry["role"] == "scene") * settings.refine
+    settings = settings_of(parameters)
+    gaussians = sum(_gaussians(entry) for entry in inputs if entry["role"] == "scene") * settings.growth
     steps = settings.views_per_step
     return JobSize(
         gaussians,
@@ -103,7 +103,8 @@ def estimated_seconds(parameters: Mapping[str, Any], inputs: Sequence[Mapping[st
     return _START_SECONDS + staging + estimated_size(parameters, inputs).seconds(max(gpus, 1))
 
 
-def _settings(parameters: Mapping[str, Any]) -> Settings:
+def settings_of(parameters: Mapping[str, Any]) -> Settings:
+    """Return the settings of a job from its stored parameters; the defaults if another version has stored them."""
     known = Settings.model_fields.keys() - {"preset", "keep"}
     given = {name: value for name, value in parameters.items() if name in known}
     preset = parameters.get("preset", "standard")

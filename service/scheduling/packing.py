@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.scheduling.job_size import estimated_size
+from service.scheduling.job_size import estimated_size, settings_of
 from service.scheduling.machine import Machine
 from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
 
@@ -151,9 +151,8 @@ class Capacity:
 def _scene_bytes(job: QueuedJob) -> int:
     """Return the size of a job's scene in bytes, once it is read and refined."""
     files = [entry for entry in job.inputs if entry["role"] == "scene"]
-    growth = job.parameters.get("refine")
     size = sum(scene_bytes(str(entry.get("name", "")), entry["size"]) for entry in files)
-    return int(size * growth) if isinstance(growth, int | float) and growth > 1 else size
+    return int(size * settings_of(job.parameters).growth)
 
 
 def _requested(job: QueuedJob, name: str) -> int:

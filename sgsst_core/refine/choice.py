@@ -21,6 +21,8 @@ LEAST_PSNR = 40.0
 #: Candidate target sizes: projected standard deviations in pixels, coarsest first. A Gaussian below the last one is
 #: hardly larger than a pixel.
 SIZES = tuple(256 * 2 ** (-step / 4) for step in range(30))
+#: Size of the finest strokes: with "auto", Gaussians are not split to smaller ones.
+STROKE_SIZE = 4.0
 #: Minimum total blend weight of a Gaussian over all views, in pixels; smaller ones are too small for a stroke.
 _LEAST_WEIGHT = 8.0
 #: Maximum number of children: those of a flat Gaussian split into the most pieces along both axes.
@@ -91,6 +93,14 @@ def axes_in_view(scene: Scene, rows: Tensor, camera: Camera) -> tuple[Tensor, Te
     return lengths.nan_to_num(torch.inf), reach.nan_to_num(torch.inf)
 
 
+def finest_size(settings: Settings) -> float:
+    """Return the smallest target size in pixels: with "auto", that of the strokes of the finest scale in the loss."""
+    if settings.refine != "auto":
+        return SIZES[-1]
+    finest = next(scale for scale, weight in enumerate(settings.scales or (1.0,)) if weight > 0)
+    return STROKE_SIZE * 2**finest
+
+
 def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, magnitude: Tensor) -> Tensor:
     """Return the mask [N] bool of Gaussians that may be split.
 
@@ -115,7 +125,7 @@ def most_children(weights: Tensor) -> Tensor:
 
 
 def choose_pieces(
-    lengths: Tensor, allowed: Tensor, cancels: Tensor, most: Tensor, budget: int
+    lengths: Tensor, allowed: Tensor, cancels: Tensor, most: Tensor, budget: int, finest: float = SIZES[-1]
 ) -> tuple[Tensor, float | None]:
     """Choose the number of pieces of each Gaussian within a budget.
 
@@ -129,6 +139,7 @@ def choose_pieces(
         cancels: [N], see `disagreement`.
         most: [N], maximum number of children, see `most_children`.
         budget: Maximum total number of Gaussians.
+        finest: Smallest target size in pixels.
 
     Returns:
         Pieces [N, 3] uint8, and the size in pixels to which Gaussians were split; None if none is split.
@@ -136,7 +147,7 @@ def choose_pieces(
     rows = allowed.nonzero()[:, 0]
     allowed_lengths, rest = lengths[rows], budget - (len(lengths) - len(rows))
     chosen, size = torch.ones((len(rows), 3), dtype=torch.uint8), None
-    for smaller in SIZES:
+    for smaller in (size for size in SIZES if size >= finest):
         following = pieces_to(allowed_lengths, smaller)
         following = torch.where((piece_counts(following) <= most[rows])[:, None], following, chosen)
         more = piece_counts(following) - piece_counts(chosen)
@@ -163,11 +174,12 @@ def refine_decision(refinement: Refinement, settings: Settings) -> Decision:
     back = back if refinement.reverted else ""
     if not refinement.split or refinement.psnr is None:
         return Decision(item, "none is split", f"none is large where the gradient calls for several colors{back}")
+    budget = "are allowed" if settings.refine == "auto" else "were requested"
     return Decision(
         item,
         f"{refinement.split:,} are split, which turns {before:,} Gaussians into {refinement.gaussians:,}",
         f"they are larger than {refinement.size:.2g} pixels in the views, and the gradient calls for several colors "
-        f"in them; at most {settings.refine:g} times as many were requested{back}",
+        f"in them; at most {settings.growth:g} times as many {budget}{back}",
         error=f"unstylized renders have {refinement.psnr:.1f} dB PSNR against those of the original scene, each "
         f"measured view at least {refinement.lowest_psnr:.1f} dB",
     )

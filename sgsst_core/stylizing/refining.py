@@ -28,7 +28,7 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.context import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, most_children
+from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, finest_size, most_children
 from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
@@ -78,7 +78,7 @@ def refine(
     Returns:
         The refinement; None if `settings.refine` turns it off.
     """
-    if settings.refine <= 1:
+    if settings.growth <= 1:
         return None
     fitted = fit_cameras(cameras, settings)
     planning_context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
@@ -138,13 +138,13 @@ class _Refining:
         covered = self._survey()
         count = len(self._scene)
         nothing = Refinement(torch.ones((count, 3), dtype=torch.uint8), 0, count)
-        if not covered:
+        lengths, finest = self._footprints.lengths, finest_size(self._settings)
+        if not covered or not self._collectives.broadcast(lambda: bool((lengths > finest).any())):
             return nothing
         cancels, magnitude = self._gradient_disagreement(spread_evenly(covered, GRADIENT_VIEWS))
         allowed = candidates(self._footprints, self._may_be_split(), cancels, magnitude)
-        budget, lengths = math.floor(self._settings.refine * count), self._footprints.lengths
-        most = most_children(self._footprints.weights)
-        pieces, size = self._collectives.broadcast(lambda: choose_pieces(lengths, allowed, cancels, most, budget))
+        budget, most = math.floor(self._settings.growth * count), most_children(self._footprints.weights)
+        pieces, size = self._collectives.broadcast(lambda: choose_pieces(lengths, allowed, cancels, most, budget, finest))
         chosen = int((piece_counts(pieces) > 1).sum())
         fitted = spread_evenly(covered, GRADIENT_VIEWS)
         pieces, change = self._undo_until_images_are_preserved(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))

@@ -266,7 +266,7 @@ class _Attempts:
             size = workplace.scene_bytes if workplace else scene_bytes(scene.name, scene.stat().st_size)
         except OSError:
             return 0
-        return int(size * self._request.settings.refine)
+        return int(size * self._request.settings.growth)
 
     def _resume(self) -> Resume:
         """Return which checkpoint to resume from: the user's choice at first, then only checkpoints of this run."""

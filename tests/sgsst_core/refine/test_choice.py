@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -13,14 +15,16 @@ from sgsst_core.rasterizer.projection import Column, project
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine.choice import (
     SIZES,
+    STROKE_SIZE,
     Footprints,
     axes_in_view,
     candidates,
     choose_pieces,
+    finest_size,
     most_children,
     refine_decision,
 )
-from sgsst_core.refine.split import Refinement, piece_counts
+from sgsst_core.refine.split import Refinement, piece_counts, ratio_of
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
@@ -107,6 +111,30 @@ def test_gaussians_that_disagree_most_are_split_first_within_the_budget() -> Non
     assert size is None
 
 
+@pytest.mark.parametrize(
+    ("values", "size"),
+    [
+        ({"refine": 4}, SIZES[-1]),
+        ({"refine": "auto"}, STROKE_SIZE),
+        ({"refine": "auto", "scales": (1.0, 0.0, 1.0)}, STROKE_SIZE),
+        ({"refine": "auto", "scales": (0.0, 0.0, 1.0)}, 4 * STROKE_SIZE),
+    ],
+)
+def test_finest_size_is_that_of_the_strokes_of_the_finest_scale(values: dict[str, Any], size: float) -> None:
+    assert finest_size(make_settings(**values)) == size
+
+
+def test_gaussians_are_split_down_to_the_finest_size_only() -> None:
+    lengths = torch.tensor([[3.0, 0.1, 0.1], [40.0, 0.1, 0.1]], dtype=torch.float64)
+    one, cancels = torch.ones(2, dtype=torch.bool), torch.ones(2, dtype=torch.float64)
+    pieces, size = choose_pieces(lengths, one, cancels, 1000 * cancels, 1000, STROKE_SIZE)
+    assert size == STROKE_SIZE
+    assert piece_counts(pieces)[0] == 1
+    assert 40 / ratio_of(int(pieces[1, 0])) <= STROKE_SIZE < 40 / ratio_of(int(pieces[1, 0]) - 1)
+    finer, _ = choose_pieces(lengths, one, cancels, 1000 * cancels, 1000)
+    assert bool((piece_counts(finer) > piece_counts(pieces)).all())
+
+
 def test_faint_uniform_or_close_gaussians_are_not_candidates() -> None:
     prints = Footprints(cloud(5))
     prints.weights = torch.tensor([100.0, 1.0, 100.0, 100.0, 100.0], dtype=torch.float64)
@@ -129,5 +157,7 @@ def test_plan_line_states_splits_and_their_image_error(reverted: int) -> None:
     assert ("7 are not split" in line.reason) == bool(reverted)
     assert "43.2 dB" in line.error
     assert "41.1 dB" in line.error
+    automatic = refine_decision(refinement, make_settings(refine="auto"))
+    assert "at most 2 times as many are allowed" in automatic.reason
     none = refine_decision(Refinement(torch.ones(9, 3, dtype=torch.uint8), 0, 9), make_settings(refine=4))
     assert none.decision == "none is split"

@@ -12,7 +12,7 @@ from sgsst_core.loss.difference import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import choice
-from sgsst_core.refine.choice import LEAST_PSNR
+from sgsst_core.refine.choice import LEAST_PSNR, Footprints
 from sgsst_core.refine.split import Refinement, parents_of, piece_counts
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import Settings, make_settings
@@ -106,6 +106,36 @@ def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights)
     assert (refinement.split, refinement.gaussians, refinement.reverted) == (0, len(small), 0)
     assert refinement.psnr is None
     assert refined(small, refinement) is small
+
+
+def test_auto_splits_only_what_is_too_large_for_strokes(tiny_weights: BackboneWeights) -> None:
+    scene, views = large_wall(), cameras()
+    refinement = refine(scene, views, style(), settings(refine="auto"), weights=tiny_weights)
+    assert refinement is not None
+    assert refinement.size is not None
+    assert refinement.size >= choice.STROKE_SIZE
+    assert len(scene) < refinement.gaussians <= 2 * len(scene)
+    prints, rasterizer = Footprints(scene), CpuRasterizer(scene)
+    for view in views:
+        prints.add(view, rasterizer.survey(view)[1])
+    split = piece_counts(refinement.pieces) > 1
+    assert float(prints.lengths[split].amax(dim=1).min()) > choice.STROKE_SIZE
+
+
+def test_auto_computes_no_gradient_if_no_gaussian_is_large(tiny_weights: BackboneWeights) -> None:
+    reports: list[int] = []
+    small = replace(wall(), scales=torch.full_like(wall().scales, -5.0))
+    refinement = refine(
+        small,
+        cameras(),
+        style(),
+        settings(refine="auto"),
+        weights=tiny_weights,
+        show=lambda now: reports.append(now.done),
+    )
+    assert refinement is not None
+    assert (refinement.split, refinement.gaussians) == (0, len(small))
+    assert reports == [0, 1, 2]  # the survey alone
 
 
 def test_splits_that_would_change_the_image_are_undone(
