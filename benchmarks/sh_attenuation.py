@@ -1,69 +1,57 @@
-"""What removing spherical harmonics does to the style of a scene, by the energy of its bands.
+"""What view-dependent color leaves of the original in a stylized scene, by the energy of spherical harmonics.
 
-python -m benchmarks.sh_attenuation SCENE CAMERAS|orbit:N STYLE NAME [--factors 0,0.5,1,2]
+python -m benchmarks.sh_attenuation SCENE CAMERAS|orbit:N STYLE [--factors 0,0.5,1,2]
 
-Multiplies the scene's coefficients above degree 0 by each factor, stylizes the result without attenuation, and judges
-it on novel views. Factor 0 is what `sh_attenuation` 1 gives. "energy" is the fraction of the color energy that depends on
-the view (`harmonics_energy`), before the job. Results are added to benchmarks/results/sh_attenuation.json, under NAME.
+Multiplies the coefficients above degree 0 by each factor, and gives the colors of degree 0 the style's distribution, as
+a warm start does. "energy" is the fraction of the color energy that depends on the view (`harmonics_energy`), "residue"
+the RMS difference in 8-bit levels that the harmonics make in the covered pixels, "color distance" the Frechet distance
+of the renders' colors from the style's.
 """
 
 from __future__ import annotations
 
-import time
+import math
 from dataclasses import replace
-from pathlib import Path
+from statistics import fmean
 
 import torch
+from torch import Tensor
 
 from benchmarks.inputs import input_parser, read_inputs
-from benchmarks.judged import UNSTYLIZED, judged
-from benchmarks.machine import add_pair
-from sgsst_core import Stylizer, make_settings
-from sgsst_core.bench.quality import make_novel_views
-from sgsst_core.quality.judge import Judge
-from sgsst_core.quality.lpips import Lpips
-from sgsst_core.report.contact_sheet import write_rows
-from sgsst_core.scene.spherical_harmonics import harmonics_energy
-
-COLUMNS = ("energy", "style", "interior_style", "sliced_features", "color_distance", "content", "seconds")
+from sgsst_core.quality.judge import frechet_distance
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.spherical_harmonics import harmonics_energy, scene_colors
+from sgsst_core.scene.stored_harmonics import held
+from sgsst_core.style import Style
+from sgsst_core.stylizing.color_moments import color_moments, style_moments
+from sgsst_core.stylizing.warm_start import warm_start
 
 
 def main() -> None:
-    """Run all factors, then print and store the results."""
+    """Print a row per factor."""
     parser = input_parser(__doc__)
-    parser.add_argument("name", help="of the pair, in the results")
     parser.add_argument("--factors", default="0,0.5,1,2")
     parser.add_argument("--views", type=int, default=6)
-    parser.add_argument("--resolution", type=int, default=256)
-    parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--out", type=Path, help="folder for a contact sheet")
+    parser.add_argument("--resolution", type=int, default=200)
     arguments = parser.parse_args()
     scene, cameras, style = read_inputs(arguments, arguments.views, arguments.resolution)
-    settings = make_settings(steps_coarse=0, steps_sos=arguments.steps, early_stop=False, measure=0)
-    description = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
-    description |= {"resolution": arguments.resolution, "steps": arguments.steps}
-    results, rows = {}, []
-    print(f"{arguments.name:20}", *(f"{name:>15}" for name in COLUMNS))
-    for factor in arguments.factors.split(","):
-        given = replace(scene, sh_rest=scene.sh_rest * float(factor))
-        stylizer = Stylizer.planned(given, cameras, style, settings)
-        novel_views = make_novel_views(stylizer)
-        views = [novel_views.cameras[index] for index in novel_views.views]
-        judge = Judge(Lpips(), style, given, novel_views.rasterizer, views)
-        started = time.process_time()
-        for _ in range(stylizer.job.total_steps):
-            stylizer.run_step()
-        seconds = time.process_time() - started
-        energy = harmonics_energy(given, stylizer.job.plan.survey.total_blend_weights)
-        colors = {f"{factor} {UNSTYLIZED}": given.sh_dc, f"{factor} stylized": stylizer.stylized()}
-        for row, sh_dc in colors.items():
-            results[row] = {"energy": energy, **judged(judge, sh_dc), "seconds": seconds}
-            print(f"{row:20}", *(f"{results[row][column]:15.3f}" for column in COLUMNS), flush=True)
-            rows.append((row, [judge.renders(sh_dc, camera)[0] for camera in judge.cameras[:3]]))
-        add_pair("sh_attenuation", arguments.name, description, results)
-    if arguments.out:
-        with torch.no_grad():
-            write_rows(arguments.out / f"{arguments.name}.jpg", style, rows)
+    rasterizer, wanted = make_rasterizer("cpu", scene), style_moments(Style.of(style))
+    coverages, weights = zip(*(rasterizer.survey(camera) for camera in cameras), strict=True)
+    total = torch.stack(weights).double().sum(dim=0)
+    plain = replace(scene, sh_dc=warm_start(scene.sh_dc, total, Style.of(style)), sh_rest=torch.zeros(len(scene), 0, 3))
+
+    def images(factor: float) -> list[Tensor]:
+        colored = replace(plain, sh_rest=held(scene.sh_rest) * factor)
+        return [rasterizer.render(scene_colors(colored, camera), camera).clamp(0, 1) for camera in cameras]
+
+    before = images(0.0)
+    print(f"{'factor':>8} {'energy':>8} {'residue':>8} {'color distance':>15}")
+    for factor in map(float, arguments.factors.split(",")):
+        triples = list(zip(images(factor), before, coverages, strict=True))
+        squares = [float(((a - b).square().mean(2) * c).sum() / c.sum()) for a, b, c in triples]
+        distances = [frechet_distance(color_moments(a.reshape(-1, 3), c.flatten()), wanted) for a, _, c in triples]
+        energy = harmonics_energy(replace(scene, sh_rest=held(scene.sh_rest) * factor), total)
+        print(f"{factor:8g} {energy:8.3f} {255 * math.sqrt(fmean(squares)):8.1f} {fmean(distances):15.1f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Collection, Mapping
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import typer
 from pydantic import BaseModel, ValidationError
@@ -141,7 +142,7 @@ def kind_of(option: Declared) -> Any:
     """Return the type of an option's values, without None and bounds. For a union, return its first type."""
     annotation = option.info.annotation
     kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
-    first = kinds[0] if type(None) in get_args(annotation) else annotation
+    first = kinds[0] if get_origin(annotation) in (Union, UnionType) else annotation
     return get_args(first)[0] if get_origin(first) is Annotated else first
 
 

@@ -142,7 +142,7 @@ export const words = {
       resolution: "Longer side of the views in pixels. Larger is finer, and slower.", views: "Uses this many of the cameras, evenly spread. Fewer is faster.",
       max_seconds: "Stops after this time and keeps the result.", style_scale: "1 is the painting's own; 2 paints strokes twice as large.", style_rotation: "Turns the strokes, counterclockwise.",
       preserve_colors: "match: the painting takes on the scene's colors. luminance: only brightness changes.", background: "black, white, or R,G,B from 0 to 255, such as 40,40,48.",
-      style_background: "black, white, or R,G,B from 0 to 255.", refine: "Splits large Gaussians, up to this many times as many in total. 1 is off.",
+      style_background: "black, white, or R,G,B from 0 to 255.", refine: "Splits large Gaussians, up to this many times as many in total. 1 is off; auto splits those too large for strokes.",
       orbit: "auto: as many as the scene needs.", up: "auto: estimated from the scene.", elevation: "One ring at this height. Otherwise, as many rings as the scene needs.", radius: "From the scene's center.",
       sh_attenuation: "0 keeps highlights that move with the view, 1 removes them.", unseen: "neighbors: painted like what is around them. freeze: left as they are.",
     }),

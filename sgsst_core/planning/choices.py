@@ -34,7 +34,7 @@ _UNCOVERED = 0.01
 _SCAN = 0.2
 #: Fraction of the color energy that depends on the view direction, from which on attenuating it is recommended: it
 #: then shows beside the style (docs/quality.md).
-_VIEW_DEPENDENT = 0.1
+_VIEW_DEPENDENT = 0.05
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
 ANOTHER_LOSS = "differs from the paper's loss"

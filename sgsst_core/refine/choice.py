@@ -98,7 +98,7 @@ def finest_size(settings: Settings) -> float:
     if settings.refine != "auto":
         return SIZES[-1]
     finest = next(scale for scale, weight in enumerate(settings.scales or (1.0,)) if weight > 0)
-    return STROKE_SIZE * 2**finest
+    return STROKE_SIZE * 2.0**finest
 
 
 def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, magnitude: Tensor) -> Tensor:

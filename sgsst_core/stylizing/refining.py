@@ -144,7 +144,9 @@ class _Refining:
         cancels, magnitude = self._gradient_disagreement(spread_evenly(covered, GRADIENT_VIEWS))
         allowed = candidates(self._footprints, self._may_be_split(), cancels, magnitude)
         budget, most = math.floor(self._settings.growth * count), most_children(self._footprints.weights)
-        pieces, size = self._collectives.broadcast(lambda: choose_pieces(lengths, allowed, cancels, most, budget, finest))
+        pieces, size = self._collectives.broadcast(
+            lambda: choose_pieces(lengths, allowed, cancels, most, budget, finest)
+        )
         chosen = int((piece_counts(pieces) > 1).sum())
         fitted = spread_evenly(covered, GRADIENT_VIEWS)
         pieces, change = self._undo_until_images_are_preserved(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))

@@ -60,9 +60,7 @@ def test_basis_is_orthonormal() -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("chunk", [7, 1 << 17])
-def test_harmonics_energy_is_that_over_all_directions(
-    degree: int, chunk: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_harmonics_energy_is_that_over_all_directions(degree: int, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(spherical_harmonics, "_CHUNK", chunk)
     scene = cloud(20, degree=degree)
     weights = torch.rand(20, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
