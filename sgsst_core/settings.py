@@ -199,6 +199,9 @@ class Settings(BaseModel):
         description="Attenuate view-dependent color by S, in the result too; 0 leaves spherical harmonics unchanged, "
         "1 removes all above degree 0.",
     )
+    stroke_depth: bool = Field(
+        False, description="Draw strokes of the same size in the scene rather than on screen: larger ones nearby."
+    )
     scales: Annotated[
         tuple[ScaleWeight, ...],
         Option(

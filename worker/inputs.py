@@ -21,7 +21,7 @@ from sgsst_core.files.images import WHITE, Color, load_image
 from sgsst_core.files.photos import Photo, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
-from sgsst_core.loss.scale_weights import check_scales
+from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
 from sgsst_core.orbit.choice import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import nothing_seen, sees_something
@@ -96,6 +96,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
     capture = _capture_on_all_ranks(source, scene_file.scene, images, collectives).fitted(settings)
     together(collectives, lambda: check_scales(settings.scales, capture.cameras, settings.coarsest_side))
+    together(collectives, lambda: check_stroke_depth(settings, capture.cameras, regions=bool(request.regions)))
     together(collectives, lambda: check_style_size(style, capture.cameras, settings.style_scale))
     with_photos = together(collectives, lambda: capture.with_photos(images))
     capture = collectives.broadcast(lambda: with_photos.checked(scene_file.scene, source.near))

@@ -50,7 +50,7 @@ from sgsst_core.files.formats import format_of_name, read_scene_header
 from sgsst_core.files.images import image_size, load_image
 from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
-from sgsst_core.loss.scale_weights import check_scales
+from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.planning.planner import make_plan
@@ -151,6 +151,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         if pixels > limits["pixels"]:
             raise TooManyPixelsError(pixels, limits["pixels"])
         check_scales(settings.scales, cameras, settings.coarsest_side)
+        check_stroke_depth(settings, cameras, regions=bool(job.regions))
         check_something_in_view(file.scene, cameras, source.near)
     with _errors_of("style"):
         check_style_size(style, cameras, settings.style_scale)

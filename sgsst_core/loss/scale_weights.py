@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from sgsst_core.errors import SettingsError
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import scale_count
+from sgsst_core.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,36 @@ class ScaleWeights:
 
 #: Equal weights, as in the paper's loss.
 EVEN = ScaleWeights()
+
+
+def band_count(cameras: Sequence[Camera], settings: Settings) -> int:
+    """Return the number of depth bands, which is that of the scales of the largest view; 0 without `stroke_depth`."""
+    if not settings.stroke_depth:
+        return 0
+    return max(scale_count(camera.height, camera.width, settings.coarsest_side) for camera in cameras)
+
+
+def check_stroke_depth(settings: Settings, cameras: Sequence[Camera], *, regions: bool) -> None:
+    """Check that `stroke_depth` has scales to choose from, and no other weights to share positions with.
+
+    Args:
+        settings: Settings of the job.
+        cameras: Cameras at the sizes used for stylization.
+        regions: Whether the scene has regions.
+
+    Raises:
+        SettingsError: If every view has one scale, or the job has regions or weights of scales.
+    """
+    if not settings.stroke_depth:
+        return
+    if regions or settings.scales:
+        other = "--region" if regions else "--scales"
+        raise SettingsError(f"--stroke-depth and {other} both weight positions. Leave one of them out.")
+    if band_count(cameras, settings) == 1:
+        raise SettingsError(
+            "--stroke-depth needs views of at least two scales, but theirs have one: give larger views or a smaller "
+            "--coarsest-side."
+        )
 
 
 def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: int) -> None:

@@ -341,4 +341,4 @@ def _styled_regions(style: Sequence[StyleTarget], view: ViewTarget) -> list[Styl
         return [StyledRegion(style[0], view.coverage)]
     if view.regions is None or len(view.regions) != len(style):
         raise ValueError("the view was not prepared for the regions that the style has")
-    return [StyledRegion(*pair) for pair in zip(style, view.regions, strict=True)]
+    return [StyledRegion(*pair) for pair in zip(style, view.regions, strict=True) if pair[0].weight]

@@ -113,6 +113,23 @@ def combined(targets: Sequence[StyleTargets], weights: Sequence[float]) -> Style
     }
 
 
+def by_band(targets: StyleTargets, bands: int) -> StyleTargets:
+    """Return the targets of a style whose strokes have the same size at every depth.
+
+    Each scale is compared in its own depth band alone; the coarsest one also in the bands of scales that the view does
+    not have.
+
+    Args:
+        targets: Targets of the style, from `TargetBuilder.of_style`.
+        bands: Number of depth bands.
+    """
+    coarsest = max(targets)
+    return {
+        scale: tuple(replace(own, weight=float(min(band, coarsest) == scale)) for band in range(bands))
+        for scale, (own,) in targets.items()
+    }
+
+
 #: Content features [h, w, 512] of the cells owned by each partition tile of this rank.
 ContentFeatures = dict[PartitionTile, Tensor]
 

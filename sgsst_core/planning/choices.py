@@ -106,7 +106,7 @@ def _about_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
             f"evaluated up to degree {degree}",
             f"all coefficients of degrees {degree + 1} to {scene.sh_degree} are 0",
             bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - (degree + 1) ** 2) * 4,
-        )
+        ),
     ]
 
 
@@ -247,6 +247,9 @@ def about_scales(counts: Sequence[int], settings: Settings) -> list[Decision]:
         if len(chosen) < most:
             text += f"; {most - len(chosen)} of {most} scales are not computed"
         lines.append(Decision("weights of scales", text, "requested", error=ANOTHER_LOSS))
+    if settings.stroke_depth:
+        text = "strokes keep their size in the scene: near parts are compared at coarse scales, far ones at fine scales"
+        lines.append(Decision("stroke depth", text, "requested", error=ANOTHER_LOSS))
     return lines
 
 

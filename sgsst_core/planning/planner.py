@@ -9,7 +9,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
-from sgsst_core.loss.scale_weights import check_scales
+from sgsst_core.loss.scale_weights import band_count, check_scales, check_stroke_depth
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.orbit.choice import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -82,6 +82,7 @@ def make_plan(
     with timer("planning"):
         fitted = fit_cameras(cameras, settings)
         check_scales(settings.scales, fitted, settings.coarsest_side)
+        check_stroke_depth(settings, fitted, regions=regions is not None)
         weights = weights_for(weights or load_network_weights("auto"), settings)
         planning_context = equip(scene, fitted, settings, weights, collectives, rasterizer)
         scene = planning_context.scene
@@ -89,7 +90,9 @@ def make_plan(
             with timer("survey"):
                 survey = survey_views(scene, fitted, planning_context.rasterizer, collectives, show)
         resolved = regions and regions.resolved(survey.total_blend_weights)
-        maps = len(resolved.active) if resolved is not None and resolved.mapped else 0
+        maps = band_count(fitted, settings)
+        if resolved is not None and resolved.mapped:
+            maps = len(resolved.active)
         link = probe_link(collectives, planning_context.network.device)
 
         def decide_here() -> Plan:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from statistics import fmean
 
@@ -112,7 +112,7 @@ class Judge:
         self._lpips, self._rasterizer = lpips, rasterizer
         styles = style if isinstance(style, JobStyles) else JobStyles(Style.of(style))
         self._judges = [_StyleJudge(lpips, each) for each in styles.each or (styles.own,)]
-        self._maps = styles.maps(rasterizer)
+        self._maps = replace(styles, bands=0).maps(rasterizer)
         self._background = torch.tensor(background, dtype=rasterizer.dtype, device=rasterizer.device)
         self._sh_rest, self._means = scene.sh_rest.to(rasterizer.device), scene.means.to(rasterizer.device)
         small = [resized(camera, min(JUDGED_SIDE, camera.side)) for camera in cameras]

@@ -31,7 +31,7 @@ from sgsst_core.quality.consistency import (
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.novel_cameras import choose_novel_cameras
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.regions.maps import ViewMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.view_colors import ViewColors
@@ -110,7 +110,7 @@ class NovelViews:
         most: int = MOST_VIEWS,
         memory: int = 1 << 29,
         rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
-        maps: RegionMaps | None = None,
+        maps: ViewMaps | None = None,
     ) -> None:
         self.scene = scene
         self.rasterizer = rasterizer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
+from sgsst_core.loss.scale_weights import band_count
 from sgsst_core.loss.sos import SosLoss, make_loss
 from sgsst_core.loss.targets import StyleTargets
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -29,6 +30,7 @@ from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions
+from sgsst_core.regions.maps import mean_level
 from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene, checked_scene
 from sgsst_core.settings import Settings
@@ -299,10 +301,14 @@ def prepare_job(
     rasterizer = _make_rasterizer(plan, settings, rendered, memory, planning_context)
     if team.group.size > 1:  # the survey's tile intersections are those of whole views
         rasterizer.forget_views()
+    fitted = fit_cameras(cameras, settings)
+    if settings.stroke_depth:
+        level = mean_level(attenuated.means, blend_weights, [fitted[index] for index in plan.covered])
+        styles = replace(styles, bands=band_count(fitted, settings), mean_level=level)
     regions_seen = plan.survey.regions if plan.weighted else None
     views = Views(
         rendered,
-        fit_cameras(cameras, settings),
+        fitted,
         rasterizer,
         covered=list(plan.covered),
         memory=view_memory(plan, memory),

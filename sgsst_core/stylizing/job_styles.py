@@ -13,11 +13,11 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.targets import StyleTargets, combined
+from sgsst_core.loss.targets import StyleTargets, by_band, combined
 from sgsst_core.parallel.division import Size
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions.definition import Regions
-from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.regions.maps import DepthBands, RegionMaps, ViewMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
@@ -33,11 +33,16 @@ class JobStyles:
         own: Default style; if one region contains everything that the views show, the style of that region.
         regions: Regions of the scene; None if there are none.
         each: Style of each region in `Regions.active`; empty if views need no region maps.
+        bands: Number of depth bands, which is that of the scales of the largest view; 0 for strokes that have the same
+            size on the whole screen.
+        mean_level: See `maps.mean_level`.
     """
 
     own: Style
     regions: Regions | None = None
     each: tuple[Style, ...] = ()
+    bands: int = 0
+    mean_level: float = 0.0
 
     @staticmethod
     def prepared(
@@ -84,6 +89,8 @@ class JobStyles:
 
     def targets(self, loss: SosLoss, view_size: Size) -> StyleTargets:
         """Compute the targets for views of a size (height, width); see `TargetBuilder.of_style`."""
+        if self.bands:
+            return by_band(loss.targets.of_style(self.own, view_size), self.bands)
         if not self.each:
             return loss.targets.of_style(self.own, view_size)
         assert self.regions is not None
@@ -114,13 +121,15 @@ class JobStyles:
                 result[own] = transfer(sh_dc[own], weights[own], style)
         return result
 
-    def maps(self, rasterizer: Rasterizer, rows: Tensor | None = None) -> RegionMaps | None:
-        """Return the renderer of region maps; None if the views need none.
+    def maps(self, rasterizer: Rasterizer, rows: Tensor | None = None) -> ViewMaps | None:
+        """Return the renderer of the maps of regions or depth bands; None if the views need none.
 
         Args:
             rasterizer: Rasterizer of the maps.
             rows: [N] bool, Gaussians that the rasterizer contains; None for all.
         """
+        if self.bands:
+            return DepthBands(self.bands, self.mean_level, rasterizer)
         if not self.each:
             return None
         assert self.regions is not None

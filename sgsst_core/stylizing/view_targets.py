@@ -16,7 +16,7 @@ from sgsst_core.loss.targets import ContentFeatures, ViewTarget
 from sgsst_core.loss.tiling import Division
 from sgsst_core.loss.view_images import ViewImages
 from sgsst_core.parallel.division import Piece
-from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.regions.maps import ViewMaps
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
 from sgsst_core.stylizing.training_background import Color, replace_background
 from sgsst_core.stylizing.views import Views
@@ -41,7 +41,7 @@ class ViewTargets:
         background: Background color of the rasterizer.
         drawn: Whether the background color changes from step to step; content images are then cached instead of
             features.
-        maps: Renderer of region maps; None if the scene has no regions.
+        maps: Renderer of the maps of regions or depth bands; None for one part.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class ViewTargets:
         regions: Sequence[Rectangle] | None = None,
         background: Color = (0.0, 0.0, 0.0),
         drawn: bool = False,
-        maps: RegionMaps | None = None,
+        maps: ViewMaps | None = None,
     ) -> None:
         self.views = views
         self.loss = loss
@@ -215,7 +215,7 @@ class ViewTargets:
         window = self.views.window(index, self.views.rasterizer.repeatable.coverage)
         return self.loss.targets.position_weights(self.views.whole(index, window))
 
-    def _rendered_regions(self, index: int, maps: RegionMaps) -> list[list[Tensor]]:
+    def _rendered_regions(self, index: int, maps: ViewMaps) -> list[list[Tensor]]:
         whole = self.views.whole(index, self.views.window(index, maps.render, maps.count))
         return [self.loss.targets.position_weights(weights) for weights in whole.unbind(2)]
 
