@@ -1,4 +1,4 @@
-"""What view-dependent color leaves of the original in a stylized scene, by the energy of spherical harmonics.
+"""Residue of the original colors that spherical harmonics leave in a stylized scene, by their energy.
 
 python -m benchmarks.sh_attenuation SCENE CAMERAS|orbit:N STYLE [--factors 0,0.5,1,2]
 
