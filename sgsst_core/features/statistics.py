@@ -43,7 +43,7 @@ _SHIFT_ROWS = 64
 #: Channels per block of a program.
 TILE = 64
 #: Matrix entries per program, rounded to whole rows.
-ENTRIES = 1024
+ENTRIES = 512
 #: Minimum channels per block, as required for matrix products. Layers with fewer channels fill part of a block.
 LEAST_CHANNELS = 16
 
