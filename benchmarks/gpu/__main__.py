@@ -32,20 +32,20 @@ import torch
 from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.machine import RESULTS, write_result
 
-#: Time limit of each part in seconds, 535 in total, the most telling parts first. The first part that uses the CPU
-#: rasterizer also compiles it.
+#: Time limit of each part in seconds, 535 in total, the most telling parts first. The first parts load the libraries
+#: from disk and compile the kernels and the CPU rasterizer.
 BUDGETS = {
-    "identity": 15,
-    "poison": 35,
-    "parity": 45,
-    "kernels": 50,
-    "convolutions": 50,
-    "step": 95,
-    "network": 20,
-    "raster": 60,
-    "ranks": 40,
-    "curve": 70,
-    "tests": 55,
+    "identity": 20,
+    "poison": 55,
+    "parity": 55,
+    "kernels": 30,
+    "convolutions": 20,
+    "step": 125,
+    "network": 15,
+    "raster": 20,
+    "ranks": 45,
+    "curve": 50,
+    "tests": 100,
 }
 #: Factor on the time limits without a GPU, where the CPU may be busy and times mean nothing.
 _PATIENCE = 5

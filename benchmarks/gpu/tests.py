@@ -1,4 +1,4 @@
-"""Run of all tests that are marked `gpu`, with pytest."""
+"""Run of all tests that are marked `gpu` but not `slow`, with pytest."""
 
 from __future__ import annotations
 
@@ -27,7 +27,17 @@ def run(sizes: Sizes, findings: Findings) -> None:
     del sizes  # tests have their own sizes
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "results.xml"
-        command = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-p", "no:cacheprovider", "--tb=short"]
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-m",
+            "gpu and not slow",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "--tb=short",
+        ]
         options = ["--continue-on-collection-errors", f"--junitxml={path}", *map(str, marked_files())]
         ended = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True)
         if not path.is_file():

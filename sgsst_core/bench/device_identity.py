@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import re
 import shutil
 import subprocess
 import time
@@ -75,7 +76,8 @@ def _gpu(device: torch.device) -> Iterator[tuple[str, Any]]:
     yield from nvidia_smi(device).items()
     topology = _output("nvidia-smi", "topo", "-m")
     if topology:
-        yield "topology", [line.rstrip() for line in topology.splitlines() if line.startswith(("GPU", "NIC", "\t"))]
+        plain = re.sub(r"\x1b\[\d*m", "", topology)
+        yield "topology", [line.rstrip() for line in plain.splitlines() if line.startswith(("GPU", "NIC", "\t"))]
 
 
 def nccl_version() -> str | None:
