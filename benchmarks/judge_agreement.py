@@ -30,7 +30,7 @@ JUDGES = {
     "dists": "DISTS",
 }
 #: Result files with judged runs, by pair.
-FILES = ("quality", "equal_steps", "training_background")
+FILES = ("quality", "equal_steps", "training_background", "cross_validation")
 #: Minimum number of runs of a pair that are ranked.
 LEAST_RUNS = 3
 
@@ -54,10 +54,11 @@ def stored_runs() -> list[list[Run]]:
 
 def table(pairs: Sequence[Sequence[Run]]) -> str:
     """Return a Markdown table of the agreement of all judges."""
-    lines = [f"| | {' | '.join(JUDGES.values())} |", f"|---|{'---|' * len(JUDGES)}"]
-    for index, (judge, name) in enumerate(JUDGES.items()):
-        cells = [_cell(agreement(pairs, judge, other)) for other in list(JUDGES)[:index]]
-        lines.append(f"| {' | '.join([name, *cells, *[''] * (len(JUDGES) - index)])} |")
+    names = list(JUDGES.items())
+    lines = [f"| | {' | '.join(name for _, name in names[:-1])} |", f"|---|{'---|' * (len(names) - 1)}"]
+    for index, (judge, name) in enumerate(names[1:], 1):
+        cells = [_cell(agreement(pairs, judge, other)) for other, _ in names[:index]]
+        lines.append(f"| {' | '.join([name, *cells, *[''] * (len(names) - 1 - index)])} |")
     return "\n".join(lines)
 
 
