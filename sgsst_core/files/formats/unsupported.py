@@ -33,7 +33,7 @@ def refuse_unsupported(start: FileStart) -> None:
     path, head, suffix = start.path, start.head, start.path.suffix.lower()
     if is_checkpoint(head):
         raise SceneError(
-            f"{path}: is a checkpoint, not a scene. Make a PLY of it: `sgsst convert {path.name} scene.ply` (gsplat, "
+            f"{path}: is a checkpoint, not a scene. Make a PLY of it: `sgsst convert CHECKPOINT scene.ply` (gsplat, "
             "nerfstudio) or `ns-export gaussian-splat` (nerfstudio); the original 3DGS code has "
             "point_cloud/iteration_*/point_cloud.ply beside it."
         )

@@ -23,7 +23,7 @@ OBJ = b"# Blender\nmtllib cube.mtl\no Cube\n" + b"".join(b"v %d 0 1.5\n" % i for
         (b"g empty", "mesh.obj", "is an OBJ mesh"),
         (b'\n{"scenes": [], "asset": {"version": "2.0"}}', "scene", "Save it as one GLB"),
         (b'{"scenes": []}', "scene.gltf", "Save it as one GLB"),
-        (b"\x80\x02}q\x00.", "model.pth", "is a checkpoint.*sgsst convert model.pth scene.ply.*ns-export"),
+        (b"\x80\x02}q\x00.", "model.pth", "is a checkpoint.*sgsst convert CHECKPOINT scene.ply.*ns-export"),
     ],
 )
 def test_error_names_the_file_type(tmp_path: Path, data: bytes, name: str, message: str) -> None:
