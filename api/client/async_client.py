@@ -226,8 +226,8 @@ class AsyncClient:
         Raises:
             RequestError: If the job has no result, or an option is invalid.
         """
-        made = await self._transport.work(f"/v1/jobs/{job_id}/video", "rendering", progress, json=options)
-        name: str = made["name"]
+        video = await self._transport.work(f"/v1/jobs/{job_id}/video", "rendering", progress, json=options)
+        name: str = video["name"]
         return name
 
     async def rename(self, job_id: str, name: str) -> Job:

@@ -126,13 +126,13 @@ def test_refusals_are_messages(service: Service, files: dict[str, str], tmp_path
 
 
 def test_existing_files_are_kept(service: Service, files: dict[str, str], tmp_path: Path) -> None:
-    kept = tmp_path / "kept.ply"
-    kept.write_bytes(b"mine")
+    existing = tmp_path / "existing.ply"
+    existing.write_bytes(b"mine")
 
     async def run() -> None:
         async with tools(service.url) as client:
             job_id = (await call(client, "submit", **files | {"style": [files["style"]]}))["job_id"]
-            assert "Name another file" in await refusal(client, "result", job_id=job_id, out=str(kept))
+            assert "Name another file" in await refusal(client, "result", job_id=job_id, out=str(existing))
 
     anyio.run(run)
-    assert kept.read_bytes() == b"mine"
+    assert existing.read_bytes() == b"mine"
