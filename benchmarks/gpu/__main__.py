@@ -48,7 +48,7 @@ BUDGETS = {
     "tests": 100,
 }
 #: Factor on the time limits without a GPU, where the CPU may be busy and times mean nothing.
-_PATIENCE = 12
+_PATIENCE = 10
 #: Packages of this repository. A missing one is an error, not a reason to skip a part.
 _OWN = ("api", "benchmarks", "service", "sgsst_core", "tests", "worker")
 

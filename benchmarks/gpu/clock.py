@@ -40,6 +40,21 @@ def waited_seconds(action: Callable[[], object], device: torch.device) -> float:
     return time.perf_counter() - started
 
 
+def kernel_times(action: Callable[[], object], most: int = 20) -> dict[str, dict[str, float]]:
+    """Return milliseconds and launches of the kernels of a call on the GPU that take the longest, by name."""
+    from torch.profiler import ProfilerActivity, profile
+
+    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
+        action()
+        torch.cuda.synchronize()
+    events = [event for event in profiled.key_averages() if event.self_device_time_total]
+    events.sort(key=lambda event: -event.self_device_time_total)
+    return {
+        event.key[:100]: {"milliseconds": event.self_device_time_total / 1e3, "launches": event.count}
+        for event in events[:most]
+    }
+
+
 def forget_peak(device: torch.device) -> None:
     """Free unused memory, and reset the memory peak."""
     if device.type == "cuda":

@@ -1,10 +1,10 @@
-"""SOS steps on small and very large views: seconds by part, and peak memory of device and process beside the plan."""
+"""SOS steps on small and very large views: seconds by part and kernel, and peak memory beside the plan."""
 
 from __future__ import annotations
 
 import statistics
 
-from benchmarks.gpu.clock import forget_peak, peak_bytes, reserved_bytes, waited_seconds
+from benchmarks.gpu.clock import forget_peak, kernel_times, peak_bytes, reserved_bytes, waited_seconds
 from benchmarks.gpu.inputs import network_weights, small_weights
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device
 from sgsst_core.bench.synthetic import surface_scene, texture, views
@@ -57,6 +57,8 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     findings.add(f"{place}/precision", stylizer.job.plan.precision)
     findings.add(f"{place}/seconds", statistics.median(taken))
     findings.add(f"{place}/seconds_by_part", parts)
+    if device().type == "cuda":
+        findings.add(f"{place}/kernels", kernel_times(stylizer.run_step))
     findings.add(f"{place}/planned_seconds", prediction.seconds if prediction else None)
     findings.add(f"{place}/device_allocated_bytes", peak_bytes(device()))
     findings.add(f"{place}/device_reserved_bytes", reserved_bytes(device()))
