@@ -35,8 +35,8 @@ from sgsst_core.features.statistics import (
     TILE,
     block_of_channels,
     block_of_entries,
-    block_positions,
     matrix_precision,
+    positions_of_block,
 )
 from sgsst_core.loss import statistics_terms
 from sgsst_core.loss import statistics_terms_kernels as loss_kernels
@@ -98,7 +98,7 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
     """Return the kernels that read features and position weights."""
     features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
     matrix = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
-    block = block_positions(_DTYPES[form])
+    block = positions_of_block(_DTYPES[form])
     moments = {**matrix, "P": block, "PARTS": FLUSH // block}
     return {
         f"shifted_moments_{of}": Target(

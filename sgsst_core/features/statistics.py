@@ -271,7 +271,7 @@ def matrix_precision(dtype: torch.dtype) -> str:
     return "tf32" if dtype == torch.bfloat16 and torch.version.hip is None else "ieee"
 
 
-def block_positions(dtype: torch.dtype) -> int:
+def positions_of_block(dtype: torch.dtype) -> int:
     """Return the number of positions per block of a program."""
     return 64 if dtype == torch.bfloat16 else 32
 
@@ -321,7 +321,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     height, width, channels = features.shape
     device, positions = features.device, height * width
     span, tile = span_positions(positions, channels), block_of_channels(channels, TILE)
-    block = block_of_positions(block_positions(features.dtype))
+    block = block_of_positions(positions_of_block(features.dtype))
     # In bfloat16, the shift is rounded like the features, so that TF32 holds most differences.
     shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1))
     sums = torch.empty((-(-positions // span), channels**2 + channels + 1), device=device)

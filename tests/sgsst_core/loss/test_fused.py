@@ -157,8 +157,9 @@ def test_bfloat16_features_are_summed_in_float32() -> None:
     x = features(40, 60, 32, seed=3).bfloat16()
     exact = layer_statistics_reference(x.cpu())
     actual = on_cpu(fused_statistics(x))
-    # Products use TF32, whose inputs are rounded to 11 bits. Truncated inputs would be off by 8e-4.
-    assert relative_error(actual.centered, exact.centered) < 4e-4
+    # Products use TF32, whose inputs have 11 bits. Truncated inputs would be off by 8e-4. Features of 0, which are
+    # frequent after a ReLU, would be off by 2e-4 in the same direction if the shift had more bits.
+    assert relative_error(actual.centered, exact.centered) < 4e-5
     target = target_of(32)
     _, gradient = fused_gradient(x, None, target)
     cpu_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
