@@ -123,6 +123,8 @@ def main() -> None:
     running.add_argument("--workers", type=int, default=1)
     running.add_argument("--seconds", type=float, default=math.inf)
     arguments = parser.parse_args()
+    if arguments.way == "run" and (unknown := set(arguments.pairs) - set(PAIRS)):
+        parser.error(f"unknown pairs: {', '.join(sorted(unknown))}. Choose some of: {'; '.join(PAIRS)}")
     if arguments.way == "run":
         run_all(arguments)
     for (steps, resolution), pairs in stored().items():

@@ -121,7 +121,7 @@ def parse_origins(text: str) -> frozenset[tuple[str, str, int]]:
         except ValueError as error:
             raise ValueError(f"{entry!r} is not a host: {error}") from error
         if url.raw_path != b"/" or url.fragment or "?" in entry:
-            raise ValueError(f"{entry!r} is not a host. Leave out its path.")
+            raise ValueError(f"{entry!r} is not a host: leave out its path")
         origins.add(origin(url))
     return frozenset(origins)
 

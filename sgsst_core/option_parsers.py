@@ -49,6 +49,16 @@ def parse_strength(text: str) -> float:
         raise ValueError(f"{text!r} is not a weight. Give a number or one of {', '.join(STRENGTHS)}.") from None
 
 
+def parse_growth(text: str) -> float | str:
+    """Return the factor of a refinement, or "auto"."""
+    if text.lower() == "auto":
+        return "auto"
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a factor. Give a number or auto.") from None
+
+
 def parse_weights(text: str) -> tuple[float, ...]:
     """Return weights of scales from "1,0.5,0,1"."""
     try:

@@ -20,7 +20,15 @@ from pydantic_core import CoreSchema, core_schema
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
-from sgsst_core.option_parsers import COLOR_SYNTAX, STRENGTHS, parse_bytes, parse_color, parse_strength, parse_weights
+from sgsst_core.option_parsers import (
+    COLOR_SYNTAX,
+    STRENGTHS,
+    parse_bytes,
+    parse_color,
+    parse_growth,
+    parse_strength,
+    parse_weights,
+)
 from sgsst_core.options import Declared, Option, reason, renamed_hint
 
 PresetName = Literal["preview", "standard", "paper"]
@@ -218,7 +226,7 @@ class Settings(BaseModel):
         description="Weight of each scale in the loss, starting at full size, each scale half as large as the one "
         "before; scales without a weight, or with weight 0, are not computed.",
     )
-    refine: Annotated[RefineFactor | Literal["auto"], Option(unit="factor", metavar="N")] = Field(
+    refine: Annotated[RefineFactor | Literal["auto"], Option(unit="factor", metavar="N", parse=parse_growth)] = Field(
         1.0,
         description="Split Gaussians that are large on screen, for finer strokes: up to N times as many in total "
         "(1 = off); auto: only those too large for the strokes of the finest scale, up to twice as many in total.",

@@ -12,7 +12,7 @@ import httpx
 import stamina
 from httpx_sse import ServerSentEvent, aconnect_sse
 
-from api.client.answers import ApiError, checked, is_temporary, refusal, unreachable
+from api.client.answers import ApiError, RequestError, checked, is_temporary, refusal, unreachable
 from api.client.downloads import BLOCK, Download, Progress
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -33,6 +33,9 @@ class Transport:
         url: Address of the service; None for the environment variable SGSST_URL, or else port 8000 of this machine.
         key: API key; None for the environment variable SGSST_KEY.
 
+    Raises:
+        RequestError: If the address is neither an http nor an https URL.
+
     Attributes:
         http: HTTP client for requests without retries.
         url: Address of the service.
@@ -41,8 +44,11 @@ class Transport:
 
     def __init__(self, url: str | None, key: str | None) -> None:
         key = key or os.environ.get("SGSST_KEY")
+        url = url or os.environ.get("SGSST_URL") or DEFAULT_URL
+        if not url.lower().startswith(("http://", "https://")):
+            raise RequestError(f"{url}: not an address of a service. Give one such as {DEFAULT_URL}.")
         self.http = httpx.AsyncClient(
-            base_url=url or os.environ.get("SGSST_URL") or DEFAULT_URL,
+            base_url=url,
             headers={"Authorization": f"Bearer {key}"} if key else {},
             timeout=httpx.Timeout(30.0, read=900.0, write=120.0),
         )
