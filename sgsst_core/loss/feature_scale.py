@@ -95,7 +95,7 @@ def paper_scales(weights: BackboneWeights, image: Path = STARRY_NIGHT) -> dict[s
     """Return the layer factors with which an image, by default The Starry Night, produces the published losses.
 
     Factors are rounded to two digits, which makes no visible difference. The published run used another painting; two
-    other paintings give factors within 25 % of these (docs/quality.md).
+    other paintings give factors within 25 % of these.
     """
     with Image.open(image) as painting:
         size = [round(side * _SIDE / max(painting.size)) for side in painting.size]

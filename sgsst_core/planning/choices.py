@@ -33,7 +33,7 @@ _UNCOVERED = 0.01
 #: that was captured from only some places have holes of a few percent.)
 _SCAN = 0.2
 #: Fraction of the color energy that depends on the view direction, from which on attenuating it is recommended: it
-#: then shows beside the style (docs/quality.md).
+#: then shows beside the style (benchmarks/results/README.md).
 _VIEW_DEPENDENT = 0.05
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
@@ -202,7 +202,7 @@ def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
     """Return whether a job with a warm start transfers the style's colors once more after the last step.
 
     A loss without statistics lets colors drift from the style's during the steps; ARF (Zhang et al. 2022) transfers
-    them twice too. With statistics, a second transfer would undo what the steps have achieved (docs/quality.md).
+    them twice too. With statistics, a second transfer would undo what the steps have achieved.
     """
     return warm and not has_statistics(settings.style_loss)
 

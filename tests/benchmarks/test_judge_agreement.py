@@ -32,4 +32,4 @@ def test_runs_without_a_figure_and_equal_figures_do_not_count() -> None:
 
 
 def test_document_shows_the_stored_results() -> None:
-    assert table(stored_runs()) in (ROOT / "docs" / "quality.md").read_text()
+    assert table(stored_runs()) in (ROOT / "benchmarks" / "results" / "README.md").read_text()
