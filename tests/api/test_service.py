@@ -191,6 +191,7 @@ def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], ex
     assert not [path for path in service.data.rglob("*") if path.is_file() and path.stat().st_mode & 0o077]
 
 
+@pytest.mark.slow
 def test_ply_is_sent_in_ranges(service: Service, files: dict[str, Path], short_job: str, tmp_path: Path) -> None:
     with service.client() as client:
         where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
@@ -270,6 +271,7 @@ def test_compressed_scene_and_results_in_other_formats(
         assert not (service.data / "artifacts" / job_id).exists()
 
 
+@pytest.mark.slow
 def test_concurrent_requests_share_one_compression(service: Service, short_job: str) -> None:
     where = f"{service.url}/v1/jobs/{short_job}/artifacts/stylized.ply?format=spz"
     with ThreadPoolExecutor(6) as pool:
@@ -420,6 +422,7 @@ def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path
             wait_until(service, client, job_id, "canceled")
 
 
+@pytest.mark.slow
 def test_dry_run_plans_without_queueing(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
         before = len(client.get("/v1/jobs").json()["jobs"])
@@ -436,6 +439,7 @@ def test_dry_run_plans_without_queueing(service: Service, files: dict[str, Path]
         assert len(client.get("/v1/jobs").json()["jobs"]) == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_job")
 def test_api_process_loads_no_pytorch_or_ray(service: Service) -> None:
     process = service.process("api.http.server")
@@ -482,6 +486,7 @@ def test_client_commands(service: Service, files: dict[str, Path], expected: byt
         assert (tmp_path / "result.ply").read_bytes()[:3] == b"ply"
 
 
+@pytest.mark.slow
 def test_deleting_job_removes_its_files(service: Service, short_job: str) -> None:
     """This test runs after all other tests that use the same job."""
     with service.client() as client:

@@ -183,6 +183,7 @@ def test_losses_match_cpu(tmp_path: Path) -> None:
     assert expected.job.plan.device == "cpu"
 
 
+@pytest.mark.slow
 def test_gradient_with_overflowing_square_changes_nothing(counts: Counts, tmp_path: Path) -> None:
     stylizer = prepare(request_(tmp_path, learning_rate=0.5)).stylizer
     stylizer.run_step()

@@ -59,9 +59,9 @@ def around_the_camera() -> Scene:
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
-    "400 faint Gaussians on one pixel": partial(gaussians._stacked, 400, math.log(1.5 / 253.5)),
-    "400 opaque Gaussians on one pixel": partial(gaussians._stacked, 400, 5.0),
-    "hundreds of Gaussians smaller than a pixel": lambda: gaussians._sub_pixel().subset(torch.arange(400)),
+    "200 faint Gaussians on one pixel": partial(gaussians._stacked, 200, math.log(1.5 / 253.5)),
+    "200 opaque Gaussians on one pixel": partial(gaussians._stacked, 200, 5.0),
+    "hundreds of Gaussians smaller than a pixel": lambda: gaussians._sub_pixel().subset(torch.arange(200)),
     "needles": needles,
     "camera inside of Gaussians": around_the_camera,
 }

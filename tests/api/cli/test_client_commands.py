@@ -50,6 +50,7 @@ def submit(files: list[str], capsys: pytest.CaptureFixture[str], *options: str) 
     return capsys.readouterr().out.strip()
 
 
+@pytest.mark.slow
 def test_masks_of_regions_are_sent(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:

@@ -239,6 +239,7 @@ def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes])
         assert bad.status_code == 422
 
 
+@pytest.mark.slow
 def test_regions_name_style_files(client: httpx.Client, files: dict[str, bytes]) -> None:
     other = png(40, 30, zlib.compress(bytes(30 * (1 + 3 * 40))))
     parts = [*form(files), ("style", ("night sky.png", other))]
@@ -672,6 +673,7 @@ def test_partial_files_of_dead_process_are_removed(tmp_path: Path, monkeypatch: 
     store.close()
 
 
+@pytest.mark.slow
 def test_job_limit_and_full_disk_reject_requests(tmp_path: Path, files: dict[str, bytes]) -> None:
     with Service(tmp_path / "data", alone=True, SGSST_MAX_JOBS_PER_KEY="1") as service, service.client() as client:
         assert client.post("/v1/jobs", files=form(files)).status_code == 202

@@ -61,6 +61,7 @@ def test_paper_scales_give_the_published_statistics(renormalized: BackboneWeight
     assert float(difference) == pytest.approx(PUBLISHED[CONTENT_LAYER], rel=0.12)
 
 
+@pytest.mark.slow
 def test_torchvision_vgg16_has_the_expected_scales(vgg16_weights: BackboneWeights) -> None:
     wanted = {"relu1_1": 1.2, "relu2_1": 1.5, "relu3_1": 0.91, "relu4_1": 4.9, "relu4_2": 4.4, "relu5_1": 0.75}
     assert paper_scales(vgg16_weights) == pytest.approx(wanted, rel=0.02)

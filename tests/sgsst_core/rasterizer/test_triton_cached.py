@@ -134,6 +134,7 @@ def test_view_without_gaussians_is_background(scene: Scene) -> None:
     assert cached.cached_bytes == cached.count_weights(view).nbytes(cached.precision)
 
 
+@pytest.mark.slow
 def test_weights_beyond_the_budget_are_recomputed_on_the_device() -> None:
     scene = cloud(100, seed=20)
     views = [camera(20, 17), camera(20, 17, pose=rotated_pose(0.1)), camera(17, 20, pose=rotated_pose(0.2))]
@@ -218,6 +219,7 @@ def test_rasterizer_is_created_by_name() -> None:
 VIEWS = cameras(2, 32, 24)
 
 
+@pytest.mark.slow
 def test_plan_predicts_the_bytes_of_cached_weights(tiny_weights: BackboneWeights) -> None:
     scene = ball(60)
     planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
