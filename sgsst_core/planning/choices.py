@@ -324,7 +324,7 @@ def about_network(model: CostModel, probe: Probe, settings: Settings) -> list[De
         reason = f"activations of {1 - again:.0%} of the pixels fit in {memory}"
         return [*lines, Decision("second forward", f"for {again:.0%} of the pixels", reason)]
     none = "none: activations are cached between statistics and gradient"
-    saved = work.pixels * network.rate.forward
+    saved = work.pixels * network.rate.features
     return [*lines, Decision("second forward", none, f"they fit in {memory}", seconds=saved)]
 
 

@@ -32,7 +32,7 @@ from sgsst_core.loss.tiling import RENDERING, Tiling
 from sgsst_core.parallel.collectives import Traffic
 from sgsst_core.parallel.division import Piece, Shares, Size, divide, loads, rounds
 from sgsst_core.parallel.shown import gaussians_sent
-from sgsst_core.planning.facts import Link, Probe, Rate
+from sgsst_core.planning.facts import Link, NetworkFacts, Probe
 from sgsst_core.planning.measuring import (
     LEVELS,
     LOSS_VIEWS,
@@ -139,6 +139,7 @@ class Work:
         again: Pixels through a second forward pass, because their activations do not fit in memory.
         without_region: Value of `pixels` if uncovered pixels were processed too.
         tiles: Maximum number of tiles of a view at one scale.
+        passes: Number of tiles of a view at all scales.
         peak: Maximum number of pixels in memory at a time, including the temporary memory of a pass in units of pixels.
         pairs: Pairs of position and style vector compared by the nearest-neighbor search.
     """
@@ -147,6 +148,7 @@ class Work:
     again: float
     without_region: float
     tiles: int
+    passes: float
     peak: float
     pairs: float = 0.0
 
@@ -159,7 +161,7 @@ class Work:
             tiling: Partitioning rules.
             working_fraction: See `_WORKING_FRACTION`; 1 if unknown.
         """
-        pixels = again = without = pairs = 0.0
+        pixels = again = without = pairs = passes = 0.0
         tiles = 0
         peak = 0.0
         for piece in (piece for pieces in views for piece in pieces):
@@ -171,6 +173,7 @@ class Work:
             pairs += pairs_of(piece)
             without += sum(tile.outer.pixels for tile in tiling.tiles(piece.size))
             tiles = max(tiles, len(areas))
+            passes += len(areas)
             once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
             # If all activations are cached, a pass needs its temporary memory while some activations are not computed
             # yet, or already freed.
@@ -178,15 +181,25 @@ class Work:
             held = sum(areas) - twice + working * max(areas, default=0)
             peak = max(peak, held, (1 + tiling.working) * once)
         count = len(views)
-        return Work(pixels / count, again / count, without / count, tiles, peak, pairs / count)
+        return Work(pixels / count, again / count, without / count, tiles, passes / count, peak, pairs / count)
 
-    def seconds(self, rate: Rate) -> float:
-        """Return the time in seconds of feature network and statistics in one iteration."""
-        return self.pixels * rate.both + self.again * rate.forward + self.pairs * rate.search
+    def seconds(self, network: NetworkFacts, *, graphs: bool) -> float:
+        """Return the time in seconds of the loss and its gradient; a CUDA graph of them is a single launch."""
+        rate = network.rate
+        both = self.pixels * rate.both if graphs else self._longer(rate.both, network.fixed.both)
+        return both + self.again * rate.features + self.pairs * rate.search
 
-    def evaluation(self, rate: Rate) -> float:
+    def evaluation(self, network: NetworkFacts) -> float:
         """Return the time in seconds of the loss without its gradient."""
-        return self.pixels * rate.forward + self.pairs * rate.search
+        return self._longer(network.rate.forward, network.fixed.forward) + self.pairs * network.rate.search
+
+    def features(self, network: NetworkFacts) -> float:
+        """Return the time in seconds of the feature network's forward pass alone."""
+        return self._longer(network.rate.features, network.fixed.features)
+
+    def _longer(self, pixel: float, tile: float) -> float:
+        """Return the time of all pixels or of all launches, whichever is longer: a GPU works on during launches."""
+        return max(self.pixels * pixel, self.passes * tile)
 
 
 def pairs_of(piece: Piece) -> int:
@@ -366,7 +379,7 @@ class ViewCosts:
             seconds = _CACHING_RENDERS * raster.seconds if raster.caching_seconds is None else raster.caching_seconds
             weights = ViewData(seconds, size, raster_budget, views)
         rendered = _RENDER * raster.seconds if settings.content_weight else 0.0
-        forward = probe.network.rate.forward if settings.content_weight else 0.0
+        features = [each.features(probe.network) if settings.content_weight else 0.0 for each in (work, coarse)]
         fraction = content_fraction(probe.machine.device, weighted=plan.weighted, has_maps=bool(probe.maps))
         content_budget = 0 if "content" in settings.keep else view_budget * fraction
         pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
@@ -389,8 +402,8 @@ class ViewCosts:
             * (1 if plan.seen.all() else 1 - _RESTRICTING),
             colors=ViewData(raster.colors_seconds, colors, view_budget / 4),
             weights=weights,
-            content=ViewData(rendered + work.pixels * forward, content, content_budget),
-            content_coarse=ViewData(rendered + coarse.pixels * forward, coarse_content, content_budget),
+            content=ViewData(rendered + features[0], content, content_budget),
+            content_coarse=ViewData(rendered + features[1], coarse_content, content_budget),
             images=images,
             raster=raster.seconds,
             raster_cached=raster.seconds if raster.cached_seconds is None else raster.cached_seconds,
@@ -692,13 +705,13 @@ class CostModel:
 
     def on_one_rank(self) -> tuple[Prediction, int]:
         """Return the prediction for the steps on one rank, and the bytes of its activations."""
-        probe, views = self._probe, self.views
+        network, views, graphs = self._probe.network, self.views, self._plan.graphs
         seconds, seconds_coarse = (
             self._settings.views_per_step
-            * (work.seconds(probe.network.rate) + views.rasterized() + views.later(coarse=work is self.coarse))
+            * (work.seconds(network, graphs=graphs) + views.rasterized() + views.later(coarse=work is self.coarse))
             for work in (self.work, self.coarse)
         )
-        return Prediction(seconds, seconds_coarse, 0), int(self.work.peak * probe.network.held_bytes)
+        return Prediction(seconds, seconds_coarse, 0), int(self.work.peak * network.held_bytes)
 
     def on_several_ranks(self) -> tuple[RanksChoice, Prediction, int, RankPart]:
         """Choose the number of ranks.
@@ -758,9 +771,9 @@ class CostModel:
                 network.halo,
                 network.rate.both,
                 raster,
-                network.fixed * len(pieces),
+                network.fixed.both * len(pieces),
                 int(plan.seen.sum()),
-                forward=network.rate.forward,
+                forward=network.rate.features,
                 held=self.tiling.held * sharing,
                 working=self.tiling.working,
                 sharing=sharing,
@@ -786,20 +799,20 @@ class CostModel:
         Returns:
             Prediction, level of measurements (see `Plan.measuring`), and number of views for the loss.
         """
-        plan, settings, rate, work = self._plan, self._settings, self._probe.network.rate, self.work
+        plan, settings, network, work = self._plan, self._settings, self._probe.network, self.work
         views = self.views.of_rank(part)
         expected = replace(
             steps,
             first_visit=views.first(coarse=False),
             first_visit_coarse=views.first(coarse=True),
-            style=self._probe.styles * work.without_region * rate.forward,
+            style=self._probe.styles * work.without_region * network.rate.forward,
         )
         seconds = self._steps_seconds(expected)
         expected = replace(expected, job=seconds)
         count = len(plan.covered)
         level, loss_views = plan.measuring, min(LOSS_VIEWS[0], count)
         if plan.measured:
-            once = _RENDER * views.rasterized() + views.later(coarse=False) + part.seconds(work.evaluation(rate))
+            once = _RENDER * views.rasterized() + views.later(coarse=False) + part.seconds(work.evaluation(network))
             unvisited = max(1 - settings.steps_sos * settings.views_per_step / count, 0.0)
             price = once + unvisited * expected.first_visit
             # `target_loss` is relative to the initial loss on these views. Their number must not depend on timings, or

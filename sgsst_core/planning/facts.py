@@ -42,18 +42,24 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class Rate:
-    """Seconds per pixel of the feature network, including statistics.
+    """Seconds per pixel of the loss of an image, or per partition tile.
 
     Attributes:
-        forward: Seconds per pixel of the forward pass alone.
-        both: Seconds per pixel of both passes.
+        features: Seconds of the feature network's forward pass alone.
+        forward: Seconds of the loss, which includes statistics.
+        both: Seconds of the loss and its gradient.
         search: Seconds per pair of position and style vector in the nearest-neighbor search; 0 if features are not
             matched.
     """
 
+    features: float
     forward: float
     both: float
     search: float = 0.0
+
+    def times(self, pixels: int) -> Rate:
+        """Return the time of a number of pixels."""
+        return Rate(pixels * self.features, pixels * self.forward, pixels * self.both, self.search)
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,8 @@ class NetworkFacts:
         working_bytes: Additional bytes per pixel needed by a pass.
         content_bytes: Bytes per cell of the content layer.
         rate: Time per pixel.
-        fixed: Constant time in seconds of a partition tile, measured on one with almost no pixels.
+        fixed: Constant time of a partition tile, measured on one with almost no pixels. On a GPU, it is the time to
+            launch its kernels. Not measured, and 0, for a single rank on a CPU.
         precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision; None if float32
             was requested, or the requested one is unavailable.
         gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
@@ -80,7 +87,7 @@ class NetworkFacts:
     working_bytes: float
     content_bytes: int
     rate: Rate
-    fixed: float = 0.0
+    fixed: Rate = Rate(0.0, 0.0, 0.0)
     precision_ratio: float | None = None
     gradient_error: Difference | None = None
     vector_channels: int = 0

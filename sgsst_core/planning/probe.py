@@ -115,9 +115,9 @@ def _network_facts(context: PlanningContext, first: Camera, maps: int) -> Networ
     """Benchmark the network on synthetic images; if it is not float32, measure its gradient error on the first view."""
     network, settings, loss = context.network, context.settings, _loss(context)
     side = min(_side(context, loss), max(max(camera.width, camera.height) for camera in context.cameras))
-    rate, fixed = measure_rate(loss, side, maps), 0.0
-    if context.machine.ranks > 1:  # with almost no pixels: the time that does not depend on their number
-        fixed = measure_rate(loss, ALIGNMENT).both * ALIGNMENT**2
+    rate, fixed = measure_rate(loss, side, maps), Rate(0.0, 0.0, 0.0)
+    if context.machine.ranks > 1 or context.machine.device == "cuda":
+        fixed = measure_rate(loss, ALIGNMENT, maps).times(ALIGNMENT**2)
     return NetworkFacts(
         network.halo,
         network.held_bytes_per_pixel(),
@@ -171,15 +171,13 @@ def measure_rate(loss: SosLoss, side: int, maps: int = 0) -> Rate:
     style = {0: (target,) * max(maps, 1)}
 
     def seconds(gradient: bool) -> float:
-        timer = Timer(loss.network.device)
-        with timer("evaluation"):
-            loss.evaluate(image, style, view, [0], gradient=gradient)
-        return timer.read()["evaluation"] / side**2
+        return _seconds_of(loss, lambda: loss.evaluate(image, style, view, [0], gradient=gradient)) / side**2
 
     seconds(True)
     both = min(seconds(True) for _ in range(_RATE_RUNS))
     forward = min(seconds(False) for _ in range(_RATE_RUNS))
-    return Rate(forward, both, 0.0 if vectors is None else _search_seconds(vectors.units))
+    features = min(_seconds_of(loss, lambda: loss.network.forward(image, cache=False)) for _ in range(_RATE_RUNS))
+    return Rate(features / side**2, forward, both, 0.0 if vectors is None else _search_seconds(vectors.units))
 
 
 def _search_seconds(units: Tensor) -> float:
@@ -252,17 +250,18 @@ def launch_cost(loss: SosLoss, size: Size) -> LaunchCost:
         return graphs.evaluate(image, style, view, scales)
 
     evaluate()  # eager first run: warms up the kernels
-    seconds = min(_launch_seconds(loss, lambda: loss.evaluate(image, style, view, scales)) for _ in range(LAUNCH_RUNS))
-    first = _launch_seconds(loss, evaluate)
+    seconds = min(_seconds_of(loss, lambda: loss.evaluate(image, style, view, scales)) for _ in range(LAUNCH_RUNS))
+    first = _seconds_of(loss, evaluate)
     if graphs.problem is not None:
         return LaunchCost(problem=graphs.problem)
     if not graphs.captured:
         return LaunchCost(problem="a view's activations do not fit the memory twice")
-    replayed = min(_launch_seconds(loss, evaluate) for _ in range(LAUNCH_RUNS))
+    replayed = min(_seconds_of(loss, evaluate) for _ in range(LAUNCH_RUNS))
     return LaunchCost(seconds, replayed, max(first - replayed, 0.0))
 
 
-def _launch_seconds(loss: SosLoss, evaluate: Callable[[], SosResult]) -> float:
+def _seconds_of(loss: SosLoss, evaluate: Callable[[], object]) -> float:
+    """Return the time in seconds of an evaluation on the loss's device."""
     timer = Timer(loss.network.device)
     with timer("evaluation"):
         evaluate()

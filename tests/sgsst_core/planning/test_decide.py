@@ -41,7 +41,7 @@ def probe(**changes: Any) -> Probe:
     parts: dict[str, Any] = {
         "scene": SceneFacts(6, 3, 3, 3),
         "survey": Survey(weights, list(range(VIEWS)), [WHOLE] * VIEWS, 0.0),
-        "network": NetworkFacts(64, 3000.0, 500.0, 2048, Rate(1e-6, 3e-6), fixed=0.01),
+        "network": NetworkFacts(64, 3000.0, 500.0, 2048, Rate(0.5e-6, 1e-6, 3e-6), Rate(0.0, 0.0, 0.01)),
         "machine": Machine("cpu", 10 * GIGABYTE),
     }
     for name, part in parts.items():
@@ -178,9 +178,9 @@ def test_random_background_costs_a_content_pass_and_disables_early_stop() -> Non
     assert drawn.prediction is not None
     assert fixed.prediction is not None
     pixels = HEIGHT * WIDTH * (1 + 1 / 4)
-    assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 1e-6, rel=0.01)
+    assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 0.5e-6, rel=0.01)
     assert drawn.prediction.first_visit < fixed.prediction.first_visit
-    assert "0.6 s per step" in text_of(drawn, "training_background")
+    assert "0.3 s per step" in text_of(drawn, "training_background")
     assert text_of(drawn, "early stop").startswith("none: all steps are run: losses on different backgrounds")
     without = plan_of(probe(uncovered_fraction=0.5), training_background="random", content_weight=0.0)
     assert "per step" not in text_of(without, "training_background")
@@ -371,6 +371,24 @@ def test_graph_needs_memory_in_addition() -> None:
     assert peaks[0] is not None
     assert peaks[1] is not None
     assert peaks[0] - peaks[1] == int(HEIGHT * WIDTH * 3500.0)  # pixels of one scale: 3000 bytes held, 500 for work
+
+
+def test_launches_limit_steps_on_a_gpu_unless_they_are_captured() -> None:
+    """Views have two scales, each of which takes seconds to launch."""
+    values: dict[str, Any] = {"device": "cuda", "raster": RasterCost(0.01), "launches": CAPTURED}
+    measurements = probe(fixed=Rate(0.5, 1.0, 4.0), **values)
+    eager, captured = (
+        plan_of(measurements, steps_coarse=0, steps_sos=400, keep=keep).prediction for keep in (("launches",), ())
+    )
+    pixels = HEIGHT * WIDTH * (1 + 1 / 4)
+    assert eager is not None
+    assert captured is not None
+    assert eager.seconds == pytest.approx(2 * 4.0 + 0.01)
+    assert captured.seconds == pytest.approx(pixels * 3e-6 + 0.01)
+    assert eager.first_visit == pytest.approx(2 * 0.5 + 0.005)  # content features, and a render
+    large = plan_of(probe(fixed=Rate(0.0, 0.0, 0.1), **values), steps_coarse=0, steps_sos=400, keep=("launches",))
+    assert large.prediction is not None
+    assert large.prediction.seconds == captured.seconds
 
 
 def test_precision_line_states_the_measured_error() -> None:

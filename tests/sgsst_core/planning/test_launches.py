@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,10 +15,15 @@ if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.features.vgg import ALIGNMENT, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.planning.probe import LAUNCH_RUNS, LEAST_GRAPH_VISITS, launch_cost
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.context import equip
+from sgsst_core.planning.facts import Link
+from sgsst_core.planning.probe import LAUNCH_RUNS, LEAST_GRAPH_VISITS, launch_cost, measure, soft_image
+from sgsst_core.planning.survey import survey_views
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
@@ -49,6 +55,24 @@ def test_launches_are_timed_with_and_without_a_graph(counts: Counts, tiny_weight
     assert cost.capture >= 0
     replays = [count for line, count in counts.launches.items() if "loss/graphs.py" in line]
     assert LAUNCH_RUNS + 1 in replays  # including the run after the capture
+
+
+def test_launches_of_a_tile_are_timed_and_do_not_depend_on_its_size(
+    counts: Counts, tiny_weights: BackboneWeights
+) -> None:
+    scene, views = wall(10, 8), cameras(1, 48, 32)
+    loss = SosLoss(FeatureNetwork(tiny_weights, device="cuda"))
+    launches = []
+    for side in (ALIGNMENT, 4 * ALIGNMENT):
+        image = soft_image(side).to("cuda")
+        style, view = loss.targets.of_style(Style.of(image.flip(0)), (side, side)), loss.targets.of_view(image)
+        counts.clear()
+        loss.evaluate(image, style, view, [0])
+        launches.append(counts.launches.total())
+    assert launches[0] == pytest.approx(launches[1], rel=0.02)
+    context = equip(scene, views, make_settings(), tiny_weights, ALONE, rasterizer="cpu")
+    fixed = measure(context, survey_views(scene, views, context.rasterizer), Link(math.inf, 0.0)).network.fixed
+    assert min(fixed.features, fixed.forward, fixed.both) > 0
 
 
 def test_launch_cost_without_graph_states_the_problem(

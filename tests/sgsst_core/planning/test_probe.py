@@ -48,6 +48,8 @@ def test_probe_contains_the_measured_facts(tiny_weights: BackboneWeights) -> Non
         planning_context.network.held_bytes_per_pixel(),
     )
     assert 0 < probe.network.rate.forward < 10 * probe.network.rate.both
+    assert 0 < probe.network.rate.features < 10 * probe.network.rate.forward
+    assert probe.network.fixed == Rate(0.0, 0.0, 0.0)
     assert probe.network.precision_ratio is None
     assert probe.network.gradient_error is None
     assert probe.device_bytes == 0
@@ -100,8 +102,8 @@ def test_synthetic_images_are_as_large_as_the_device_needs(tiny_weights: Backbon
 
 
 def test_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first run is a warm-up; two runs with gradient and two without follow."""
-    taken = iter([1.0, 5.0, 3.0, 4.0, 2.0])
+    """The first run is a warm-up; two runs with gradient, two without, and two of the network alone follow."""
+    taken = iter([1.0, 5.0, 3.0, 4.0, 2.0, 1.0, 1.5])
 
     class Clock(Timer):
         def read(self) -> dict[str, float]:
@@ -109,7 +111,7 @@ def test_fastest_run_of_the_network_counts(tiny_weights: BackboneWeights, monkey
 
     monkeypatch.setattr("sgsst_core.planning.probe.Timer", Clock)
     loss = SosLoss(equipped(tiny_weights, wall()).network, memory=1 << 30)
-    assert measure_rate(loss, 64) == Rate(forward=2.0 / 64**2, both=3.0 / 64**2)
+    assert measure_rate(loss, 64) == Rate(1.0 / 64**2, 2.0 / 64**2, 3.0 / 64**2)
     assert next(taken, None) is None
 
 
