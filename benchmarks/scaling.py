@@ -1,6 +1,6 @@
 """Forecast of the time of an SOS iteration on 1 to 64 GPUs, by the planner's model for choosing the number of ranks.
 
-python -m benchmarks.scaling [--tflops 100] [--shown 0.65]
+python -m benchmarks.scaling [--tflops 370] [--shown 0.65]
 
 Nothing here is measured on GPUs. The assumptions are the constants below; they are printed and stored with the table.
 `benchmarks.ranks` validates the same model on a CPU, by predicting the speedup of two ranks from one rank's seconds.
@@ -30,9 +30,12 @@ LINKS = {
     "PCIe 4.0 x16": Link(0.8 * 32e9, 10e-6),
     "25 Gb/s Ethernet": Link(0.8 * 25e9 / 8, 30e-6),
 }
-#: Height, width, number of optimized Gaussians, and seconds of render plus gradient, for a typical scene of Tanks and
-#: Temples and for the garden scene of Mip-NeRF 360 at full size.
-VIEWS = {"980x545": (545, 980, 2_500_000, 0.006), "5187x3361": (3361, 5187, 5_800_000, 0.030)}
+#: Height, width, number of optimized Gaussians, and seconds of render plus gradient on an H100 by `forecast`, for a
+#: typical scene of Tanks and Temples and for the garden scene of Mip-NeRF 360 at full size.
+VIEWS = {"980x545": (545, 980, 2_500_000, 0.0015), "5187x3361": (3361, 5187, 5_800_000, 0.020)}
+#: Default of `--tflops`: operations of VGG's convolutions over the time of network, statistics and losses, on an H100
+#: in bfloat16 by `forecast`.
+TFLOPS = 370.0
 #: Fraction of the optimized Gaussians that a view shows: 65 % for the plush toy scene with its real cameras, 68 % for
 #: the biker scene in an orbit. Views of walk-through scenes show fewer.
 SHOWN_SHARE = 0.65
@@ -43,7 +46,7 @@ FIXED_SECONDS = 0.003
 def main() -> None:
     """Compute the forecast, then print and store it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tflops", type=float, default=100.0, help="that one GPU sustains in VGG's convolutions")
+    parser.add_argument("--tflops", type=float, default=TFLOPS, help="that one GPU sustains in VGG's convolutions")
     parser.add_argument("--shown", type=float, default=SHOWN_SHARE, help="share of the Gaussians that a view shows")
     arguments = parser.parse_args()
     results: dict[str, Any] = {}
