@@ -22,7 +22,7 @@ import torch
 from benchmarks.inputs import input_parser, read_inputs
 from benchmarks.judged import compare_rows, judged, write_sheet
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.bench.quality import make_novel_views
+from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import with_scales
 from sgsst_core.quality.dists import may_judge
@@ -86,9 +86,7 @@ def main() -> None:
 def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
     """Return a judge of the novel views between a job's views."""
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
-    novel_views = make_novel_views(stylizer)
-    views = [novel_views.cameras[index] for index in novel_views.views]
-    return Judge(Lpips(), style, scene, novel_views.rasterizer, views, stylizer.job.settings.background)
+    return make_judge(stylizer, make_novel_views(stylizer), Lpips())
 
 
 def _judged(judge: Judge, sh_dc: torch.Tensor, wanted: torch.Tensor) -> dict[str, float]:

@@ -178,7 +178,7 @@ def _number(value: float | None) -> str:
 
 
 def error_time_table(curves: Sequence[Curve]) -> Table:
-    """Return a table of each variant's remaining loss over time, and of the final remaining loss on each scale."""
+    """Return a table of each variant's remaining loss over time, and of its final loss by scale and judgment."""
     shown = [curve for curve in curves if curve.points]
     scales = sorted({scale for curve in shown for scale in curve.points[-1].by_scale})
     moments = [f"{point.seconds:.0f} s" for point in shown[0].points] if shown else []
@@ -186,15 +186,19 @@ def error_time_table(curves: Sequence[Curve]) -> Table:
         Column("variant", no_wrap=True),
         *moments,
         *(f"scale {scale}" for scale in scales),
+        "style",
+        "color_distance",
         "steps",
-        title="remaining loss, relative to the start",
+        title="remaining loss, relative to the start, and judgment of the end",
     )
     for curve in curves:
         if not curve.points:
             continue
         losses = [f"{point.relative:.3f}" for point in curve.points]
-        ends = [f"{curve.points[-1].by_scale[scale]:.3f}" for scale in scales]
-        table.add_row(curve.variant.name, *losses, *ends, str(curve.points[-1].step))
+        end = curve.points[-1]
+        ends = [end.by_scale[scale] for scale in scales]
+        judged = [end.judgment.style, end.judgment.color_distance] if end.judgment else [None, None]
+        table.add_row(curve.variant.name, *losses, *(_number(value) for value in (*ends, *judged)), str(end.step))
     return table
 
 

@@ -1,27 +1,33 @@
 """Error against run time: variants of one job with the same time budget, evaluated by the same exact loss.
 
-Every variant optimizes for the same number of seconds. At fixed times, its colors are evaluated on all views by the
+Every variant optimizes for the same number of seconds. At fixed times, its colors are evaluated on some views by the
 float32 loss of all scales (`exact.Float32Reference`). This is the paper's loss, regardless of the loss that the variant
-optimizes. Run time excludes these evaluations. It also excludes the one-time preparation of each view, which would
-dominate a short budget and is reported separately. All variants are in memory at the same time. A variant is on the
-Pareto front if it reaches some loss sooner than all other variants.
+optimizes. At the same times, they are judged on novel views by a network that no variant optimizes (`Judge`). Run time
+excludes evaluations and judgments. It also excludes the one-time preparation of each view, which would dominate a short
+budget and is reported separately. All variants are in memory at the same time. A variant is on the Pareto front if it
+reaches some loss sooner than all other variants.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from torch import Tensor
 
+from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.planning.measuring import LOSS_VIEWS
 from sgsst_core.quality.exact import Float32Reference
+from sgsst_core.quality.judge import Judgment
+from sgsst_core.quality.lpips import load_lpips_or_none
 from sgsst_core.report.charts import (
     RELATIVE_LOSS,
     draw_legend,
@@ -33,9 +39,9 @@ from sgsst_core.report.charts import (
 )
 from sgsst_core.report.history import X_MARGIN, Floats, column, joined, log_limits
 from sgsst_core.report.palette import INK, color_of
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import Settings, make_settings
+from sgsst_core.settings import PresetName, Settings, make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.schedule import Phase
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -89,11 +95,20 @@ class Variant:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
+def _of_preset(preset: PresetName) -> dict[str, Any]:
+    """Return the settings of a preset that differ from the standard preset's."""
+    standard, other = make_settings("standard"), make_settings(preset)
+    pairs = {name: (getattr(standard, name), getattr(other, name)) for name in Settings.model_fields}
+    return {name: value for name, (usual, value) in pairs.items() if value != usual}
+
+
 PAPER_RATE = {"learning_rate": 2.5e-3, "learning_rate_end": 2.5e-3, "clamp_aware_gradient": False}
 VARIANTS = {
     variant.name: variant
     for variant in (
         Variant("standard", "coarsest scale first, then all scales (SOS); the standard preset"),
+        Variant("preview", "the preview preset: views of at most 640 pixels", settings=_of_preset("preview")),
+        Variant("paper", "the paper preset: published schedule, rate and start", settings=_of_preset("paper")),
         Variant("paper-rate", "the same with the paper's constant learning rate and clamp", settings=PAPER_RATE),
         Variant("no-phase-1", "all scales from the beginning", _sos),
         Variant("coarse-only", "the coarsest scale alone", _coarse_only),
@@ -128,12 +143,21 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class Point:
-    """Losses of a variant at one evaluation, relative to the unstylized scene."""
+    """Evaluation of a variant.
+
+    Attributes:
+        seconds: Seconds of optimization.
+        step: Number of steps.
+        relative: Loss relative to the unstylized scene, mean over scales.
+        by_scale: Relative loss of each scale.
+        judgment: Judgment on the novel views; None if AlexNet is not installed, or if no view can be judged.
+    """
 
     seconds: float
     step: int
     relative: float
     by_scale: dict[int, float]
+    judgment: Judgment | None = None
 
 
 @dataclass(frozen=True)
@@ -207,8 +231,11 @@ def error_time(
     base = make_settings("standard", **settings)
     fraction = (base.memory_limit or default_memory_limit()) // (len(variants) + 1)
     base = base.model_copy(update={"memory_limit": fraction})
-    exact = Float32Reference(Stylizer.planned(scene, cameras, style, base, weights=weights), style_loss="sos")
-    views = exact.views.covered
+    reference = Stylizer.planned(scene, cameras, style, base, weights=weights)
+    exact = Float32Reference(reference, style_loss="sos")
+    lpips = load_lpips_or_none()
+    judge = make_judge(reference, make_novel_views(reference), lpips) if lpips else None
+    views = spread(exact.views.covered, LOSS_VIEWS[0])
     start = exact.evaluate(views, scene.sh_dc)
     running = [_prepared(variant, seconds, (scene, cameras, style), base, weights) for variant in variants]
     for part in range(1, SLICES + 1):
@@ -218,10 +245,11 @@ def error_time(
             while stylizer.seconds < part / SLICES * seconds:
                 stylizer.run_step()
             if part in MOMENTS:
-                loss = exact.evaluate(views, stylizer.stylized())
+                colors = stylizer.stylized()
+                loss, judgment = exact.evaluate(views, colors), judge.judge(colors) if judge else None
                 by_scale = {scale: loss[scale].total / start[scale].total for scale in loss}
                 relative = mean_loss(loss, exact.loss.weights) / mean_loss(start, exact.loss.weights)
-                curve.points.append(Point(stylizer.seconds, stylizer.step, relative, by_scale))
+                curve.points.append(Point(stylizer.seconds, stylizer.step, relative, by_scale, judgment))
                 progress(curve.variant, curve.points[-1])
     return [replace(curve, sh_dc=stylizer.stylized() if stylizer else None) for curve, stylizer in running]
 
@@ -293,6 +321,7 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
                         "step": point.step,
                         "relative": point.relative,
                         "by_scale": {str(scale): value for scale, value in point.by_scale.items()},
+                        "judgment": asdict(point.judgment) if point.judgment else None,
                     }
                     for point in curve.points
                 ],
@@ -311,42 +340,52 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
 _MARKERS = "osD^vP*"
 
 
+#: Measures of the judgment that the plot shows, with their titles.
+_JUDGED = {"style": "distance from the style (AlexNet)", "color_distance": "color distance"}
+
+
 def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
-    """Write a PNG of loss against seconds on logarithmic axes: a panel for the mean over scales, and one per scale.
+    """Write a PNG of loss and judgments against seconds on logarithmic axes.
+
+    There is a panel for the mean loss over scales, one for each scale, and one for each judgment.
 
     Raises:
         OutputError: If the file cannot be written.
     """
     shown = [curve for curve in curves if curve.points]
     scales = sorted({scale for curve in shown for point in curve.points for scale in point.by_scale})
-    with png_chart(path, (5.2 * (1 + len(scales)), 4.8)) as figure:
-        panels = figure.subplots(1, 1 + len(scales), sharey=True, squeeze=False)[0]
-        losses = [_draw_curves(axes, shown, scale) for axes, scale in zip(panels, (None, *scales), strict=True)]
-        for axes in panels:
+    measures = _JUDGED if any(point.judgment for curve in shown for point in curve.points) else {}
+    with png_chart(path, (5.2 * (1 + len(scales) + len(measures)), 4.8)) as figure:
+        mean, *panels = figure.subplots(1, 1 + len(scales) + len(measures), squeeze=False)[0]
+        losses = [_draw_curves(mean, shown, "mean of the scales", lambda point: point.relative)]
+        for axes, scale in zip(panels, scales, strict=False):
+            losses.append(_draw_curves(axes, shown, scale_name(scale), partial(_scale_loss, scale)))
+        for axes in (mean, *panels[: len(scales)]):
             set_log_y(axes, losses)
+        for axes, (name, what) in zip(panels[len(scales) :], measures.items(), strict=True):
+            set_log_y(axes, [_draw_curves(axes, shown, what, partial(_judged, name))])
         front = [point for _, point in pareto_front(shown)]
-        panels[0].plot([p.seconds for p in front], [p.relative for p in front], "--", color=INK, lw=2.5, alpha=0.35)
-        panels[0].set_ylabel(RELATIVE_LOSS)
+        mean.plot([p.seconds for p in front], [p.relative for p in front], "--", color=INK, lw=2.5, alpha=0.35)
+        mean.set_ylabel(RELATIVE_LOSS)
         draw_legend(figure, in_row=7)
         figure.suptitle(f"{title} (dashed: Pareto front)")
 
 
-def _draw_curves(axes: Axes, curves: Sequence[Curve], scale: int | None) -> Floats:
-    """Draw loss against seconds with one line per curve; return the drawn losses.
+def _scale_loss(scale: int, point: Point) -> float | None:
+    return point.by_scale.get(scale)
 
-    Args:
-        axes: Axes to draw on.
-        curves: Curves to draw.
-        scale: Scale of the loss; None for the mean over scales.
-    """
+
+def _judged(measure: str, point: Point) -> float | None:
+    return getattr(point.judgment, measure, None)
+
+
+def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str, value: Callable[[Point], float | None]) -> Floats:
+    """Draw a value of points against seconds with one line per curve; return the drawn values."""
     seconds = [column([point.seconds for point in curve.points]) for curve in curves]
-    losses = [
-        column([point.relative if scale is None else point.by_scale.get(scale) for point in curve.points])
-        for curve in curves
-    ]
+    values = [column([value(point) for point in curve.points]) for curve in curves]
     for index, curve in enumerate(curves):
         options = {"marker": _MARKERS[index % len(_MARKERS)], "color": color_of(index), "label": curve.variant.name}
-        draw_points(axes, seconds[index], losses[index], markersize=4, linewidth=1, **options)
+        draw_points(axes, seconds[index], values[index], markersize=4, linewidth=1, **options)
     set_log_x(axes, log_limits(joined(seconds), X_MARGIN), "seconds of optimization")
-    axes.set_title("mean of the scales" if scale is None else scale_name(scale))
-    return joined(losses)
+    axes.set_title(title)
+    return joined(values)

@@ -17,15 +17,14 @@ from torch import Tensor
 
 from sgsst_core.bench.error_time import Curve, Point, Variant, error_time
 from sgsst_core.bench.error_time import as_dict as curves_as_dict
-from sgsst_core.budget import measuring_memory
+from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.consistency import Consistency
 from sgsst_core.quality.dists import load_dists_or_none, may_judge
-from sgsst_core.quality.exact import ExactLoss, rasterizer_beside
 from sgsst_core.quality.judge import Judge, Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
-from sgsst_core.quality.novel_views import NovelViewMoment, NovelViews
+from sgsst_core.quality.novel_views import NovelViewMoment
 from sgsst_core.report.charts import png_chart
 from sgsst_core.report.contact_sheet import write_rows
 from sgsst_core.report.palette import INK, color_of
@@ -154,8 +153,7 @@ def compare_quality(
         raise WeightsError("results are judged by AlexNet, which is not installed: run `sgsst weights fetch vgg16`.")
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings), weights=weights)
     novel_views = make_novel_views(stylizer)
-    views = [novel_views.cameras[index] for index in novel_views.views]
-    judge = Judge(lpips, style, scene, novel_views.rasterizer, views, stylizer.job.settings.background)
+    judge = make_judge(stylizer, novel_views, lpips)
     if not judge.cameras:
         raise SettingsError(
             "no view between the cameras can be judged: neighboring cameras are too far apart, or views are smaller "
@@ -185,21 +183,6 @@ def compare_quality(
             last_outcome = outcome(curve.variant.name, curve.variant.what, curve.sh_dc)
             outcomes.append(replace(last_outcome, loss=last.relative, steps=last.step, seconds=last.seconds))
     return Quality(outcomes, curves, judge, style)
-
-
-def make_novel_views(stylizer: Stylizer) -> NovelViews:
-    """Create the novel views of a job, with all Gaussians of its scene."""
-    exact = ExactLoss(stylizer, "sos")
-    return NovelViews(
-        stylizer.job.views.cameras,
-        stylizer.job.views.covered,
-        stylizer.job.scene,
-        rasterizer_beside(stylizer, stylizer.job.scene),
-        exact.loss,
-        exact.style_targets,
-        weighted=stylizer.job.plan.weighted,
-        memory=measuring_memory(stylizer.job.memory),
-    )
 
 
 def write_plot(path: Path, quality: Quality, title: str) -> None:

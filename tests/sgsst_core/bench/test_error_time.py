@@ -19,20 +19,29 @@ from sgsst_core.bench.error_time import (
     pareto_front,
     write_plot,
 )
+from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.exact import Float32Reference
+from sgsst_core.quality.lpips import Lpips
+from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import Evaluation
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_variants_are_evaluated_at_equal_times(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_variants_are_evaluated_at_equal_times(
+    tiny_weights: BackboneWeights, vgg16_weights: object, tmp_path: Path
+) -> None:
+    """AlexNet's weights, which judge results, are installed together with VGG16's."""
     names = ["standard", "coarse-only", "coarse-to-fine", "cold-start", "half-weights"]
     scene, views = wall(), cameras(2, 96, 72)
     curves = error_time(scene, views, style(), choose_variants(names), 1.0, weights=tiny_weights, coarsest_side=36)
     assert [curve.variant.name for curve in curves] == names
+    job = Stylizer.planned(scene, views, style(), make_settings(coarsest_side=36), weights=tiny_weights)
+    judge = make_judge(job, make_novel_views(job), Lpips())
     for curve in curves:
         assert len(curve.points) == 6
         assert [point.seconds for point in curve.points] == sorted(point.seconds for point in curve.points)
@@ -40,6 +49,9 @@ def test_variants_are_evaluated_at_equal_times(tiny_weights: BackboneWeights, tm
         assert set(curve.points[-1].by_scale) == {0, 1}
         assert curve.sh_dc is not None
         assert curve.sh_dc.shape == scene.sh_dc.shape
+        judgments = [point.judgment for point in curve.points]
+        assert all(judgment is not None and judgment.content > 0 for judgment in judgments)
+        assert judgments[-1] == judge.judge(curve.sh_dc)
     assert curves[0].points[-1].relative < 0.9  # it optimizes the loss it is evaluated with
     write_plot(tmp_path / "p.png", curves, "a wall")
     assert Image.open(tmp_path / "p.png").width > 800
@@ -76,6 +88,14 @@ def test_pareto_front_contains_undominated_points() -> None:
     curves = [curve("standard", (1, 0.9), (2, 0.5), (4, 0.3)), curve("two-views", (1, 0.8), (2, 0.6), (3, 0.4))]
     front = [(name, point.seconds) for name, point in pareto_front(curves)]
     assert front == [("two-views", 1), ("standard", 2), ("two-views", 3), ("standard", 4)]
+
+
+def test_presets_are_variants_with_their_own_settings() -> None:
+    """At the same time, only what differs from the standard preset is replaced, so that given settings stay."""
+    assert VARIANTS["preview"].settings["max_resolution"] == 640
+    assert VARIANTS["paper"].settings["learning_rate"] == 2.5e-3
+    assert "learning_rate" not in VARIANTS["preview"].settings
+    assert "seed" not in VARIANTS["paper"].settings
 
 
 def test_unknown_variant_error_names_it() -> None:
