@@ -6,7 +6,6 @@ import contextlib
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -16,6 +15,8 @@ from typing import Any
 
 import psutil
 from sqlalchemy import create_engine, text
+
+from tests.ports import free_port
 
 
 def is_installed() -> bool:
@@ -39,9 +40,7 @@ class Postgres:
         if os.geteuid() == 0:  # it refuses to run as root
             shutil.chown(self._folder, "postgres")
             user = {"user": "postgres", "group": "postgres", "extra_groups": []}
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
+        port = free_port()
         self.url = f"postgresql+psycopg://sgsst@127.0.0.1:{port}"
         self._options: dict[str, Any] = {**user, "check": True, "stdout": subprocess.DEVNULL, "cwd": self._folder}
         self._data = str(self._folder / "data")
@@ -56,11 +55,12 @@ class Postgres:
     def signal(self, number: int) -> None:
         """Send a signal to all processes of the server."""
         main = psutil.Process(int((Path(self._data) / "postmaster.pid").read_text().split()[0]))
-        for process in [main, *main.children(recursive=True)]:
+        processes = [main, *main.children(recursive=True)]
+        for process in processes:
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.send_signal(number)
-        if number == signal.SIGKILL:
-            main.wait()
+        if number == signal.SIGKILL:  # a server cannot start while a process of the killed one holds its memory
+            psutil.wait_procs(processes, timeout=60)
 
     def remove(self) -> None:
         """Stop the server, and delete its folder."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,6 +25,8 @@ from tests.ports import free_port
 ROOT = Path(__file__).resolve().parents[2]
 #: Seconds that a test waits for anything before it fails. No test measures time.
 PATIENCE = 180.0
+#: Command that runs another one, and stops it if this process is killed.
+_WITH_PARENT = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []
 #: Short intervals, so that tests see within seconds what otherwise takes minutes.
 SETTINGS = {
     "SGSST_MIN_FREE_BYTES": "0",
@@ -57,7 +61,12 @@ class Service:
         self.url = f"http://127.0.0.1:{self.environment['SGSST_PORT']}"
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
-                self._command, env=self.environment, stdout=log, stderr=log, cwd=ROOT, start_new_session=True
+                [*_WITH_PARENT, *self._command],
+                env=self.environment,
+                stdout=log,
+                stderr=log,
+                cwd=ROOT,
+                start_new_session=True,
             )
         wait_for(self.ready, "the service to be ready", self.said)
         return self
@@ -117,6 +126,15 @@ class Service:
             except psutil.Error:
                 continue
         return alive
+
+    def stored(self) -> dict[Path, os.stat_result]:
+        """Return the status of every file and folder in the data folder; entries that vanish meanwhile are left out."""
+        entries = {}
+        for folder, folders, files in os.walk(self.data):
+            for path in (Path(folder, name) for name in folders + files):
+                with contextlib.suppress(FileNotFoundError):
+                    entries[path] = path.lstat()
+        return entries
 
     def stop(self, number: int = signal.SIGTERM) -> None:
         """Stop the service with a signal, as a user or the system would."""

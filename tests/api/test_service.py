@@ -8,6 +8,7 @@ import io
 import json
 import os
 import signal
+import stat
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -188,7 +189,8 @@ def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], ex
                 f"{entry['name']} tells where the service's data is"
             )
         assert result(client, job_id) == expected
-    assert not [path for path in service.data.rglob("*") if path.is_file() and path.stat().st_mode & 0o077]
+    modes = {path: status.st_mode for path, status in service.stored().items() if stat.S_ISREG(status.st_mode)}
+    assert not [path for path, mode in modes.items() if mode & 0o077]
 
 
 @pytest.mark.slow
@@ -341,7 +343,7 @@ def test_job_that_is_finished_early_keeps_its_colors(service: Service, files: di
 
 def test_queued_job_is_canceled_immediately(service: Service, files: dict[str, Path]) -> None:
     with service.client() as client:
-        first, second = submit(client, files), submit(client, files)
+        first, second = (submit(client, files, steps_sos=1_000_000) for _ in range(2))
         assert client.post(f"/v1/jobs/{second}/cancel").json()["status"] == "canceled"
         client.post(f"/v1/jobs/{first}/cancel")
         wait_until(service, client, first, "canceled")
@@ -401,7 +403,7 @@ def test_job_on_two_ranks(service: Service, files: dict[str, Path]) -> None:
 @pytest.mark.slow
 def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path: Path) -> None:
     with Service(tmp_path / "data", SGSST_PARALLEL_JOBS="2") as service, service.client() as client:
-        jobs = [submit(client, files, name=name) for name in ("one", "two", "three")]
+        jobs = [submit(client, files, name=name, steps_sos=1_000_000) for name in ("one", "two", "three")]
         for job_id in jobs[:2]:
             wait_for_step(service, client, job_id, 1)
         assert [job(client, job_id)["status"] for job_id in jobs] == ["running", "running", "queued"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import psutil
 import pytest
 
 from tests.api.service import ROOT, Service, wait_for
@@ -71,7 +73,8 @@ def has_ended(client: httpx.Client, job_id: str) -> bool:
 def lose(service: Service) -> None:
     """Kill all processes of a service at once."""
     for process in service.survivors():
-        process.send_signal(signal.SIGKILL)
+        with contextlib.suppress(psutil.NoSuchProcess):  # it has died with its parent
+            process.send_signal(signal.SIGKILL)
     wait_for(lambda: not service.survivors(), "the end of all processes")
 
 

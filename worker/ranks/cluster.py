@@ -137,11 +137,11 @@ class Cluster:
                 "RAY_ADDRESS to a cluster."
             ) from error
         started = [process for process in psutil.Process().children() if process not in earlier]
-        self._daemons = [process for process in started if process.name() in _DAEMONS]
+        self._daemons = [process for process in started if _is_daemon(process)]
 
     def alive(self) -> bool:
         """Return whether the daemons of a local instance run. Always True for a cluster, which is not checked."""
-        return all(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in self._daemons)
+        return all(map(_is_running, self._daemons))
 
     def close(self) -> None:
         """Disconnect from Ray; end a local instance and all its processes."""
@@ -155,6 +155,23 @@ class Cluster:
         if self._sweeper is not None:
             sweeper.dismiss(self._sweeper)
             self._sweeper = None
+
+
+def _is_daemon(process: psutil.Process) -> bool:
+    """Return whether this is one of `_DAEMONS`; Ray also starts processes that soon end."""
+    try:
+        return process.name() in _DAEMONS
+    except psutil.NoSuchProcess:
+        return False
+
+
+def _is_running(process: psutil.Process) -> bool:
+    """Return whether a process has not ended."""
+    try:
+        zombie: bool = process.status() == psutil.STATUS_ZOMBIE
+        return process.is_running() and not zombie
+    except psutil.NoSuchProcess:
+        return False
 
 
 def _silence_ray() -> None:

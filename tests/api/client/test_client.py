@@ -117,9 +117,13 @@ def test_interrupted_call_is_canceled(service: Service, files: dict[str, Path]) 
     with Client(service.url) as client:
         job_id = client.submit(files["scene"], files["style"], orbit=2).id
         main = threading.main_thread().ident or 0
-        threading.Timer(1.0, signal.pthread_kill, (main, signal.SIGINT)).start()
-        with pytest.raises(KeyboardInterrupt):
+
+        def wait() -> None:
+            threading.Timer(1.0, signal.pthread_kill, (main, signal.SIGINT)).start()
             client.wait(job_id)
+
+        with pytest.raises(KeyboardInterrupt):  # also if the signal arrives before the request
+            wait()
         assert client.cancel(job_id).finished
 
 

@@ -150,6 +150,6 @@ def test_data_folder_is_private(service: Service, client: httpx.Client, files: d
     submit(client, files)
     assert stat.S_IMODE(service.data.stat().st_mode) == 0o700
     # Folders below that of the results belong to the process of this test.
-    own = [path for path in service.data.rglob("*") if "artifacts" not in path.parts[:-1]]
+    own = {path: status for path, status in service.stored().items() if "artifacts" not in path.parts[:-1]}
     assert {"sgsst.db", "sgsst.db-wal", "artifacts"} <= {path.name for path in own}
-    assert not [path for path in own if path.stat().st_mode & 0o077]
+    assert not [path for path, status in own.items() if status.st_mode & 0o077]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import stat
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -96,16 +97,10 @@ def owner_and_key(service: Service, quotas: Quotas) -> tuple[str, str]:
 
 def on_disk(service: Service) -> int:
     """Return the total bytes of stored inputs and unfinished uploads of all owners."""
-    sizes = {}
-    for folder in ("blobs", "incoming", "uploads", "inspections"):
-        for path in (service.data / folder).rglob("*"):
-            try:
-                status = path.stat()
-            except FileNotFoundError:
-                continue
-            if path.is_file():
-                sizes[status.st_ino] = status.st_size
-    return sum(sizes.values())
+    folders = [service.data / name for name in ("blobs", "incoming", "uploads", "inspections")]
+    files = {path: status for path, status in service.stored().items() if stat.S_ISREG(status.st_mode)}
+    mine = [status for path, status in files.items() if any(folder in path.parents for folder in folders)]
+    return sum({status.st_ino: status.st_size for status in mine}.values())
 
 
 def test_quotas_of_jobs_bytes_and_requests(service: Service, files: dict[str, bytes]) -> None:

@@ -447,8 +447,8 @@ def test_slow_answers_are_cut_off_at_the_deadline(head: bytes, stored: Stored, f
         except OSError:
             cut_off.set()
 
-    with pytest.raises(FetchError, match=r"within 0\.5 s"):
-        fetch(stored, files.url("/a", drip), url_hosts=files.origin, url_seconds=0.5)
+    with pytest.raises(FetchError, match="within 2 s"):  # long enough to send the request on a busy machine
+        fetch(stored, files.url("/a", drip), url_hosts=files.origin, url_seconds=2)
     assert cut_off.wait(PATIENCE)
 
 

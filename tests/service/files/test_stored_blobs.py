@@ -303,7 +303,7 @@ def test_store_outage_is_reported_as_unavailable(fleet: Fleet, monkeypatch: pyte
 def test_silent_store_is_retried(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"the scene"
     sha256 = fleet.take(fleet.host("one"), data)
-    monkeypatch.setattr("service.files.objects._ANSWER_SECONDS", 1.0)
+    monkeypatch.setattr("service.files.objects._ANSWER_SECONDS", 3.0)
     two = fleet.host("two")
     fleet.s3.fail("silence", 1, lambda method, path: "blobs" in path)
     assert fleet.read(two, sha256) == data

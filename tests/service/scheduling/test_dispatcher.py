@@ -143,11 +143,12 @@ def test_attempt_is_abandoned_before_an_unrenewed_lease_expires(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The database does not respond: the thread that renews leases waits for it, and others will take over the job."""
-    settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, lease_seconds=4)
+    settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, lease_seconds=8)
     store = open_store(settings)
     store.inputs.add_blob(SHA, "aa/blob", 3)
     released = threading.Event()
     abandoned = threading.Event()
+    abandoned_at: list[float] = []
 
     def renew(leases: list[Lease]) -> dict[str, None]:
         released.wait(60)
@@ -169,6 +170,7 @@ def test_attempt_is_abandoned_before_an_unrenewed_lease_expires(
             self.started = time.monotonic()
 
         def abandon(self) -> None:
+            abandoned_at.append(store.database.clock())
             abandoned.set()
 
         def release(self) -> None:
@@ -183,7 +185,7 @@ def test_attempt_is_abandoned_before_an_unrenewed_lease_expires(
         assert abandoned.wait(60)
         expires = store.jobs.get(job.id, None).lease_expires_at
         assert expires is not None
-        assert store.database.clock() < expires, "nobody else can have the job yet"
+        assert abandoned_at[0] < expires, "nobody else can have the job yet"
         released.set()
     store.close()
 

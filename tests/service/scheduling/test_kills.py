@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import signal
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import psutil
 import pytest
 import torch
 
@@ -153,7 +155,8 @@ def test_job_survives_kills_of_its_ranks(service: Service, files: dict[str, Path
     at_step(service, job_id, 3, attempt=1)
     # the plan may leave out a rank, so every participant is killed
     for process in service.processes("ray::RankProcess"):
-        process.kill()
+        with contextlib.suppress(psutil.NoSuchProcess):  # one that the plan leaves out ends by itself
+            process.kill()
     job = ended(service, job_id)
     assert job["result"]["steps"] == STEPS
     log = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/log.txt", timeout=60).text

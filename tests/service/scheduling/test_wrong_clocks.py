@@ -28,7 +28,7 @@ from tests.service.store.helpers import Clock
 
 SHA = "a" * 64
 DAY = 86_400.0
-LEASE = 3.0
+LEASE = 6.0
 
 
 @pytest.fixture(scope="module")

@@ -76,7 +76,7 @@ def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluati
     assert report["memory"]["peak_bytes"] > 50_000_000
     assert report["memory"]["device_peak_bytes"] is report["plan"]["measured"]["device_bytes"] is None
     parts = sum(report["seconds_by_part"].values())
-    assert 0.5 * report["seconds"] < parts <= report["seconds"] + 0.01
+    assert 0.2 * report["seconds"] < parts <= report["seconds"] + 0.01
 
 
 def test_first_and_later_visits_are_distinguished(

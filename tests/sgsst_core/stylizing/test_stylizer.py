@@ -360,11 +360,13 @@ def test_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scen
     """The seconds of all parts are known when the step has finished, as with a GPU's events."""
     clock, events = (make(tiny_weights, scene) for _ in range(2))
     events.job.loss.timer = events.job.views.timer = Timer(event=ClockEvent)
-    for _ in range(6):  # the last step is on all scales
+    timed = 0.0
+    for step in range(6):
         expected, actual = clock.run_step(), events.run_step()
+        timed += sum(actual.parts.values()) if step else 0.0
         assert actual.parts.keys() == expected.parts.keys()
         assert all(seconds > 0 for seconds in actual.parts.values())
         assert sum(actual.parts.values()) < events.seconds
         assert actual.loss == expected.loss
     assert events.seconds_by_part.keys() == clock.seconds_by_part.keys()
-    assert sum(actual.parts.values()) > 0.5 * (events.seconds - events.history[-2].seconds)
+    assert timed > 0.2 * (events.seconds - events.history[0].seconds)

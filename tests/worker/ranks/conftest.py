@@ -47,5 +47,5 @@ def joined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
     finally:
         head.terminate()
-        head.wait(30)
+        head.wait(120)
         sweeper.sweep(Path(folder))

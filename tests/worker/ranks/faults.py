@@ -120,6 +120,14 @@ def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
     )
 
 
+def name_of(process: psutil.Process) -> str:
+    """Return the name of a process; an empty string if it has ended since it was listed."""
+    try:
+        return process.name()
+    except psutil.Error:
+        return ""
+
+
 def shared_memory(processes: Iterable[psutil.Process]) -> set[Path]:
     """Return the shared memory files that these processes have mapped."""
     segments = set()

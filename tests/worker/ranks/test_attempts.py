@@ -8,7 +8,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +19,8 @@ from PIL import Image
 from sgsst_core.errors import SceneError
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import Progress
-from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, shared_memory, small_request
+from tests.api.service import PATIENCE, wait_for
+from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, name_of, shared_memory, small_request
 from worker.description import Prepared
 from worker.execute import execute
 from worker.prepare import prepare
@@ -175,7 +175,7 @@ def test_job_survives_killed_raylet(undisturbed: tuple[float, bytes], cluster: C
 
     def stop() -> bool:
         if events.steps and not killed:
-            raylet = next(child for child in psutil.Process().children() if child.name() == "raylet")
+            raylet = next(child for child in psutil.Process().children() if name_of(child) == "raylet")
             killed.append(raylet.pid)
             raylet.kill()
         return False
@@ -268,20 +268,16 @@ def test_killed_driver_leaves_no_processes_or_files(tmp_path: Path) -> None:
     process = start(command(small_request(tmp_path, STEPS)))
     family = processes_below(psutil.Process(process.pid))
     used = folders(family)
-    assert any("FaultyRank" in child.name() or "RankProcess" in child.name() for child in family)
+    assert any("RankProcess" in name_of(child) for child in family)
     assert used
-    stopped = next(child for child in family if "RankProcess" in child.name())
+    stopped = next(child for child in family if "RankProcess" in name_of(child))
     stopped.suspend()
     shared = shared_memory(family)
     process.kill()
     process.communicate()
-    _, alive = psutil.wait_procs(family, timeout=30)
+    _, alive = psutil.wait_procs(family, timeout=PATIENCE)
     assert alive == []
-    deadline = time.monotonic() + 30
-    while any(folder.exists() for folder in used) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not any(folder.exists() for folder in used)
-    assert not any(path.exists() for path in shared)
+    wait_for(lambda: not any(path.exists() for path in used | shared), "the job's folders and memory to be deleted")
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def taken(memory: int) -> Iterator[None]:
     from ray.util import placement_group, remove_placement_group
 
     group = placement_group([{"memory": memory}])
-    assert group.wait(20)
+    assert group.wait(120)
     yield
     remove_placement_group(group)
 

@@ -243,12 +243,12 @@ def test_single_rank_collectives_return_their_input() -> None:
 
 
 def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
-    """Return whether rank 1, with a timeout of one second, waits for rank 0, which is three seconds late."""
+    """Return whether rank 1, with a timeout of one second, waits for rank 0, which is six seconds late."""
     collectives.all_gather(None)
     if expected is not None:
         collectives.set_timeout_for(expected)
     if collectives.rank == 0:
-        time.sleep(3)
+        time.sleep(6)
     try:
         collectives.all_gather(None)
     except RuntimeError:

@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 
 from sgsst_core.parallel.collectives import Collectives
-from tests.worker.ranks.faults import small_request
+from tests.worker.ranks.faults import name_of, small_request
 from tests.worker.ranks.spawn import on_ranks
 from tests.worker.ranks.test_attempts import command, start
 
@@ -26,9 +26,13 @@ pytestmark = [
 
 
 def listening(process: psutil.Process) -> list[str]:
-    """Return the addresses on which a process accepts connections or datagrams."""
-    sockets = []
-    for socket in process.net_connections("inet"):
+    """Return the addresses on which a process accepts connections or datagrams; none if it has ended."""
+    sockets: list[str] = []
+    try:
+        connections = process.net_connections("inet")
+    except psutil.NoSuchProcess:
+        return sockets
+    for socket in connections:
         if socket.status == psutil.CONN_LISTEN or (socket.type.name == "SOCK_DGRAM" and not socket.raddr):
             address = ip_address(socket.laddr.ip)
             mapped = address.ipv4_mapped if isinstance(address, IPv6Address) else None
@@ -42,7 +46,7 @@ def test_single_machine_job_listens_on_loopback_only(tmp_path: Path, tiny_instal
     try:
         driver = psutil.Process(process.pid)
         family = [driver, *driver.children(recursive=True)]
-        sockets = {f"{each.name()} {each.pid}": listening(each) for each in family}
+        sockets = {f"{name_of(each)} {each.pid}": listening(each) for each in family}
     finally:
         process.terminate()
         process.communicate(timeout=120)
