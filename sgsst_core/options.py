@@ -7,7 +7,8 @@ pydantic cannot express are added by `Annotated[..., Option(...)]`.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, get_args, get_origin
 
@@ -33,6 +34,10 @@ REMOVED = {
     "prune_weight": "it saved no time",
     "similar_views": "use fewer views instead (--views)",
 }
+
+
+#: Parts of an error's location that name a type of a union.
+_MEMBER = re.compile(r"constrained-\w+|\w+\[.*\]")
 
 
 def renamed_hint(name: str) -> str:
@@ -133,6 +138,19 @@ class Declared:
 def reason(error: ErrorDetails) -> str:
     """Return pydantic's reason why a value is invalid, or the message of our own validators, for users."""
     return error["msg"].removeprefix("Value error, ")
+
+
+def merged(errors: Iterable[ErrorDetails]) -> list[ErrorDetails]:
+    """Return one error for each invalid value; pydantic has one for each type that the value could have."""
+    by_loc: dict[tuple[int | str, ...], ErrorDetails] = {}
+    for error in errors:
+        unknown = error["type"] == "extra_forbidden"  # the last part is a name that a client has chosen
+        loc = error["loc"] if unknown else tuple(part for part in error["loc"] if not _MEMBER.fullmatch(str(part)))
+        if loc not in by_loc:
+            by_loc[loc] = {**error, "loc": loc}
+        elif by_loc[loc]["type"].endswith(("_parsing", "_type")):  # otherwise it has the first type, out of bounds
+            by_loc[loc]["msg"] += f", or {error['msg'].removeprefix('Input should be ')}"
+    return list(by_loc.values())
 
 
 def declared(model: type[BaseModel]) -> dict[str, Declared]:

@@ -29,7 +29,7 @@ from sgsst_core.option_parsers import (
     parse_strength,
     parse_weights,
 )
-from sgsst_core.options import Declared, Option, reason, renamed_hint
+from sgsst_core.options import Declared, Option, merged, reason, renamed_hint
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
@@ -372,7 +372,7 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
+        first = merged(error.errors())[0]
         name = ".".join(str(part) for part in first["loc"])
         raise SettingsError(f"Setting {name} = {first['input']!r}: {renamed_hint(name) or reason(first)}.") from error
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sgsst_core.errors import CameraError, OutputError, SettingsError
-from sgsst_core.files.atomic import ensure_writable_folder
-from sgsst_core.files.formats import RESULT_SUFFIXES, format_of_name
+from sgsst_core.files.formats import format_of_name
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, JobVideo, ViewOptions
+from worker.outputs import check_folder, check_is_not_scene, result_format
 from worker.region_requests import RegionRequest
 from worker.styles import StyleFile
 
@@ -219,41 +219,3 @@ def check_request(request: StylizeRequest) -> Outputs:
             check_is_not_scene(path, request.source.scene, "" if path == out else f" (the PLY beside {out.name})")
     check_folder(out.parent)
     return outputs
-
-
-def result_format(out: Path) -> SceneFormat:
-    """Return the format of a scene to write, by its file name.
-
-    Raises:
-        OutputError: If the name does not end in a suffix of a format that can be written, or the path is a folder.
-    """
-    format = format_of_name(out.name)
-    if format is None or format.write is None or out.is_dir():
-        raise OutputError(f"{out}: does not end in {RESULT_SUFFIXES}. Name the scene file to write.")
-    return format
-
-
-def check_is_not_scene(out: Path, scene: Path, remark: str = "") -> None:
-    """Check that an output is not the scene itself.
-
-    Args:
-        out: File to write.
-        scene: Scene to read.
-        remark: Text about the output for the message.
-
-    Raises:
-        OutputError: If both are the same file.
-    """
-    if out.exists() and scene.exists() and out.samefile(scene):
-        raise OutputError(f"{out}{remark}: is the scene itself, which would be overwritten. Give another file name.")
-
-
-def check_folder(folder: Path) -> None:
-    """Check that a folder is writable or can be created, without creating it.
-
-    Raises:
-        OutputError: If the folder cannot be written or created.
-    """
-    while not (folder.exists() or folder.is_symlink()) and folder != folder.parent:
-        folder = folder.parent
-    ensure_writable_folder(folder)

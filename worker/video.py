@@ -26,7 +26,8 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from worker.capture import about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view
 from worker.options import DEFAULT_SIDE, JobVideo, VideoOptions
-from worker.request import SceneRequest, check_choice, check_folder, check_is_not_scene
+from worker.outputs import check_folder, check_is_not_scene
+from worker.request import SceneRequest, check_choice
 
 
 @dataclass(frozen=True)

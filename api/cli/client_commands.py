@@ -32,6 +32,7 @@ from sgsst_core.files.formats import (
     result_name,
 )
 from sgsst_core.stylizing.progress_bar import clock, live_bar
+from worker.outputs import check_folder, check_is_not_scene, result_format
 from worker.region_requests import RegionOptions, RegionRequest, region_requests
 from worker.styles import parse_styles
 
@@ -68,6 +69,10 @@ def submit(
     key: KeyOption = None,
 ) -> None:
     """Submit a job to a service, with the options of stylize. With --out, wait for the result."""
+    if out is not None:
+        result_format(out)
+        check_is_not_scene(out, inputs.scene)
+        check_folder(out.parent)
     styles, settings = _styles_and_parameters(inputs, options, parameters)
     files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": _masks(inputs.regions)}
     with _client(url, key) as client:
@@ -172,7 +177,6 @@ def download(
         written = []
         for each in names:
             target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
-            target.parent.mkdir(parents=True, exist_ok=True)
             chosen = (format or _format_of(target)) if each == "stylized.ply" else None
             if format and out is None and each == "stylized.ply":
                 target = Path(result_name(each, by_name(format)))
@@ -192,11 +196,10 @@ def _check_target(target: Path, sha256: str | None) -> None:
     Args:
         sha256: SHA-256 of the artifact; None if it does not exist yet.
     """
-    if not target.exists() or (target.is_file() and sha256 == _sha256(target)):
-        return
-    raise OutputError(
-        f"{target}: exists, and is not this job's file. Write to another file with --out, or pass --overwrite."
-    )
+    if target.is_file() and sha256 != _sha256(target):
+        raise OutputError(
+            f"{target}: exists, and is not this job's file. Write to another file with --out, or pass --overwrite."
+        )
 
 
 def _sha256(path: Path) -> str:
@@ -241,7 +244,7 @@ def jobs(
     if as_json:
         out_console.print(json.dumps([job.data for job in page]))
         return
-    console = Console(highlight=False, markup=False)
+    console = Console(highlight=False, markup=False, emoji=False)
     widths = {"id": 35, "name": 0, "status": 13, "created": 11}
     widths["name"] = max(console.width - sum(widths.values()) - 2 * (len(widths) - 1), len("name"))
     table = Table(box=None, pad_edge=False)

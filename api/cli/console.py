@@ -15,8 +15,8 @@ NOT_FOUND, CONFLICT, JOB_FAILED = 3, 4, 5
 #: Exit code after Ctrl-C, as in shells.
 INTERRUPTED = 130
 
-out_console = Console(highlight=False, markup=False, soft_wrap=True)
-error_console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+out_console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
+error_console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
 
 
 def print_field(name: str, value: object) -> None:

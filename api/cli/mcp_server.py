@@ -48,7 +48,7 @@ Options = Annotated[
     Field(
         description="Options by name, such as `preset` (preview, standard or paper), `orbit` (number of views around "
         "an object, in place of cameras), `content_weight` (light, balanced or strong), `style_weights`, "
-        "`preserve_colors`, `seconds` (time limit). /docs of the service lists all."
+        "`preserve_colors`, `max_seconds` (time limit). /docs of the service lists all."
     ),
 ]
 JobId = Annotated[str, Field(description="ID of a job, from `submit`.")]
@@ -184,11 +184,10 @@ class Tools:
 
 
 def _new_file(out: str) -> Path:
-    """Return the absolute path of a file that does not exist yet, in a folder that does."""
+    """Return the absolute path of a file that does not exist yet."""
     path = Path(out).absolute()
     if path.exists():
         raise ToolError(f"{path}: exists. Name another file.")
-    path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 

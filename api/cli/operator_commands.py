@@ -142,7 +142,7 @@ def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
     table = Table("id", "name", "priority", "state")
     for row in rows:
         table.add_row(row.id, row.name, str(row.priority), "revoked" if row.revoked_at else "valid")
-    Console(highlight=False, markup=False).print(table)
+    Console(highlight=False, markup=False, emoji=False).print(table)
 
 
 @keys_app.command("revoke")

@@ -11,7 +11,7 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Declared, declared, reason
+from sgsst_core.options import Declared, declared, merged, reason
 from sgsst_core.settings import BY_PRESET
 
 Command = Callable[..., None]
@@ -160,6 +160,6 @@ def _checked(model: type[M], given: dict[str, object]) -> M:
     try:
         return model.model_validate(given)
     except ValidationError as error:
-        first = error.errors()[0]
+        first = merged(error.errors())[0]
         option = flags(declared(model)[str(first["loc"][0])])
         raise SettingsError(f"{option} {first['input']}: {reason(first)}.") from error

@@ -14,7 +14,7 @@ from sgsst_core.stylizing.progress_bar import live_bar
 @contextmanager
 def transfer_bar(console: Console, description: str) -> Iterator[Callable[[int, int], None]]:
     """Show the progress of a transfer; yield a function that receives the transferred and the total bytes."""
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with live_bar(console, *columns) as bar:
         task = bar.add_task(description, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total or None)

@@ -43,14 +43,8 @@ from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import about_rendering, choose_axes, read_capture
 from worker.description import describe_scene
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
-from worker.request import (
-    SceneRequest,
-    StylizeRequest,
-    check_choice,
-    check_folder,
-    check_is_not_scene,
-    result_format,
-)
+from worker.outputs import check_folder, check_is_not_scene, result_format
+from worker.request import SceneRequest, StylizeRequest, check_choice
 from worker.styles import split_weight
 
 #: Number of views of an orbit that a converted scene is compared in.

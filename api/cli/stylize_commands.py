@@ -67,7 +67,8 @@ def demo(
     """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
     from api.cli.demo_scene import build_demo
     from sgsst_core.features.network_weights import load_network_weights
-    from worker.request import SceneRequest, StylizeRequest, check_folder
+    from worker.outputs import check_folder
+    from worker.request import SceneRequest, StylizeRequest
     from worker.styles import StyleFile
 
     check_folder(out)

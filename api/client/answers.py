@@ -79,9 +79,10 @@ def checked(response: httpx.Response) -> httpx.Response:
 
     Raises:
         RequestError: If the service refused the request as faulty.
-        ApiError: If the service failed.
+        ApiError: If the service failed, or another program answered.
     """
     if response.status_code < 400:
+        _check_origin(response)
         return response
     try:
         problem = response.json()
@@ -89,6 +90,19 @@ def checked(response: httpx.Response) -> httpx.Response:
     except (ValueError, KeyError, TypeError):
         problem, message = {}, f"{response.request.url} answered {response.status_code}"
     raise refusal(message, response.status_code, problem)
+
+
+def _check_origin(response: httpx.Response) -> None:
+    """Raise an ApiError if a successful response is not the service's, whose responses are JSON or empty."""
+    kind = response.headers.get("content-type", "no type")
+    if response.has_redirect_location:
+        what = f"it redirects to {response.headers['location']}"
+    elif response.content and not kind.startswith("application/json"):
+        what = f"it sends {kind}"
+    else:
+        return
+    url = response.request.url
+    raise ApiError(f"{url} does not answer like the service: {what}. Check the address.", response.status_code)
 
 
 def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
+from urllib.parse import quote
 
 import anyio
 import httpx
 from httpx_sse import aconnect_sse
 
 from api.client import uploads
-from api.client.answers import Event, Job, checked, unreachable
+from api.client.answers import Event, Job, RequestError, checked, unreachable
 from api.client.downloads import Download, Progress
 from api.client.inputs import JobFiles, path_or_url
-from api.client.transport import TRIES, Transport
+from api.client.transport import TRIES, Transport, in_thread
+from sgsst_core.errors import OutputError
+from sgsst_core.files.atomic import ensure_writable_folder
 
 #: Jobs per page of a list.
 _PAGE = 200
@@ -22,6 +26,10 @@ _PAGE = 200
 _SILENCE_SECONDS = 60.0
 #: Seconds to wait before reconnecting to a stream. The wait doubles with each further connection without an event.
 FIRST_WAIT = 1.0
+
+
+#: IDs that do not change the path of a request.
+_ID = re.compile(r"\w+", re.ASCII)
 
 
 def no_progress(done: int, total: int) -> None:
@@ -117,7 +125,7 @@ class AsyncClient:
 
     async def job(self, job_id: str) -> Job:
         """Return the current state of a job."""
-        return Job.of((await self._transport.call("GET", f"/v1/jobs/{job_id}")).json())
+        return Job.of((await self._transport.call("GET", _job_path(job_id))).json())
 
     async def jobs(self, *, status: Sequence[str] = (), limit: int | None = None) -> AsyncIterator[Job]:
         """Yield the jobs of this key, newest first."""
@@ -139,7 +147,7 @@ class AsyncClient:
         timeout = httpx.Timeout(30.0, read=_SILENCE_SECONDS)
         while True:
             headers = {"Last-Event-ID": str(after)} if after else {}
-            path = f"/v1/jobs/{job_id}/events"
+            path = f"{_job_path(job_id)}/events"
             try:
                 async with aconnect_sse(self._transport.http, "GET", path, headers=headers, timeout=timeout) as source:
                     self._transport.reached = True
@@ -170,7 +178,7 @@ class AsyncClient:
 
     async def artifacts(self, job_id: str) -> list[dict[str, Any]]:
         """Return the files that a job has made so far."""
-        response = await self._transport.call("GET", f"/v1/jobs/{job_id}/artifacts")
+        response = await self._transport.call("GET", f"{_job_path(job_id)}/artifacts")
         artifacts: list[dict[str, Any]] = response.json()["artifacts"]
         return artifacts
 
@@ -190,10 +198,14 @@ class AsyncClient:
 
         Raises:
             RequestError: If the file does not exist, or does not exist yet.
+            OutputError: If the target is a folder, or its folder cannot be written or created.
         """
         target = Path(target)
+        if target.is_dir():
+            raise OutputError(f"{target}: is a folder. Name the file to write.")
+        await in_thread(ensure_writable_folder, target.parent)
         query = f"?format={format}" if format else ""
-        await self._transport.fetch(Download(f"/v1/jobs/{job_id}/artifacts/{name}{query}", target, progress))
+        await self._transport.fetch(Download(f"{_job_path(job_id)}/artifacts/{quote(name)}{query}", target, progress))
         return target
 
     async def blend(
@@ -212,7 +224,7 @@ class AsyncClient:
         """
         parts = [{"job_id": other, "weight": each} for other, each in (others or {}).items()]
         body = {"weight": weight, "others": parts, "format": format}
-        name: str = (await self._transport.call("POST", f"/v1/jobs/{job_id}/blends", json=body)).json()["name"]
+        name: str = (await self._transport.call("POST", f"{_job_path(job_id)}/blends", json=body)).json()["name"]
         return name
 
     async def video(self, /, job_id: str, progress: Progress = no_progress, **options: Any) -> str:
@@ -226,44 +238,57 @@ class AsyncClient:
         Raises:
             RequestError: If the job has no result, or an option is invalid.
         """
-        video = await self._transport.work(f"/v1/jobs/{job_id}/video", "rendering", progress, json=options)
+        video = await self._transport.work(f"{_job_path(job_id)}/video", "rendering", progress, json=options)
         name: str = video["name"]
         return name
 
     async def rename(self, job_id: str, name: str) -> Job:
         """Change the display name of a job; an empty name restores the names of scene and style."""
-        return Job.of((await self._transport.call("PATCH", f"/v1/jobs/{job_id}", json={"name": name})).json())
+        return Job.of((await self._transport.call("PATCH", _job_path(job_id), json={"name": name})).json())
 
     async def finish(self, job_id: str) -> Job:
         """End a running job after its current step, and keep its result so far."""
-        return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/finish")).json())
+        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/finish")).json())
 
     async def cancel(self, job_id: str) -> Job:
         """Cancel a job."""
-        return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/cancel")).json())
+        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/cancel")).json())
 
     async def retry(self, job_id: str) -> Job:
         """Queue a failed or canceled job again."""
-        return Job.of((await self._transport.call("POST", f"/v1/jobs/{job_id}/retry")).json())
+        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/retry")).json())
 
     async def share(self, job_id: str, days: float = 7.0) -> dict[str, Any]:
         """Create a read-only link to a result, which works for some days; `url` is its address."""
-        response = await self._transport.call("POST", f"/v1/jobs/{job_id}/shares", json={"days": days})
+        response = await self._transport.call("POST", f"{_job_path(job_id)}/shares", json={"days": days})
         share: dict[str, Any] = response.json()
         return share | {"url": f"{self.url}{share['url']}"}
 
     async def shares(self, job_id: str) -> list[dict[str, Any]]:
         """Return the links to a result that have not expired, without their addresses."""
-        shares: list[dict[str, Any]] = (await self._transport.call("GET", f"/v1/jobs/{job_id}/shares")).json()["shares"]
+        shares: list[dict[str, Any]] = (await self._transport.call("GET", f"{_job_path(job_id)}/shares")).json()[
+            "shares"
+        ]
         return shares
 
     async def revoke_share(self, job_id: str, share_id: str) -> None:
         """Revoke a link to a result."""
-        await self._transport.call("DELETE", f"/v1/jobs/{job_id}/shares/{share_id}")
+        await self._transport.call("DELETE", f"{_job_path(job_id)}/shares/{share_id}")
 
     async def delete(self, job_id: str) -> None:
         """Delete a job that has ended, with its results."""
-        await self._transport.call("DELETE", f"/v1/jobs/{job_id}")
+        await self._transport.call("DELETE", _job_path(job_id))
+
+
+def _job_path(job_id: str) -> str:
+    """Return the path of a job in the API.
+
+    Raises:
+        RequestError: If no job can have this ID.
+    """
+    if not _ID.fullmatch(job_id):
+        raise RequestError(f"There is no job {job_id!r}. `sgsst jobs` lists the IDs of jobs.", 404)
+    return f"/v1/jobs/{job_id}"
 
 
 def _files(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from api.client.answers import RequestError
 
-_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
+_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".heic", ".heif", ".hif"}
 
 
 @dataclass(frozen=True)
@@ -99,19 +99,38 @@ def camera_files(path: Path) -> list[Path]:
     Raises:
         RequestError: If there are none.
     """
-    if path.is_file() and path.suffix == ".json":
+    if path.is_file() and path.suffix in (".bin", ".txt") and (files := _model_files(path.parent)):
+        return files
+    if path.is_file():
         companion = path.with_name("dataparser_transforms.json")
         return [path, companion] if companion.is_file() and companion != path else [path]
-    folder = path if path.is_dir() else path.parent
-    for model in (folder, folder / "sparse" / "0", folder / "sparse"):
-        for suffix in (".bin", ".txt"):
-            if (model / f"cameras{suffix}").is_file():
-                names = ("cameras", "images", "points3D", "rigs", "frames")
-                return [file for name in names if (file := model / f"{name}{suffix}").is_file()]
-    for name in ("transforms.json", "cameras.json"):
-        if (folder / name).is_file() and path.is_dir():
-            return camera_files(folder / name)
+    _check_exists(path)
+    sparse = path / "sparse"
+    numbered = sorted(sparse.glob("[0-9]*"), key=lambda model: (len(model.name), model))
+    for model in (path, sparse / "0", sparse, *numbered):
+        if files := _model_files(model):
+            return files
+    for name in ("transforms.json", "transforms_train.json", "cameras.json"):
+        if (path / name).is_file():
+            return camera_files(path / name)
+    if files := _model_files(path / "colmap" / "sparse" / "0"):
+        return files
     raise RequestError(f"{path}: contains no cameras. Give a cameras.json, a COLMAP model or a transforms.json.")
+
+
+def _model_files(folder: Path) -> list[Path]:
+    """Return the files of a COLMAP model; empty if the folder holds none."""
+    for suffix in (".bin", ".txt"):
+        if (folder / f"cameras{suffix}").is_file():
+            names = ("cameras", "images", "points3D", "rigs", "frames")
+            return [file for name in names if (file := folder / f"{name}{suffix}").is_file()]
+    return []
+
+
+def _check_exists(path: Path) -> None:
+    """Raise a RequestError if there is neither a file nor a folder."""
+    if not path.exists():
+        raise RequestError(f"{path}: does not exist. Check the path.")
 
 
 def image_files(folder: Path) -> list[tuple[Path, str]]:
@@ -120,7 +139,9 @@ def image_files(folder: Path) -> list[tuple[Path, str]]:
     Raises:
         RequestError: If there are none.
     """
-    images = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _IMAGE_SUFFIXES and path.is_file())
+    _check_exists(folder)
+    visible = (path for path in folder.rglob("*") if not path.name.startswith("."))
+    images = sorted(path for path in visible if path.suffix.lower() in _IMAGE_SUFFIXES and path.is_file())
     if not images:
         raise RequestError(f"{folder}: contains no images. Give a folder of image files.")
     return [(path, path.relative_to(folder).as_posix()) for path in images]

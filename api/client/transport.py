@@ -34,7 +34,7 @@ class Transport:
         key: API key; None for the environment variable SGSST_KEY.
 
     Raises:
-        RequestError: If the address is neither an http nor an https URL.
+        RequestError: If the address is neither an http nor an https URL, or the key cannot be one.
 
     Attributes:
         http: HTTP client for requests without retries.
@@ -43,10 +43,12 @@ class Transport:
     """
 
     def __init__(self, url: str | None, key: str | None) -> None:
-        key = key or os.environ.get("SGSST_KEY")
+        key = (key or os.environ.get("SGSST_KEY") or "").strip()
         url = url or os.environ.get("SGSST_URL") or DEFAULT_URL
-        if not url.lower().startswith(("http://", "https://")):
+        if not _is_address(url):
             raise RequestError(f"{url}: not an address of a service. Give one such as {DEFAULT_URL}.")
+        if not (key.isascii() and key.isprintable()):
+            raise RequestError("The API key contains characters that no key has. Copy it again.")
         self.http = httpx.AsyncClient(
             base_url=url,
             headers={"Authorization": f"Bearer {key}"} if key else {},
@@ -169,6 +171,15 @@ class Transport:
             return await self._retrying(may_pass, once)
         except httpx.TransportError as error:
             raise unreachable(self.url, error) from None
+
+
+def _is_address(url: str) -> bool:
+    """Return whether a text is an http or https URL with a host."""
+    try:
+        parsed = httpx.URL(url)
+    except httpx.InvalidURL:
+        return False
+    return parsed.scheme in ("http", "https") and bool(parsed.host)
 
 
 async def in_thread(function: Callable[..., T], *args: Any) -> T:

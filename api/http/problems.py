@@ -17,7 +17,7 @@ from starlette.routing import Match
 from service.errors import ServiceError
 from service.parameters import JobParameters
 from sgsst_core.errors import InvalidInputError
-from sgsst_core.options import renamed_hint
+from sgsst_core.options import merged, reason, renamed_hint
 from worker.region_requests import RegionOptions
 
 MEDIA_TYPE = "application/problem+json"
@@ -128,9 +128,9 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     errors = [
         {
             "at": (at := ".".join(str(part) for part in entry["loc"])[:_SHOWN]),
-            "message": renamed_hint(at) or (_unknown(at) if entry["type"] == "extra_forbidden" else entry["msg"]),
+            "message": renamed_hint(at) or (_unknown(at) if entry["type"] == "extra_forbidden" else reason(entry)),
         }
-        for entry in error.errors()[:20]
+        for entry in merged(error.errors())[:20]
     ]
     first = errors[0] if errors else {"at": "", "message": "invalid"}
     return problem(422, "invalid-request", f"{first['at']}: {first['message']}", errors=errors)

@@ -72,7 +72,7 @@ def stylize(
     chosen = make_settings(preset, **settings)
     if isinstance(scene, SceneFile):
         check_sh_attenuation(scene, chosen.sh_attenuation)
-    with job_bar(Console(highlight=False, markup=False)) if progress else nullcontext() as bar:
+    with job_bar(Console(highlight=False, markup=False, emoji=False)) if progress else nullcontext() as bar:
         show = bar.show_planning if bar else None
         given = as_scene(scene)
         given = replace(given, rendering=given.rendering.requested(render_mode, eps2d))

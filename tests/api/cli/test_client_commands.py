@@ -9,7 +9,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
+from typing import Any
 
 import httpx
 import pytest
@@ -175,6 +178,96 @@ def test_download_replaces_no_file_of_another_job(
     assert main(["download", ids[1], "--overwrite"]) == 0
     assert result.read_bytes() == (tmp_path / "other.ply").read_bytes() == b"second"
     assert main(["download", ids[0], "all"]) == main(["download", ids[0], "all"]) == 0
+
+
+def test_outputs_are_checked_before_a_job_is_queued(
+    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+) -> None:
+    """Neither the scene nor a file of another kind is overwritten, and nothing fails after the job has ended."""
+    before = len(httpx.get(f"{service.url}/v1/jobs").json()["jobs"])
+    (tmp_path / "file").touch()
+    for out, message in (
+        (files[0], "is the scene itself"),
+        (tmp_path, "does not end in .ply"),
+        (tmp_path / "out.splat", "does not end in .ply"),
+        (tmp_path / "file" / "out.ply", "there is a file of that name"),
+    ):
+        assert main(["submit", *files, "--out", str(out)]) == 2
+        assert message in capsys.readouterr().err
+    assert len(httpx.get(f"{service.url}/v1/jobs").json()["jobs"]) == before
+
+
+def test_download_names_a_target_that_cannot_be_written(
+    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+) -> None:
+    job_id = submit(files, capsys)
+    finish(service, job_id, b"result", tmp_path)
+    (tmp_path / "file").touch()
+    for out, message in ((tmp_path, "is a folder"), (tmp_path / "file" / "out.ply", "there is a file of that name")):
+        for more in ([], ["--overwrite"]):
+            assert main(["download", job_id, "--out", str(out), *more]) == 2
+            assert message in capsys.readouterr().err
+    assert main(["download", job_id, "--out", str(tmp_path / "new" / "out.ply")]) == 0
+    assert (tmp_path / "new" / "out.ply").read_bytes() == b"result"
+
+
+@pytest.mark.parametrize("job_id", ["", "?", ".", "..", "a/b", "a b#c"])
+@pytest.mark.parametrize("command", ["status", "watch", "download", "cancel", "delete"])
+def test_id_that_no_job_has_is_refused(command: str, job_id: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, job_id]) == 3
+    assert capsys.readouterr().err == f"error: There is no job {job_id!r}. `sgsst jobs` lists the IDs of jobs.\n"
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--url", "http://127.0.0.1:abc", "not an address of a service"),
+        ("--url", "http://", "not an address of a service"),
+        ("--key", "kéy", "Copy it again"),
+        ("--key", "a\nb", "Copy it again"),
+    ],
+)
+def test_address_or_key_that_cannot_be_used_is_refused(
+    option: str, value: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["jobs", option, value]) == 2
+    assert message in capsys.readouterr().err
+
+
+class Stranger(BaseHTTPRequestHandler):
+    """Another program at the address of the service: it sends a page, or redirects `/moved`."""
+
+    def do_GET(self) -> None:
+        """Answer a request."""
+        moved = self.path.startswith("/moved")
+        self.send_response(301 if moved else 200)
+        self.send_header("Location" if moved else "Content-Type", "https://new.example/" if moved else "text/html")
+        self.end_headers()
+        self.wfile.write(b"<html>")
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Print nothing."""
+
+
+def test_address_of_another_program_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Stranger) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        for path, what in (("", "it sends text/html"), ("/moved", "it redirects to https://new.example/")):
+            for command in (["status", MISSING], ["jobs"], ["download", MISSING]):
+                assert main([*command, "--url", url + path]) == 1
+                assert f"does not answer like the service: {what}. Check the address." in capsys.readouterr().err
+        server.shutdown()
+
+
+def test_colons_of_names_are_no_emoji(files: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    job_id = submit(files, capsys, "--name", ":abc: [b]")
+    assert main(["status", job_id, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["name"] == ":abc: [b]"
+    assert main(["jobs", "--limit", "1"]) == 0
+    assert ":abc: [b]" in capsys.readouterr().out
+    assert main(["submit", ":abc:", *files[1:]]) == 2
+    assert capsys.readouterr().err == "error: :abc:: not a file. Check the path.\n"
 
 
 def test_list_of_jobs_fits_80_columns(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 import sys
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -18,6 +19,7 @@ from mcp_types import CallToolResult, ImageContent, TextContent
 from PIL import Image
 
 from api.client import AsyncClient
+from service.parameters import JobParameters
 from tests.api.service import ROOT, Service
 from tests.small_scenes import wall, write_files
 
@@ -72,6 +74,8 @@ def test_tools_describe_themselves(service: Service) -> None:
             assert all(each.get("description") for each in tool.input_schema["properties"].values())
         reading = {name for name, tool in listed.items() if tool.annotations and tool.annotations.read_only_hint}
         assert reading == {"estimate", "status"}
+        options = listed["submit"].input_schema["properties"]["options"]["description"]
+        assert set(re.findall(r"`(\w+)`", options)) <= JobParameters.model_fields.keys()
 
     anyio.run(run)
 

@@ -107,6 +107,11 @@ def test_bounds_match_across_interfaces(name: str, value: float, capsys: pytest.
         assert error["msg"] in said
 
 
+def test_orbit_that_is_no_number_is_refused_with_the_word(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", "--orbit", "many"]) == 2
+    assert capsys.readouterr().err.endswith("unable to parse string as an integer, or 'auto'.\n")
+
+
 def test_only_numbers_have_bounds(capsys: pytest.CaptureFixture[str]) -> None:
     """Whether the bound itself is valid is as the help text says."""
     assert {name for name, option in OPTIONS.items() if option.bounds} == {name for name, _ in BEYOND}

@@ -17,6 +17,7 @@ import stamina
 
 from api.client import AsyncClient, Client, uploads
 from api.client.answers import ApiError, Event, Job, RequestError
+from api.client.inputs import camera_files, image_files
 from api.client.transport import TRIES
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
@@ -235,6 +236,40 @@ def test_plan_queues_nothing_and_rejects_bad_files(
         with pytest.raises(RequestError, match="contains no images"):
             client.submit(files["scene"], files["style"], cameras=files["cameras"], photos=tmp_path)
         assert [job.id for job in client.jobs()] == before
+
+
+@pytest.mark.parametrize(
+    ("present", "given", "sent"),
+    [
+        (["sparse/1/cameras.bin", "sparse/1/images.bin"], "", ["sparse/1/cameras.bin", "sparse/1/images.bin"]),
+        (["sparse/10/cameras.txt", "sparse/2/cameras.txt"], "", ["sparse/2/cameras.txt"]),
+        (["transforms_train.json", "transforms_test.json"], "", ["transforms_train.json"]),
+        (["cameras.json", "colmap/sparse/0/cameras.bin"], "", ["cameras.json"]),
+        (["colmap/sparse/0/cameras.bin"], "", ["colmap/sparse/0/cameras.bin"]),
+        (["cameras.bin", "images.bin"], "images.bin", ["cameras.bin", "images.bin"]),
+        (["views.JSON", "sparse/0/cameras.bin"], "views.JSON", ["views.JSON"]),
+        (["a.json", "dataparser_transforms.json"], "a.json", ["a.json", "dataparser_transforms.json"]),
+    ],
+)
+def test_cameras_are_found_as_on_the_command_line(
+    tmp_path: Path, present: list[str], given: str, sent: list[str]
+) -> None:
+    for name in present:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert camera_files(tmp_path / given) == [tmp_path / name for name in sent]
+
+
+def test_photos_of_all_formats_are_sent_except_hidden_files(tmp_path: Path) -> None:
+    for name in ("a.HEIC", "b.avif", "c.jpg", "._c.jpg", "notes.txt"):
+        (tmp_path / name).touch()
+    assert [name for _, name in image_files(tmp_path)] == ["a.HEIC", "b.avif", "c.jpg"]
+
+
+@pytest.mark.parametrize("find", [camera_files, image_files])
+def test_missing_folder_is_reported_as_missing(find: Callable[[Path], Any], tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match=r"missing: does not exist\. Check the path\."):
+        find(tmp_path / "missing")
 
 
 @pytest.mark.parametrize(

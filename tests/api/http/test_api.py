@@ -187,6 +187,35 @@ def test_invalid_parameters_are_rejected(client: httpx.Client, files: dict[str, 
     refused(client.post("/v1/jobs", files=form(files), data={"parameters": text}), 422, code)
 
 
+@pytest.mark.parametrize(
+    ("values", "at", "message"),
+    [
+        (
+            {"orbit": "many"},
+            "orbit",
+            "Input should be a valid integer, unable to parse string as an integer, or 'auto'",
+        ),
+        ({"refine": "autp"}, "refine", "Input should be a valid number, unable to parse string as a number, or 'auto'"),
+        ({"orbit": 0}, "orbit", "Input should be greater than or equal to 1"),
+        (
+            {"regions": [{"name": "a", "style": 3}]},
+            "regions.0.style",
+            "Input should be a valid string, or a valid list",
+        ),
+        ({"background": "red"}, "background", "'red' is not a color. Give black, white or three numbers from 0 to 255"),
+        ({"list[x]": 1}, "list[x]", "is not a parameter."),
+    ],
+)
+def test_value_of_several_types_gets_one_message(
+    client: httpx.Client, files: dict[str, bytes], values: dict[str, Any], at: str, message: str
+) -> None:
+    """The message lists the types, and names the parameter rather than one of its types."""
+    answer = client.post("/v1/jobs", files=form(files), data={"parameters": json.dumps(values)})
+    problem = refused(answer, 422, "invalid-request")
+    assert [error["at"] for error in problem["errors"]] == [at]
+    assert problem["detail"].startswith(f"{at}: {message}")
+
+
 def test_style_scale_beyond_image_limit_is_rejected(client: httpx.Client, files: dict[str, bytes]) -> None:
     line = form(files, style=png(5000, 1, zlib.compress(bytes(1 + 3 * 5000))))
     for where in ("/v1/jobs", "/v1/jobs?dry_run=true"):
