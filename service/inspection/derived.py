@@ -11,7 +11,8 @@ import json
 import shutil
 import tempfile
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
 from service.inspection.inspector import LEFTOVER_SECONDS, MEMORY_PER_BYTE, InspectionProcess, findings_of
+from service.inspection.lanes import Lanes
 from service.parameters import stored_parameters
 from service.settings import ServiceSettings
 from service.store import Store
@@ -63,11 +65,14 @@ class Blend:
 
 
 class DerivedFiles:
-    """Writer of files derived from results, one at a time; concurrent requests for the same file share one task."""
+    """Writer of files derived from results, one at a time; owners take turns.
+
+    Concurrent requests for the same file share one task.
+    """
 
     def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
-        self._process = InspectionProcess()
+        self._lanes = Lanes([InspectionProcess()])
         self._tasks: dict[tuple[str, str], asyncio.Task[None]] = {}
         self._folder = settings.folder / "packing"
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -82,7 +87,7 @@ class DerivedFiles:
             BusyError, NoSpaceError: If the result cannot be compressed now.
         """
         name = result_name(RESULT, format)
-        return await self._derived(job, name, lambda result: self._compress(job, result, name))
+        return await self._derived(job, name, lambda: self._compress(job, name))
 
     async def blended(self, job: JobRow, blend: Blend, quotas: Quotas) -> ArtifactRow:
         """Return a blend of a job's scene and results. The owner of the job must also own the others.
@@ -95,16 +100,16 @@ class DerivedFiles:
             QuotaError: If the blend exceeds the owner's quota of stored bytes.
             BusyError, NoSpaceError: If the results cannot be blended now.
         """
-        return await self._derived(job, blend.name, lambda result: self._blend(job, result, blend, quotas))
+        return await self._derived(job, blend.name, lambda: self._blend(job, blend, quotas))
 
-    async def _derived(self, job: JobRow, name: str, derive: Callable[[ArtifactRow], Awaitable[None]]) -> ArtifactRow:
+    async def _derived(self, job: JobRow, name: str, derive: Callable[[], Awaitable[None]]) -> ArtifactRow:
         """Return the database row of a derived file, which `derive` creates from the job's result if there is none."""
-        result = await asyncio.to_thread(self._result, job.id)
+        await asyncio.to_thread(self._result, job.id)
         row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
         if row is None:
             task = self._tasks.get((job.id, name))
             if task is None:
-                task = asyncio.ensure_future(derive(result))
+                task = asyncio.ensure_future(derive())
                 self._tasks[job.id, name] = task
                 task.add_done_callback(lambda done: self._tasks.pop((job.id, name), None))
             await asyncio.shield(task)
@@ -121,35 +126,33 @@ class DerivedFiles:
 
     # --- compressed formats ---------------------------------------------------------------------------------------
 
-    async def _compress(self, job: JobRow, result: ArtifactRow, name: str) -> None:
+    async def _compress(self, job: JobRow, name: str) -> None:
         """Compress the result, store the files, and make them visible."""
-        self._blobs.ensure_space(3 * result.size)
-        with tempfile.TemporaryDirectory(dir=self._folder) as given:
-            folder = Path(given)
+        async with self._turn(job) as (process, folder, result):
+            self._blobs.ensure_space(3 * result.size)
             staged = await asyncio.to_thread(self._stage, folder, job, [result])
             limits = {"name": name, "bytes": result.size + _HEADER_BYTES}  # a compressed scene is smaller
-            loss = await self._ask("compress", folder, job, replace(staged, scene=Path(RESULT)), limits, result.size)
+            request = self._request("compress", folder, job, replace(staged, scene=Path(RESULT)), limits, result.size)
             loss_file = folder / "loss.json"
-            loss_file.write_text(json.dumps(loss, indent=1) + "\n")
+            loss_file.write_text(json.dumps(findings_of(await process.ask(request)), indent=1) + "\n")
             files = {f"{name}.json": loss_file, name: folder / name}
             await asyncio.to_thread(self._publish, job, result, files)
 
     # --- blends ---------------------------------------------------------------------------------------------------
 
-    async def _blend(self, job: JobRow, result: ArtifactRow, blend: Blend, quotas: Quotas) -> None:
+    async def _blend(self, job: JobRow, blend: Blend, quotas: Quotas) -> None:
         """Blend the results, store the file, and make it visible."""
-        await asyncio.to_thread(self._check_count, job)
-        others = [await asyncio.to_thread(self._result, job_id) for job_id in blend.others]
-        scene = sum(entry["size"] for entry in job.inputs if entry["role"] == "scene")
-        size = scene + sum(row.size for row in (result, *others))
-        self._blobs.ensure_space(size + _BLEND_SIZE * result.size)
-        with tempfile.TemporaryDirectory(dir=self._folder) as given:
-            folder = Path(given)
+        async with self._turn(job) as (process, folder, result):
+            await asyncio.to_thread(self._check_count, job)
+            others = [await asyncio.to_thread(self._result, job_id) for job_id in blend.others]
+            scene = sum(entry["size"] for entry in job.inputs if entry["role"] == "scene")
+            size = scene + sum(row.size for row in (result, *others))
+            self._blobs.ensure_space(size + _BLEND_SIZE * result.size)
             staged = await asyncio.to_thread(self._stage, folder, job, [result, *others])
             parts = {RESULT: blend.weight, **{_staged_name(job, row): blend.others[row.job_id] for row in others}}
             file = f"blend{blend.format.suffix}"
             limits = {"name": file, "parts": parts, "bytes": _BLEND_SIZE * result.size + _HEADER_BYTES}
-            await self._ask("blend", folder, job, staged, limits, size)
+            findings_of(await process.ask(self._request("blend", folder, job, staged, limits, size)))
             await asyncio.to_thread(self._publish, job, result, {blend.name: folder / file}, quotas)
 
     def _check_count(self, job: JobRow) -> None:
@@ -157,6 +160,14 @@ class DerivedFiles:
             raise TooManyBlendsError(job.id, MOST_BLENDS)
 
     # --- both -----------------------------------------------------------------------------------------------------
+
+    @asynccontextmanager
+    async def _turn(self, job: JobRow) -> AsyncIterator[tuple[InspectionProcess, Path, ArtifactRow]]:
+        """Wait for the owner's turn, and provide the process, an empty folder, and the job's result."""
+        async with self._lanes.turn(job.owner) as process:
+            result = await asyncio.to_thread(self._result, job.id)  # the job may have been deleted meanwhile
+            with tempfile.TemporaryDirectory(dir=self._folder) as folder:
+                yield process, Path(folder), result
 
     def _stage(self, folder: Path, job: JobRow, results: list[ArtifactRow]) -> Staged:
         """Stage the job's inputs, with results beside them."""
@@ -166,11 +177,11 @@ class DerivedFiles:
             self._artifacts.fetch(result.location, folder / _staged_name(job, result), result.sha256)
         return staged
 
-    async def _ask(
+    def _request(
         self, work: str, folder: Path, job: JobRow, staged: Staged, limits: dict[str, Any], size: int
     ) -> dict[str, Any]:
-        """Return the findings of the inspecting process about scenes of `size` bytes in total."""
-        request = {
+        """Return a request to the inspecting process about scenes of `size` bytes in total."""
+        return {
             "work": work,
             "folder": str(folder),
             "staged": staged.as_json(),
@@ -179,7 +190,6 @@ class DerivedFiles:
             "seconds": self._settings.inspection_seconds + _SECONDS_PER_BYTE * size,
             "bytes": self._settings.inspection_bytes + MEMORY_PER_BYTE * size,
         }
-        return findings_of(await self._process.ask(request))
 
     def _publish(self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas = NO_QUOTAS) -> None:
         """Store files and make them visible.
@@ -199,7 +209,8 @@ class DerivedFiles:
 
     async def close(self) -> None:
         """Stop the process, which also aborts any work in progress."""
-        await self._process.close()
+        for process in self._lanes.slots:
+            await process.close()
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -1,0 +1,103 @@
+"""Tests of files derived from results: turns of owners, and the number of blends, while many are requested at once."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from service.errors import TooManyBlendsError
+from service.files.artifacts import Artifacts
+from service.files.blobs import BlobFolder
+from service.files.staging import RESULT
+from service.inspection.derived import MOST_BLENDS, Blend, DerivedFiles
+from service.settings import ServiceSettings
+from service.store import Store, open_store
+from service.store.jobs import NewJob
+from service.store.leases import Published
+from service.store.quotas import NO_QUOTAS
+from service.store.tables import JobRow
+from sgsst_core.files.formats.ply import PLY
+from tests.small_scenes import wall, write_files
+
+
+@dataclass
+class Stored:
+    """Store with the files of finished jobs."""
+
+    settings: ServiceSettings
+    store: Store
+    blobs: BlobFolder
+    artifacts: Artifacts
+
+    def finished(self, owner: str, folder: Path) -> JobRow:
+        """Return a finished job, whose scene is also its result."""
+        (folder / owner).mkdir()
+        files = dict(zip(("scene", "cameras", "style"), write_files(folder / owner, wall()), strict=True))
+        inputs = []
+        for role, path in files.items():
+            size, sha256 = path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest()
+            self.blobs.add(path, link=True)
+            inputs.append({"role": role, "name": path.name, "sha256": sha256, "size": size})
+        job, _ = self.store.jobs.create(NewJob(owner, "job", 0, {}, inputs), limit=1)
+        lease = self.store.leases.take("test")
+        assert lease is not None
+        result = self.artifacts.put(job.id, lease.epoch, RESULT, files["scene"])
+        self.store.leases.succeed(lease, [result], {})
+        return self.store.jobs.get(job.id, owner)
+
+    def derived(self) -> DerivedFiles:
+        return DerivedFiles(self.settings, self.store, self.blobs, self.artifacts)
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Iterator[Stored]:
+    settings = ServiceSettings(data=tmp_path / "data")
+    store = open_store(settings)
+    yield Stored(settings, store, BlobFolder(settings.folder, store.inputs, 0), Artifacts(settings.artifacts_url))
+    store.close()
+
+
+def test_blends_of_one_key_do_not_delay_another_key(stored: Stored, tmp_path: Path) -> None:
+    one, other = (stored.finished(owner, tmp_path) for owner in ("one", "other"))
+    order: list[str] = []
+
+    async def blend(derived: DerivedFiles, job: JobRow, weight: float) -> None:
+        await derived.blended(job, Blend(weight, {}, PLY), NO_QUOTAS)
+        order.append(job.owner)
+
+    async def blend_all() -> None:
+        derived = stored.derived()
+        try:
+            waiting = [asyncio.create_task(blend(derived, one, weight / 10)) for weight in range(1, 9)]
+            await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.gather(*waiting, blend(derived, other, 0.5))
+        finally:
+            await derived.close()
+
+    asyncio.run(blend_all())
+    assert order[-1] == "one"
+
+
+def test_parallel_blends_cannot_pass_their_limit(stored: Stored, tmp_path: Path) -> None:
+    job = stored.finished("one", tmp_path)
+    source = stored.store.jobs.artifact(job.id, RESULT)
+    assert source is not None
+    existing = [Published(f"blends/{index}.ply", f"nowhere/{index}", 0, "0" * 64) for index in range(MOST_BLENDS - 1)]
+    stored.store.jobs.add_derived(source, existing, "one")
+
+    async def blend_all() -> list[object]:
+        derived = stored.derived()
+        blends = [derived.blended(job, Blend(weight / 10, {}, PLY), NO_QUOTAS) for weight in range(1, 5)]
+        try:
+            return await asyncio.gather(*blends, return_exceptions=True)
+        finally:
+            await derived.close()
+
+    outcomes = asyncio.run(blend_all())
+    assert sum(isinstance(outcome, TooManyBlendsError) for outcome in outcomes) == 3
+    assert sum(row.name.startswith("blends/") for row in stored.store.jobs.artifacts(job.id)) == MOST_BLENDS
