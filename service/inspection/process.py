@@ -79,6 +79,9 @@ with contextlib.suppress(ImportError):
 _ready_at = time.time()
 #: Maximum size of a response in bytes.
 MAX_ANSWER = 64 << 20
+#: Maximum number of progress messages of one child that are passed on. The calling process keeps them until its client
+#: has read them.
+MAX_REPORTS = 10_000
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
 #: Rounding error of 1 minus weights that are rounded to thousandths.
@@ -423,11 +426,12 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
     os.close(writing)
     answer = None
     try:
-        for line in _lines(reading, time.monotonic() + 2 * request["seconds"]):
+        for number, line in enumerate(_lines(reading, time.monotonic() + 2 * request["seconds"])):
             if "planning" not in line:
                 answer = line
                 break
-            yield json.dumps(line).encode()
+            if number < MAX_REPORTS:
+                yield json.dumps(line).encode()
     finally:
         os.close(reading)
         os.kill(child, signal.SIGKILL)  # an exited child stays a zombie until waitpid, so its id is still valid
@@ -543,6 +547,7 @@ _TITLES = {
     "plan": "Planning the job",
     "compress": "Compressing the result",
     "blend": "Blending the results",
+    "video": "Rendering the video",
 }
 
 
@@ -579,6 +584,8 @@ def _is_response(answer: Any) -> bool:
         return False
     planning = answer.get("planning", {})
     if not isinstance(planning, dict) or (planning and planning.keys() != {"step", "total", "fraction", "eta_s"}):
+        return False
+    if not all(value is None or isinstance(value, int | float) for value in planning.values()):
         return False
     error = answer.get("error", {"code": "", "message": "", "input": None})
     if not isinstance(error, dict) or error.keys() != {"code", "message", "input"}:

@@ -12,7 +12,8 @@ from PIL import Image
 
 from service.errors import RefusedInputError
 from service.files.blobs import BlobFolder
-from service.inspection.inspector import Inspector
+from service.inspection.inspector import InspectionProcess, Inspector, Show
+from service.inspection.process import WORK
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -20,8 +21,8 @@ from sgsst_core.files.scene_file import write_scene
 from tests.small_scenes import wall, write_files
 
 
-def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, Any]:
-    """Inspect files with these limits in the settings, and return the findings."""
+def inspect(folder: Path, files: dict[str, Path], show: Show = lambda now: None, **limits: Any) -> dict[str, Any]:
+    """Inspect files with these limits in the settings, and return the findings; `show` receives progress."""
     settings = ServiceSettings(data=folder / "data", **limits)
     digests = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
     inputs = [
@@ -36,7 +37,7 @@ def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, An
         inspector = Inspector(settings, store, blobs)
         try:
             rows = store.inputs.blobs(sorted(digests.values()))
-            return await inspector.inspect("validate", "local", inputs, rows, JobParameters(backbone="auto"))
+            return await inspector.inspect("validate", "local", inputs, rows, JobParameters(backbone="auto"), show)
         finally:
             await inspector.close()
 
@@ -80,3 +81,16 @@ def test_large_scene_is_read_within_its_memory_limit(files: dict[str, Path], tmp
     assert files["scene"].stat().st_size > 250_000_000
     findings = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
     assert findings["gaussians"] == 1010**2
+
+
+def test_work_beyond_its_time_limit_is_refused(tmp_path: Path) -> None:
+    async def ask_all() -> dict[str, Any]:
+        process = InspectionProcess()
+        try:
+            return {work: await process.ask(request | {"work": work}) for work in WORK}
+        finally:
+            await process.close()
+
+    request = {"folder": str(tmp_path), "staged": {}, "parameters": {}, "limits": {}, "seconds": 0, "bytes": 0}
+    for work, answer in asyncio.run(ask_all()).items():
+        assert answer["error"]["code"] == "inspection-limit", work

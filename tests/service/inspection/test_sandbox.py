@@ -19,6 +19,7 @@ from service.errors import RefusedInputError
 from service.files.blobs import BlobFolder
 from service.inspection import inspector, sandbox
 from service.inspection.inspector import Inspector
+from service.inspection.process import MAX_REPORTS
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.service.inspection import attack
@@ -116,6 +117,17 @@ def test_landlock_alone_blocks_files_and_signals(
     assert "secret" not in reached["environment"].values()
 
 
+def forger(monkeypatch: pytest.MonkeyPatch, folder: Path, answer: str) -> Path:
+    """Write a scene that takes over its reader, sends an answer in the reader's place, and ends it."""
+    monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED)))
+    scene = folder / "attack" / "scene.ply"
+    scene.parent.mkdir()
+    write = f"os.write(descriptor, {answer.encode()!r} + bytes([10]))"
+    code = f"import os\nfor descriptor in range(16):\n    try: {write}\n    except OSError: pass\nos._exit(0)\n"
+    scene.write_text(f"# attack\n{code}")
+    return scene
+
+
 @pytest.mark.parametrize(
     "answer",
     [
@@ -126,24 +138,29 @@ def test_landlock_alone_blocks_files_and_signals(
         pytest.param('{"error": {}}', marks=pytest.mark.slow),
         pytest.param('{"error": {"code": 1, "message": [], "input": {}}}', marks=pytest.mark.slow),
         '{"findings": 7}',
+        '{"planning": {"step": "x", "total": [], "fraction": {}, "eta_s": null}}\n{"findings": {}}',
         '{"findings": {}}\n{"findings": {"gaussians": 7}}',
     ],
 )
 def test_forged_response_affects_only_its_own_request(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], answer: str
 ) -> None:
-    monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED)))
-    scene = tmp_path / "attack" / "scene.ply"
-    scene.parent.mkdir()
-    write = f"os.write(descriptor, {answer.encode()!r} + bytes([10]))"
-    code = f"import os\nfor descriptor in range(16):\n    try: {write}\n    except OSError: pass\nos._exit(0)\n"
-    scene.write_text(f"# attack\n{code}")
+    scene = forger(monkeypatch, tmp_path, answer)
     if answer.startswith('{"findings": {}}'):  # it may falsify the answer about its own files
         assert inspect(tmp_path, {**files, "scene": scene}) == {}
     else:
         with pytest.raises(RefusedInputError, match="breaks their reader"):
             inspect(tmp_path, {**files, "scene": scene})
     assert inspect(tmp_path, files)["gaussians"] == 616
+
+
+def test_flood_of_progress_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path]) -> None:
+    progress = {"step": 1, "total": 2, "fraction": 0.5, "eta_s": None}
+    flood = (json.dumps({"planning": progress}) + "\n") * (2 * MAX_REPORTS)
+    scene = forger(monkeypatch, tmp_path, flood + '{"findings": {}}')
+    shown: list[dict[str, Any]] = []
+    assert inspect(tmp_path, {**files, "scene": scene}, shown.append) == {}
+    assert shown == [progress] * MAX_REPORTS
 
 
 def test_missing_kernel_features_are_logged(
