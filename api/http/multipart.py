@@ -243,7 +243,7 @@ class _Form:
     def __init__(self, boundary: bytes, blobs: Blobs, settings: ServiceSettings, receipt: Receipt) -> None:
         self.received = Received()
         self._blobs, self._settings, self._receipt = blobs, settings, receipt
-        self._most_files = settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + MOST_REGIONS + 1
+        self._most_files = most_files(settings)
         self._header: tuple[bytearray, bytearray] = (bytearray(), bytearray())
         self._parts = 0
         self._headers: dict[bytes, bytes] = {}
@@ -358,6 +358,11 @@ class _Form:
 
     def _finished(self) -> None:
         self._done = True
+
+
+def most_files(settings: ServiceSettings) -> int:
+    """Return the maximum number of files of a job."""
+    return settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + MOST_REGIONS + 1
 
 
 def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSettings) -> None:

@@ -24,6 +24,7 @@ from api.http.multipart import (
     check_file,
     check_media_type,
     media_type,
+    most_files,
     parse_json,
     read_json,
     receive,
@@ -58,6 +59,7 @@ from service.errors import (
     RefusedInputError,
     RetryError,
     TooLargeError,
+    TooManyFilesError,
     UnfinishedUploadError,
     UnknownInputError,
     UnknownUploadError,
@@ -255,6 +257,8 @@ async def _from_json(request: Request, context: Context) -> Parts:
     styles = [job.style] if isinstance(job.style, str) else job.style
     named = [("scene", job.scene), *(("style", each) for each in styles)]
     named += [(role, each) for role in ("cameras", "photos", "mask") for each in getattr(job, role)]
+    if len(named) > (most := most_files(context.settings)):
+        raise TooManyFilesError(most, "files")
     uploads = [(index, *each) for index, each in enumerate(named)]
     return Received(uploads=uploads), job.parameters, job.webhook
 

@@ -28,6 +28,7 @@ from PIL import Image, ImageCms, PngImagePlugin
 
 from api.cli.options import kind_of
 from api.http.connection import MAX_HEAD_BYTES, MAX_HEADERS
+from service.examples import SHARE_ID, UPLOAD_ID
 from service.files.artifacts import Artifacts
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
@@ -769,6 +770,9 @@ def test_too_many_parts_are_rejected(client: httpx.Client, files: Files) -> None
     refused(post(client, named * 20_000 + END), 422, "too-many-files")
     empty = part('Content-Disposition: form-data; name="photos"', b"")
     refused(post(client, empty * 20_000 + END), 422, "too-many-files")
+    for role in ("photos", "mask"):
+        job = {"scene": UPLOAD_ID, "style": UPLOAD_ID, role: [UPLOAD_ID] * 1000}
+        refused(client.post("/v1/jobs", json=job), 422, "too-many-files")
 
 
 def test_endless_part_header_is_rejected(client: httpx.Client) -> None:
@@ -1053,12 +1057,18 @@ def test_other_keys_ids_are_not_found(client: httpx.Client, service: Service, st
         job_id = me.post("/v1/jobs", files=form(files)).json()["id"]
         where = begin(me, 5)
         nothing = refused(you.get("/v1/jobs/job_0000000000000000000000000000000"), 404, "not-found")
-        for method, path in (
-            ("GET", ""), ("POST", "/cancel"), ("POST", "/retry"), ("DELETE", ""), ("GET", "/events"),
-            ("GET", "/artifacts"), ("GET", "/artifacts/stylized.ply"),
+        for method, path, body in (
+            ("GET", "", None), ("POST", "/finish", None), ("POST", "/cancel", None), ("POST", "/retry", None),
+            ("DELETE", "", None), ("PATCH", "", {"name": "x"}), ("GET", "/events", None), ("GET", "/progress", None),
+            ("GET", "/inputs", None), ("GET", "/inputs/scene", None), ("GET", "/artifacts", None),
+            ("GET", "/artifacts/stylized.ply", None), ("GET", "/artifacts/stylized.ply?format=spz", None),
+            ("GET", "/artifacts/live/colors.f16", None), ("POST", "/blends", {"weight": 0.5}), ("POST", "/video", {}),
+            ("GET", "/shares", None), ("POST", "/shares", {}), ("DELETE", f"/shares/{SHARE_ID}", None),
         ):  # fmt: skip
-            problem = refused(you.request(method, f"/v1/jobs/{job_id}{path}"), 404, "not-found")
+            problem = refused(you.request(method, f"/v1/jobs/{job_id}{path}", json=body), 404, "not-found")
             assert problem["detail"].replace(job_id, "") == nothing["detail"].replace("job_" + "0" * 31, "")
+        reference = {"scene": f"/v1/jobs/{job_id}/inputs/scene", "style": f"/v1/jobs/{job_id}/inputs/style"}
+        refused(you.post("/v1/jobs", json=reference), 422, "unknown-input")
         for method in ("GET", "DELETE"):
             refused(you.request(method, where, headers=TUS), 404, "not-found")
         assert you.head(where, headers=TUS).status_code == 404
