@@ -33,17 +33,18 @@ class SignIns:
         self._clock = clock
         self._failures: OrderedDict[str, deque[float]] = OrderedDict()
 
-    def check(self, address: str) -> None:
-        """Raise TooManyTriesError if an address has failed too often recently."""
-        failures = self._failures.get(address)
-        if failures is not None and len(failures) == MOST_FAILURES:
+    def attempt(self, address: str) -> None:
+        """Count an attempt as failed until `succeeded` is called, so that parallel attempts cannot pass the limit.
+
+        Raises:
+            TooManyTriesError: If the address has failed too often recently.
+        """
+        failures = self._failures.setdefault(address, deque(maxlen=MOST_FAILURES))
+        if len(failures) == MOST_FAILURES:
             left = failures[0] + WITHIN_SECONDS - self._clock()
             if left > 0:
                 raise TooManyTriesError(retry_after=int(left) + 1)
-
-    def failed(self, address: str) -> None:
-        """Record a failed attempt."""
-        self._failures.setdefault(address, deque(maxlen=MOST_FAILURES)).append(self._clock())
+        failures.append(self._clock())
         self._failures.move_to_end(address)
         if len(self._failures) > _MOST_ADDRESSES:
             self._failures.popitem(last=False)

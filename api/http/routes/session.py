@@ -65,10 +65,9 @@ async def sign_in(request: Request, context: ContextDep) -> Response:
     check_media_type(request, "application/json")
     sign_in = SignIn.model_validate(await read_json(request, context.settings, _MAX_BODY))
     address = request.client.host if request.client else ""
-    context.sign_ins.check(address)
+    context.sign_ins.attempt(address)
     key = await asyncio.to_thread(context.store.keys.find, sign_in.key)
     if key is None:
-        context.sign_ins.failed(address)
         raise UnknownKeyError
     context.sign_ins.succeeded(address)
     await _end(request, context)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import sqlite3
 from collections.abc import Iterator
 from http.cookies import Morsel, SimpleCookie
@@ -299,6 +300,18 @@ def test_failed_sign_ins_are_limited_temporarily(tmp_path: Path) -> None:
         store.close()
 
 
+def test_parallel_sign_ins_cannot_pass_the_limit(tmp_path: Path) -> None:
+    with Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service:
+
+        async def guess() -> list[int]:
+            async with httpx.AsyncClient(base_url=service.url, timeout=60) as browser:
+                guesses = [browser.post("/v1/session", json={"key": f"sgsst_{each}"}) for each in range(60)]
+                return [answer.status_code for answer in await asyncio.gather(*guesses)]
+
+        statuses = asyncio.run(guess())
+    assert (statuses.count(401), statuses.count(429)) == (MOST_FAILURES, 60 - MOST_FAILURES)
+
+
 @pytest.mark.parametrize("trusted", ["", "10.0.0.0/8", "127.0.0.1"])
 def test_only_trusted_proxy_sets_client_address(tmp_path: Path, trusted: str) -> None:
     """If any local client were trusted, it could invent an address for each attempt."""
@@ -316,17 +329,15 @@ def test_sign_in_failures_expire() -> None:
     now = 0.0
     tries = SignIns(lambda: now)
     for _ in range(MOST_FAILURES):
-        tries.check("a")
-        tries.failed("a")
+        tries.attempt("a")
     with pytest.raises(TooManyTriesError):
-        tries.check("a")
-    tries.check("b")
+        tries.attempt("a")
+    tries.attempt("b")
     now = WITHIN_SECONDS
-    tries.check("a")
+    tries.attempt("a")
     tries.succeeded("a")
     for _ in range(MOST_FAILURES):
-        tries.check("a")
-        tries.failed("a")
+        tries.attempt("a")
 
 
 def test_session_expires(tmp_path: Path) -> None:
