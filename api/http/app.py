@@ -20,7 +20,7 @@ from api.http.documentation import complete
 from api.http.fetching import Fetcher
 from api.http.hub import Hub
 from api.http.metrics import Metrics
-from api.http.problems import METHODS, Problem, add_handlers
+from api.http.problems import METHODS, Problem, add_handlers, logged_path, route_of
 from api.http.rates import Rates
 from api.http.readiness import Readiness
 from api.http.receipts import Receipts
@@ -44,9 +44,6 @@ from service.weights import check_weights
 _THREADS = 40
 #: Seconds that a request waits for a locked database, and for each response of the database server.
 _ANSWER_SECONDS = 8.0
-
-#: Start of paths that contain the token of a share.
-_SHARED = "/v1/shared/"
 
 _access = logging.getLogger("api.access")
 
@@ -152,11 +149,10 @@ class Observed:
         await self._app(scope, receive, observed)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        route = getattr(scope.get("route"), "path", "(none)")
+        route = route_of(scope)
         method = scope["method"] if scope["method"] in METHODS else "(other)"
         self._state.context.metrics.observe(method, route, status, seconds)
-        path = route if scope["path"].startswith(_SHARED) else scope["path"]  # logs must not contain tokens
-        extra = {"method": scope["method"], "path": path, "status": status, "seconds": round(seconds, 4)}
+        extra = {"method": scope["method"], "path": logged_path(scope), "status": status, "seconds": round(seconds, 4)}
         _access.info("request", extra=extra)
 
 

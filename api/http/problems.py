@@ -13,6 +13,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
+from starlette.types import Scope
 
 from service.errors import ServiceError
 from service.parameters import JobParameters
@@ -24,6 +25,8 @@ MEDIA_TYPE = "application/problem+json"
 #: Names of statuses that HTTPStatus lacks; 460 is defined by the tus protocol.
 _TITLES = {460: "Checksum Mismatch"}
 METHODS = ("GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS")
+#: Start of paths that contain the token of a share.
+_SHARED = "/v1/shared/"
 #: Maximum number of characters of an input that a problem document quotes.
 _SHOWN = 100
 
@@ -169,5 +172,16 @@ async def _system_error(request: Request, error: Exception) -> JSONResponse:
 
 
 async def _unexpected(request: Request, error: Exception) -> JSONResponse:
-    _log.exception("%s %s failed unexpectedly", request.method, request.url.path, exc_info=error)
+    _log.exception("%s %s failed unexpectedly", request.method, logged_path(request.scope), exc_info=error)
     return from_service(InternalError())
+
+
+def route_of(scope: Scope) -> str:
+    """Return the path of the route that answers a request, with the names of its parameters."""
+    return getattr(scope.get("route"), "path", "(none)")
+
+
+def logged_path(scope: Scope) -> str:
+    """Return the path of a request for the log; that of its route if the path contains a secret token."""
+    path: str = scope["path"]
+    return route_of(scope) if path.startswith(_SHARED) else path

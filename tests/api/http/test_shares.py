@@ -257,13 +257,19 @@ def test_only_results_of_ones_own_can_be_shared(
 def test_stored_digest_is_no_token_and_logs_contain_none(
     service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    view, token = share(me, finished(me, service, store, files, tmp_path))
+    job_id = finished(me, service, store, files, tmp_path)
+    view, token = share(me, job_id)
     with store.database.reading() as session:
         row = session.get_one(ShareRow, view["id"])
     assert token.partition(".")[2] not in (row.id, row.sha256)
     assert_missing(visitor.get(f"/v1/shared/{row.id}.{row.sha256[:43]}"))
     assert visitor.get(f"/v1/shared/{token}/scene").status_code == 200
     assert visitor.get(f"/v1/shared/{token}/a/b").status_code == 404
+    (result,) = (service.data / "artifacts" / job_id).rglob("colors.f16")
+    result.unlink()
+    result.mkdir()  # which cannot be read as a file
+    assert visitor.get(f"/v1/shared/{token}/colors.f16").status_code == 500
+    assert "/v1/shared/{token}/{name} failed unexpectedly" in service.log.read_text()
     assert token.partition(".")[2] not in service.log.read_text()
 
 
