@@ -337,6 +337,8 @@ class _FileWriter:
             self._file = path.open("r+b", buffering=0)
         except FileNotFoundError:
             raise LostUploadError(upload.id) from None
+        except PermissionError:  # another request is turning the file into a blob, which is read-only
+            raise LockedError from None
         try:
             _lock(self._file)
             # read the row again: no other writer changes it while the lock is held

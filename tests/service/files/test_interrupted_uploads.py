@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import signal
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
 import pytest
 
+from service.errors import LockedError
 from service.files.blobs import BlobFolder
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -17,6 +22,8 @@ from tests.api.service import Service
 from tests.small_scenes import wall, write_files
 
 TUS = {"Tus-Resumable": "1.0.0"}
+#: User id without rights.
+_NOBODY = 65534
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +98,31 @@ def test_missing_bytes_are_not_read_as_zeros(files: dict[str, Path], tmp_path: P
         part.unlink()
         answer = append(service, where, files["scene"].stat().st_size - 1, b"x")
         assert (answer.status_code, answer.json()["code"]) == (404, "not-found")
+
+
+@contextmanager
+def unprivileged() -> Iterator[None]:
+    """Run the block without the rights of root, which may write to read-only files."""
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(_NOBODY)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+
+
+def test_upload_that_becomes_a_blob_is_locked(tmp_path: Path) -> None:
+    store = open_store(ServiceSettings(data=tmp_path))
+    with tempfile.TemporaryDirectory() as folder:  # other users may not enter `tmp_path`
+        Path(folder).chmod(0o755)
+        blobs = BlobFolder(Path(folder), store.inputs, 0)
+        row = store.inputs.create_upload("me", 5, "scene.ply", "", 3600)
+        blobs.start_upload(row.id)
+        blobs.upload_path(row.id).chmod(0o400)
+        with unprivileged(), pytest.raises(LockedError):
+            blobs.append(row, 3600)
+    store.close()
 
 
 @pytest.mark.parametrize("killed", [False, True])
