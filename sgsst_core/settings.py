@@ -113,6 +113,10 @@ Color = Annotated[
 ]
 
 
+#: Annotation of a content weight that accepts a style strength as text.
+OR_STRENGTH = _OrText(lambda text: STRENGTHS.get(text, text), {"enum": list(STRENGTHS)})
+
+
 class Settings(BaseModel):
     """Everything that determines a result, apart from scene, cameras, style and photos.
 
@@ -138,7 +142,7 @@ class Settings(BaseModel):
     )
     content_weight: Annotated[
         float,
-        _OrText(lambda text: STRENGTHS.get(text, text), {"enum": list(STRENGTHS)}),
+        OR_STRENGTH,
         Option(
             unit="factor or strength",
             metavar="W",

@@ -131,7 +131,9 @@ def read_regions(
 
     # Only one rank selects: mask votes depend on renders, which different processors may round differently.
     return collectives.broadcast(
-        lambda: select_regions(request.regions, file, cameras, near, load, settings.sh_attenuation)
+        lambda: select_regions(
+            request.regions, file, cameras, near, load, settings.sh_attenuation, settings.content_weight
+        )
     )
 
 

@@ -22,7 +22,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.settings import checked
+from sgsst_core.option_parsers import parse_strength
+from sgsst_core.settings import OR_STRENGTH, checked
 from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style
 
 #: Name of the region of all Gaussians that no selection contains.
@@ -66,6 +67,7 @@ class RegionRequest:
         styles: Images of the region's style; empty for the job's style.
         weight: Weight of the region's style in the loss.
         freeze: Whether the colors of its Gaussians stay unchanged.
+        content_weight: Weight of the content term in the region; None for that of the job.
     """
 
     name: str
@@ -73,6 +75,7 @@ class RegionRequest:
     styles: tuple[StyleFile, ...] = ()
     weight: float = 1.0
     freeze: bool = False
+    content_weight: float | None = None
 
 
 class RegionOptions(BaseModel):
@@ -111,6 +114,12 @@ class RegionOptions(BaseModel):
         1.0, gt=0, le=1e12, allow_inf_nan=False, description="Weight of the region's style in the loss."
     )
     freeze: bool = Field(False, description="Freeze the region: its colors stay bit-identical.")
+    content_weight: Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False), OR_STRENGTH] | None = Field(
+        None,
+        description="Weight of the content term in the region, or a style strength: light, balanced or strong. "
+        "Default: the job's.",
+        examples=["balanced"],
+    )
 
     @property
     def style_texts(self) -> list[str]:
@@ -128,7 +137,7 @@ class RegionOptions(BaseModel):
         """
         selection = None if self.select is None else parse_selection(self.select, f"region {self.name}")
         styles = tuple(parse_style(text, exists) for text in self.style_texts)
-        return RegionRequest(self.name, selection, styles, self.weight, self.freeze)
+        return RegionRequest(self.name, selection, styles, self.weight, self.freeze, self.content_weight)
 
 
 def parse_selection(text: str, where: str) -> Selection:
@@ -181,7 +190,11 @@ def _number(text: str, whole: str, where: str) -> float:
 
 
 def region_options(
-    regions: Sequence[str], styles: Sequence[str], weights: Sequence[str], frozen: Sequence[str]
+    regions: Sequence[str],
+    styles: Sequence[str],
+    weights: Sequence[str],
+    frozen: Sequence[str],
+    content_weights: Sequence[str] = (),
 ) -> tuple[RegionOptions, ...]:
     """Parse the region options of the command line.
 
@@ -190,6 +203,7 @@ def region_options(
         styles: Texts `NAME=FILE[:WEIGHT]`; several styles of one region are mixed.
         weights: Texts `NAME=WEIGHT`.
         frozen: Names of regions whose colors stay unchanged.
+        content_weights: Texts `NAME=WEIGHT`, where the weight may be a style strength.
 
     Raises:
         SettingsError: If a text is malformed, a name is used twice, or a region is unknown.
@@ -223,9 +237,23 @@ def region_options(
         if not 0 < weight <= 1e12:
             raise SettingsError(f"--region-weight {text}: the weight must be greater than 0 and at most 1e12.")
         by_name[name] = region.model_copy(update={"weight": weight})
+    for text in content_weights:
+        name, _, value = text.partition("=")
+        region = known(name, f"--region-content-weight {text}")
+        by_name[name] = region.model_copy(update={"content_weight": _content_weight(value, text)})
     for name in frozen:
         by_name[name] = known(name, f"--region-freeze {name}").model_copy(update={"freeze": True})
     return tuple(by_name.values())
+
+
+def _content_weight(value: str, text: str) -> float:
+    try:
+        weight = parse_strength(value)
+    except ValueError as error:
+        raise SettingsError(f"--region-content-weight {text}: {error}") from error
+    if not 0 <= weight <= 1e12:
+        raise SettingsError(f"--region-content-weight {text}: the weight must be at least 0 and at most 1e12.")
+    return weight
 
 
 def region_requests(
@@ -249,7 +277,7 @@ def region_requests(
         if (region.name == REST) != (region.selection is None):
             why = "needs a SPEC" if region.name != REST else "is what no other region selects, and takes no SPEC"
             raise SettingsError(f"Region {region.name!r} {why}. {_HOW}")
-        if region.freeze and (region.styles or region.weight != 1):
+        if region.freeze and (region.styles or region.weight != 1 or region.content_weight is not None):
             raise SettingsError(
                 f"Region {region.name!r} is frozen, so it cannot have a style or weight. Remove one or the other."
             )

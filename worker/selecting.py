@@ -30,6 +30,7 @@ def select_regions(
     near: float,
     load: Callable[[Sequence[StyleFile]], Style],
     sh_attenuation: float = 0.0,
+    content_weight: float = 1.0,
 ) -> Regions | None:
     """Return the requested regions of a scene, or None if none are requested.
 
@@ -42,10 +43,11 @@ def select_regions(
         near: Near plane in world units.
         load: Function that reads the images of a style.
         sh_attenuation: SH attenuation of the job, 0 to 1.
+        content_weight: Content weight of the job.
 
     Raises:
-        InvalidInputError: If a file cannot be used, if every Gaussian is frozen, or if some are frozen although the
-            job has an SH attenuation, which would change them.
+        InvalidInputError: If a file cannot be used, or the regions contradict each other or the job; see
+            `check_regions`.
     """
     if not requests:
         return None
@@ -54,15 +56,23 @@ def select_regions(
     for request in requests:
         style = load(request.styles) if request.styles else None
         if request.selection is None:
-            every[0] = Region(REST, "", style, request.weight, request.freeze)
+            every[0] = Region(REST, "", style, request.weight, request.freeze, content_weight=request.content_weight)
             continue
         own = select(request.selection, file, cameras, near)
         labels[own] = len(every)
         every.append(
-            Region(request.name, request.selection.text, style, request.weight, request.freeze, int(own.sum()))
+            Region(
+                request.name,
+                request.selection.text,
+                style,
+                request.weight,
+                request.freeze,
+                int(own.sum()),
+                request.content_weight,
+            )
         )
     regions = Regions(tuple(every), labels)
-    check_regions(regions, sh_attenuation)
+    check_regions(regions, sh_attenuation, content_weight)
     return regions
 
 

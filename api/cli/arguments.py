@@ -72,6 +72,14 @@ class JobInputs:
         ),
     ] = None
 
+    region_content_weight: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=W",
+            help="Weight of the content term in a region: a number, light, balanced or strong. [default: the job's]",
+        ),
+    ] = None
+
     @property
     def regions(self) -> tuple[RegionOptions, ...]:
         """Regions of the job.
@@ -80,7 +88,11 @@ class JobInputs:
             SettingsError: If an option of a region is malformed.
         """
         return region_options(
-            self.region or (), self.region_style or (), self.region_weight or (), self.region_freeze or ()
+            self.region or (),
+            self.region_style or (),
+            self.region_weight or (),
+            self.region_freeze or (),
+            self.region_content_weight or (),
         )
 
     def request(self, options: StylizeOptions, out: Path, *, resume: bool = False) -> StylizeRequest:

@@ -32,6 +32,7 @@ export class RegionList {
     const name = h("input", { type: "text", placeholder: "face", pattern: "[A-Za-z][A-Za-z0-9_\\-]{0,31}", autocomplete: "off" });
     const select = h("input", { type: "text", placeholder: "sphere=0,1.4,0,0.3", autocomplete: "off" });
     const weight = h("input", { type: "number", min: 0, step: "any", value: "1" });
+    const strength = h("input", { type: "text", placeholder: say.ownStyle, autocomplete: "off" });
     const style = h("select"), freeze = h("input", { type: "checkbox" });
     const setStyles = (/** @type {string[]} */ names) => {
       const before = style.value;
@@ -42,7 +43,7 @@ export class RegionList {
     /** @type {Mask | null} */
     let mask = null;
     const text = () => (mask ? `mask=${name.value.trim()}.bin` : select.value.trim());
-    const value = () => ({ name: name.value.trim(), ...(text() ? { select: text() } : {}), ...(freeze.checked || weight.value === "1" ? {} : { weight: Number(weight.value) }), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(freeze.checked ? { freeze: true } : {}) });
+    const value = () => ({ name: name.value.trim(), ...(text() ? { select: text() } : {}), ...(freeze.checked || weight.value === "1" ? {} : { weight: Number(weight.value) }), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(strength.value.trim() && !freeze.checked ? { content_weight: Number.isNaN(Number(strength.value)) ? strength.value.trim() : Number(strength.value) } : {}), ...(freeze.checked ? { freeze: true } : {}) });
     const selectField = field(say.regionSelect, select), picked = h("span");
     const pick = h("button.quiet.small", { type: "button", hidden: !this.select, onclick: () => this.select?.(row) });
     const drop = h("button.quiet.small", { type: "button", onclick: () => setMask(null) }, hand.forget);
@@ -55,9 +56,9 @@ export class RegionList {
       picked.textContent = mask ? hand.made(mask.total) : "";
     };
     setMask(null);
-    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field(say.regionName, name), selectField, handmade, field(say.style, style), field(hand.weight, weight), h("label.check", freeze, h("span", say.freeze)));
+    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field(say.regionName, name), selectField, handmade, field(say.style, style), field(hand.weight, weight), field(words.options.titles.content_weight, strength), h("label.check", freeze, h("span", say.freeze)));
     const error = h("p.wrong", { id: newId(), hidden: true });
-    const inputs = /** @type {Record<string, any>} */ ({ name, select, style, weight, freeze });
+    const inputs = /** @type {Record<string, any>} */ ({ name, select, style, weight, content_weight: strength, freeze });
     for (const input of Object.values(inputs)) input.setAttribute("aria-describedby", error.id);
     const wrong = (/** @type {string} */ text, field = "select") => {
       for (const input of Object.values(inputs)) showWrong(input, error, "");
@@ -67,6 +68,7 @@ export class RegionList {
       [name.value, select.value, style.value] = [region.name, region.select ?? "", region.style ?? ""];
       freeze.checked = !!region.freeze;
       weight.value = String(region.weight ?? 1);
+      strength.value = String(region.content_weight ?? "");
       setMask(region.mask ?? null);
       if (mask) select.value = "";
     };

@@ -1,4 +1,11 @@
-"""Content term: lambda_c mean((F_42 - F_42^content)^2), the mean weighted by coverage."""
+"""Content term: lambda_c mean((F_42 - F_42^content)^2), the mean weighted by coverage.
+
+If the content weight differs between regions, the squared difference of position p counts v_p <= 1 times, where
+lambda_c v_p is the blended content weight of the Gaussians there. The sum is still divided by the coverage, so a
+position counts as much as with that weight everywhere:
+
+    lambda_c sum_p v_p |F_42 - F_42^content|_p^2 / (c sum_p a_p)
+"""
 
 from __future__ import annotations
 
@@ -81,7 +88,7 @@ class ContentTerm(PositionTerm):
     Attributes:
         view: Scale of the view.
         content: Content features.
-        coverage: Position weights.
+        position_weights: Coverage, or v.
         factor: Result of `content_factor`.
     """
 
@@ -90,7 +97,7 @@ class ContentTerm(PositionTerm):
 
     view: ScaledView
     content: ContentFeatures
-    coverage: PositionWeights
+    position_weights: PositionWeights
     factor: Tensor
 
     @staticmethod
@@ -105,7 +112,8 @@ class ContentTerm(PositionTerm):
             return None
         count = inputs.view.count(CONTENT_LAYER, inputs.coverage)
         factor = content_factor(count, inputs.network.channels(CONTENT_LAYER), inputs.objective.content_weight)
-        return cls(inputs.view, inputs.content, inputs.coverage, factor)
+        weights = inputs.coverage if inputs.content_weights is None else inputs.content_weights
+        return cls(inputs.view, inputs.content, weights, factor)
 
     def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
         """Return the contribution of the cells that a tile owns, float64 scalar."""
@@ -119,7 +127,7 @@ class ContentTerm(PositionTerm):
 
     def _difference(self, tile: PartitionTile, features: Tensor) -> ContentDifference:
         in_view, in_tile = tile.owned_cells(CONTENT_LAYER, self.view.size)
-        weights = self.view.weights(CONTENT_LAYER, in_view, self.coverage)
+        weights = self.view.weights(CONTENT_LAYER, in_view, self.position_weights)
         return ContentDifference.of(features[in_tile.slices], self.content[tile], self.factor, weights)
 
     @staticmethod
@@ -128,7 +136,8 @@ class ContentTerm(PositionTerm):
         if inputs.content is None or not inputs.objective.content_weight:
             return None
         difference = inputs.features[CONTENT_LAYER] - inputs.content[CONTENT_LAYER]
-        weights = inputs.coverage(CONTENT_LAYER)
-        a = torch.ones(difference.shape[:2], dtype=torch.float64) if weights is None else weights
-        mean = (a[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
+        coverage, own = inputs.coverage(CONTENT_LAYER), inputs.content_weights(CONTENT_LAYER)
+        a = torch.ones(difference.shape[:2], dtype=torch.float64) if coverage is None else coverage
+        v = a if own is None else own
+        mean = (v[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
         return inputs.objective.content_weight * mean

@@ -62,6 +62,7 @@ class _Key:
     tiles: tuple[tuple[int, PartitionTile], ...]
     coverage: tuple[int, ...] | None
     regions: int
+    content_weights: bool
     style: int
 
 
@@ -172,7 +173,9 @@ class LossGraphs:
             return None
         coverage = tuple(view.coverage[0].shape) if view.coverage else None
         regions = len(view.regions or ())
-        return _Key(tuple(image.shape), image.dtype, tiles, coverage, regions, id(style))
+        return _Key(
+            tuple(image.shape), image.dtype, tiles, coverage, regions, view.content_weights is not None, id(style)
+        )
 
     def _captured(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph | None:
         """Capture, cache and return the graph for a key; return None if capturing fails."""
@@ -224,8 +227,12 @@ class LossGraphs:
             [self._static_tensor(("region", number, k), level) for k, level in enumerate(pyramid)]
             for number, pyramid in enumerate(view.regions)
         ]
-        tiles = {scale: [tile] for scale, tile in key.tiles}
-        return self._static_tensor("image", image), ViewTarget(None, content, coverage, Division({}, tiles), regions)
+        content_weights = view.content_weights and [
+            self._static_tensor(("content weights", k), level) for k, level in enumerate(view.content_weights)
+        ]
+        division = Division({}, {scale: [tile] for scale, tile in key.tiles})
+        static_view = ViewTarget(None, content, coverage, division, regions, content_weights)
+        return self._static_tensor("image", image), static_view
 
     def _static_tensor(self, name: object, like: Tensor) -> Tensor:
         """Return a tensor at a fixed address. Graphs share it if its name, shape, layout and dtype are the same."""
@@ -239,4 +246,4 @@ def _inputs(image: Tensor, view: ViewTarget, scales: Sequence[int]) -> list[Tens
     """Return all input tensors whose values may differ between evaluations with the same key, in a fixed order."""
     features = [tile for scale in scales if scale in view.content for tile in view.content[scale].values()]
     regions = [level for pyramid in view.regions or [] for level in pyramid]
-    return [image, *features, *(view.coverage or []), *regions]
+    return [image, *features, *(view.coverage or []), *regions, *(view.content_weights or [])]

@@ -97,6 +97,7 @@ class TermInputs:
         regions: Regions with their styles; a single one for the whole view if the scene has no regions.
         content: Content features; None without a content term.
         coverage: Position weights of terms that do not depend on the style.
+        content_weights: Position weights of the content term, relative to its weight; None for `coverage`.
         timer: Timer of this evaluation.
     """
 
@@ -106,6 +107,7 @@ class TermInputs:
     regions: Sequence[StyledRegion]
     content: ContentFeatures | None
     coverage: PositionWeights
+    content_weights: PositionWeights
     timer: Timer
 
 
@@ -128,6 +130,7 @@ class ReferenceInputs:
         regions: Regions with their styles.
         content: Features of the content image; None without a content term.
         coverage: Function that returns the position weights [h, w] of a layer; None for equal weights.
+        content_weights: The same for the position weights of the content term; None for `coverage`.
     """
 
     weights: BackboneWeights
@@ -136,6 +139,7 @@ class ReferenceInputs:
     regions: Sequence[RegionReference]
     content: Mapping[str, Tensor] | None
     coverage: Callable[[str], Tensor | None]
+    content_weights: Callable[[str], Tensor | None]
 
 
 class PositionTerm(ABC):

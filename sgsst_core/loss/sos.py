@@ -197,6 +197,7 @@ class SosLoss:
             _styled_regions(style, view),
             self._content(view, scaled.scale, tiles),
             view.coverage,
+            view.content_weights,
             self.timer,
         )
         terms = [term.of(inputs) for term in POSITION_TERMS]
@@ -308,6 +309,7 @@ def make_loss(
     settings: Settings,
     memory: int,
     *,
+    content_weight: float | None = None,
     timer: Timer | None = None,
     collectives: Collectives = ALONE,
 ) -> SosLoss:
@@ -317,12 +319,13 @@ def make_loss(
         network: Feature network.
         settings: Settings of the job.
         memory: Memory budget for activations in bytes.
+        content_weight: Largest content weight of a region; None for that of the settings.
         timer: Timer; see `SosLoss`.
         collectives: Collectives; see `SosLoss`.
     """
     return SosLoss(
         network,
-        content_weight=settings.content_weight,
+        content_weight=settings.content_weight if content_weight is None else content_weight,
         style_loss=settings.style_loss,
         memory=memory,
         coarsest=settings.coarsest_side,

@@ -105,6 +105,7 @@ def sos_reference(
     *,
     content_weight: float = 1.0,
     coverage: Tensor | None = None,
+    content_weights: Tensor | None = None,
     style_loss: StyleLossName = "sos",
     coarsest: int = COARSEST_SHORTER_SIDE,
     scales: Sequence[float] = (),
@@ -118,6 +119,7 @@ def sos_reference(
         content: [H, W, 3] in 0..1; None for no content term.
         content_weight: lambda_c.
         coverage: [H, W] position weights; None for equal weights.
+        content_weights: [H, W] position weights of the content term relative to `content_weight`; None for `coverage`.
         style_loss: Style loss; see `terms`. If it matches features, the style may have at most
             `nearest.MOST_VECTORS` positions.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
@@ -142,6 +144,7 @@ def sos_reference(
             ],
             None if content is None else _scaled(network_weights, content, side),
             _cells(coverage, side),
+            _cells(content_weights, side),
         )
         values = [_statistics_terms(inputs), *(term.reference(inputs) for term in POSITION_TERMS)]
         total = total + factor * sum(value for value in values if value is not None)

@@ -146,6 +146,8 @@ class ViewTarget:
         division: Division of work for which the content was prepared; None to divide the work in every evaluation.
         regions: Position weights of each region (its fraction of the blend weights), in the format of `coverage` and
             the order of the style targets. None if the scene has no regions.
+        content_weights: Content weight of each position relative to the loss's, in 0..1 and the format of `coverage`,
+            which it replaces in the content term; None for the same weight everywhere.
         background: Color of the pixels that no rank renders, because no Gaussian covers them.
     """
 
@@ -154,4 +156,5 @@ class ViewTarget:
     coverage: list[Tensor] | None = None
     division: Division | None = None
     regions: list[list[Tensor]] | None = None
+    content_weights: list[Tensor] | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)

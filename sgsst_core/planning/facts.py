@@ -226,7 +226,7 @@ class Probe:
         launches: Cost of launching a view's loss on a GPU; None on a CPU, or if no decision depends on it.
         styles: Number of images in the style mixture.
         frozen: [N] bool, frozen Gaussians; None if there are none.
-        maps: Number of regions whose maps are rendered in each view.
+        maps: Number of maps of regions, and of content weights, that are rendered in each view.
     """
 
     scene: SceneFacts

@@ -93,14 +93,14 @@ def make_plan(
         maps = band_count(fitted, settings)
         if resolved is not None and resolved.mapped:
             maps = len(resolved.active)
+        weighted = resolved is not None and resolved.content_weights(settings.content_weight) is not None
         link = probe_link(collectives, planning_context.network.device)
 
         def decide_here() -> Plan:
             probe = measure(planning_context, survey, link, maps)
             frozen = None if resolved is None else resolved.frozen
-            return decide(
-                replace(probe, styles=_style_count(style, resolved), frozen=frozen), settings, measured=measured
-            )
+            probe = replace(probe, styles=_style_count(style, resolved), frozen=frozen, maps=maps + weighted)
+            return decide(probe, settings, measured=measured)
 
         # Timings differ between ranks, so one rank decides for all.
         plan = collectives.broadcast(decide_here)
@@ -147,6 +147,7 @@ def _about_regions(regions: Regions, resolved: Regions, plan: Plan, cameras: Seq
     lines = []
     for index, region in enumerate(regions.every):
         requested, members = int(regions.members(index).sum()), resolved.members(index)
+        seen = bool((weights[members] > 0).any())
         reason = region.select or "not in any other region"
         lost = region.selected - requested
         if lost > 0:
@@ -155,15 +156,16 @@ def _about_regions(regions: Regions, resolved: Regions, plan: Plan, cameras: Seq
             decision = f"warning: ignored, because it has no Gaussians{' of its own' if lost > 0 else ''}"
         elif region.freeze:
             decision = f"{requested:,} Gaussians stay unchanged"
-        elif index and index not in resolved.active:
+        elif index and not seen:
             decision = f"warning: ignored, because no view sees its {requested:,} Gaussians; they count as rest"
-        elif index not in resolved.active:
+        elif not seen:
             continue  # the rest is empty
         else:
             fraction = float(weights[members].sum() / weights.sum())
             decision = f"{int(members.sum()):,} of {len(weights):,} Gaussians, {fraction:.1%} of what the views show,"
             decision += f" use {region.style.text if region.style else 'the style'}"
             decision += f", with weight {region.weight:g}" if region.weight != 1 else ""
+            decision += "" if region.content_weight is None else f", with content weight {region.content_weight:,g}"
         lines.append(Decision(f"region {region.name}", decision, reason, error=ANOTHER_LOSS))
     if not resolved.mapped:
         return lines

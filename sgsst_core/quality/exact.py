@@ -85,7 +85,8 @@ class ExactLoss:
         settings = settings.model_copy(update={"style_loss": style_loss or settings.style_loss})
         layers = layers_of(settings.style_loss, stylizer.job.weights, content=settings.content_weight > 0)
         network = FeatureNetwork(stylizer.job.weights, layers, torch.float32, stylizer.job.network.device)
-        self.loss = make_loss(network, settings, stylizer.job.loss.memory)
+        own = stylizer.job.loss
+        self.loss = make_loss(network, settings, own.memory, content_weight=own.content_weight)
         self.style_targets = StyleTargetCache(stylizer.job.styles.to(network.device), self.loss)
 
 
@@ -121,6 +122,7 @@ class Float32Reference(ExactLoss):
             photos=stylizer.job.view_targets.photos,
             memory=memory,
             maps=stylizer.job.styles.maps(rasterizer, self.shown),
+            content_maps=stylizer.job.styles.content_maps(rasterizer, self.shown),
         )
 
     def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:

@@ -5,6 +5,8 @@ sum of the SOS losses of its regions, each with its own style. In the loss of a 
 region's fraction of the blend weights there. Blending is linear in the colors, so this fraction is a rendering with
 color 1 for the region's Gaussians and 0 for all others. Other regions affect the statistics of a region only where
 receptive fields extend across the border.
+
+A region that differs from the rest in its content weight only is compared with the style together with the rest.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ class Region:
         weight: Weight of the region's style loss, above 0.
         freeze: Whether the colors of the region's Gaussians are frozen.
         selected: Number of Gaussians that the selection matches. Later regions may have taken over some of them.
+        content_weight: Weight of the content term in the region; None for that of the job.
     """
 
     name: str
@@ -38,6 +41,7 @@ class Region:
     weight: float = 1.0
     freeze: bool = False
     selected: int = 0
+    content_weight: float | None = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,26 @@ class Regions:
         """
         return len(self.active) > 1 or self.frozen_in_view or self.every[self.active[0]].weight != 1
 
+    @property
+    def style_labels(self) -> Tensor:
+        """Index of the region with whose Gaussians each Gaussian is compared with the style, [N] uint8."""
+        rest = self.every[0]
+        indices = [
+            0 if region.content_weight is not None and _style_of(region) == _style_of(rest) else index
+            for index, region in enumerate(self.every)
+        ]
+        return torch.tensor(indices, dtype=torch.uint8)[self.labels.long()]
+
+    def content_weights(self, default: float) -> Tensor | None:
+        """Return the content weight of each Gaussian, [N] float32; None if all have the default.
+
+        Args:
+            default: Content weight of the job.
+        """
+        weights = [default if region.content_weight is None else region.content_weight for region in self.every]
+        by_gaussian = torch.tensor(weights)[self.labels.long()]
+        return None if bool((by_gaussian == torch.tensor(default)).all()) else by_gaussian
+
     def members(self, index: int) -> Tensor:
         """Return the mask [N] bool of the Gaussians in the region with this index."""
         return self.labels == index
@@ -101,7 +125,8 @@ class Regions:
             own = labels == index
             if index and not region.freeze and not bool((weights[own] > 0).any()):
                 labels[own] = 0
-        seen = torch.bincount(labels[weights > 0].long(), minlength=len(self.every)) > 0
+        styled = replace(self, labels=labels).style_labels
+        seen = torch.bincount(styled[weights > 0].long(), minlength=len(self.every)) > 0
         active = tuple(index for index, region in enumerate(self.every) if seen[index] and not region.freeze)
         if not active:
             raise SettingsError(
@@ -111,16 +136,28 @@ class Regions:
         return replace(self, labels=labels, active=active, frozen_in_view=frozen_in_view)
 
 
-def check_regions(regions: Regions, sh_attenuation: float = 0.0) -> None:
+def _style_of(region: Region) -> tuple[int, float, bool]:
+    """Return what determines how a region is compared with a style."""
+    return id(region.style), region.weight, region.freeze
+
+
+def check_regions(regions: Regions, sh_attenuation: float = 0.0, content_weight: float = 1.0) -> None:
     """Check that the regions leave something to stylize, without rendering any view.
 
     Args:
         regions: Regions of the scene.
         sh_attenuation: SH attenuation, 0 to 1.
+        content_weight: Content weight of the job.
 
     Raises:
-        SettingsError: If every Gaussian is frozen, or some are frozen while SH attenuation would change all of them.
+        SettingsError: If every Gaussian is frozen, some are frozen while SH attenuation would change all of them, or a
+            region has a content weight while the job has no content term.
     """
+    if not content_weight and any(region.content_weight for region in regions.every):
+        raise SettingsError(
+            "--content-weight 0 disables the content term, also in regions with a content weight of their own. "
+            "Use --content-weight 1, which is hardly visible."
+        )
     if sh_attenuation and bool(regions.frozen.any()):
         raise SettingsError(
             f"--sh-attenuation {sh_attenuation:g} changes the Gaussians of every region, and some are frozen. "

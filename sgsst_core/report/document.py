@@ -172,7 +172,8 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
             "style": region.style and region.style.text,
             "weight": region.weight,
             "freeze": region.freeze,
-            "stylized": index in regions.active,
+            "content_weight": region.content_weight,
+            "stylized": not region.freeze and bool((weights[regions.members(index)] > 0).any()),
         }
         for index, region in enumerate(regions.every)
     ]

@@ -184,7 +184,8 @@ def _add_regions(digest: Any, regions: Regions) -> None:
     digest.update(regions.labels.contiguous().numpy().data)
     for region in regions.every:
         images, weights = (region.style.images, region.style.weights) if region.style else ((), ())
-        digest.update(repr((region.freeze, region.weight, weights)).encode())
+        own = () if region.content_weight is None else (region.content_weight,)
+        digest.update(repr((region.freeze, region.weight, weights, *own)).encode())
         for image in images:
             digest.update(repr(tuple(image.shape)).encode() + image.contiguous().numpy().tobytes())
 

@@ -293,7 +293,12 @@ def prepare_job(
     memory_limit = settings.memory_limit or plan.memory_limit
     memory = memory_limit // sharing_memory(team.everybody, plan.device)
     loss = make_loss(
-        network, settings, memory_for("activations", memory), timer=Timer(plan.device), collectives=team.group
+        network,
+        settings,
+        memory_for("activations", memory),
+        content_weight=styles.content_weight,
+        timer=Timer(plan.device),
+        collectives=team.group,
     )
     attenuated = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
     rendered = attenuated if plan.seen.all() else attenuated.subset(plan.seen)
@@ -328,6 +333,7 @@ def prepare_job(
         background=settings.background,
         drawn=plan.training_background != "background",
         maps=styles.maps(rasterizer.repeatable, plan.seen),
+        content_maps=styles.content_maps(rasterizer.repeatable, plan.seen),
     )
     return StylizationJob(
         plan=plan,

@@ -17,7 +17,7 @@ from sgsst_core.loss.targets import StyleTargets, by_band, combined
 from sgsst_core.parallel.division import Size
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions.definition import Regions
-from sgsst_core.regions.maps import DepthBands, RegionMaps, ViewMaps
+from sgsst_core.regions.maps import ContentMaps, DepthBands, RegionMaps, ViewMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
@@ -36,6 +36,7 @@ class JobStyles:
         bands: Number of depth bands, which is that of the scales of the largest view; 0 for strokes that have the same
             size on the whole screen.
         mean_level: See `maps.mean_level`.
+        content_weights: [N], content weight of each Gaussian; None for that of the settings everywhere.
     """
 
     own: Style
@@ -43,6 +44,7 @@ class JobStyles:
     each: tuple[Style, ...] = ()
     bands: int = 0
     mean_level: float = 0.0
+    content_weights: Tensor | None = None
 
     @staticmethod
     def prepared(
@@ -60,15 +62,22 @@ class JobStyles:
         """
         if regions is None:
             return JobStyles(prepared_style(style, settings, sh_dc, weights))
+        content_weights, labels = regions.content_weights(settings.content_weight), regions.style_labels
         by_region = [regions.every[index].style or style for index in regions.active]
         if not regions.mapped:
-            return JobStyles(prepared_style(by_region[0], settings, sh_dc, weights), regions)
+            own = prepared_style(by_region[0], settings, sh_dc, weights)
+            return JobStyles(own, regions, content_weights=content_weights)
         each = [
-            prepared_style(own, settings, sh_dc, torch.where(regions.members(index), weights, 0.0))
+            prepared_style(own, settings, sh_dc, torch.where(labels == index, weights, 0.0))
             for index, own in zip(regions.active, by_region, strict=True)
         ]
         rest = each[regions.active.index(0)] if 0 in regions.active else prepared_style(style, settings, sh_dc, weights)
-        return JobStyles(rest, regions, tuple(each))
+        return JobStyles(rest, regions, tuple(each), content_weights=content_weights)
+
+    @property
+    def content_weight(self) -> float | None:
+        """Largest content weight of a Gaussian; None for that of the settings."""
+        return None if self.content_weights is None else float(self.content_weights.max())
 
     @property
     def all(self) -> list[Style]:
@@ -114,7 +123,7 @@ class JobStyles:
         if not self.each:
             return transfer(sh_dc, weights, self.own)
         assert self.regions is not None
-        result, labels = sh_dc.clone(), self.regions.labels[rows]
+        result, labels = sh_dc.clone(), self.regions.style_labels[rows]
         for index, style in zip(self.regions.active, self.each, strict=True):
             own = labels == index
             if bool((weights[own] > 0).any()):
@@ -133,8 +142,14 @@ class JobStyles:
         if not self.each:
             return None
         assert self.regions is not None
-        labels = self.regions.labels if rows is None else self.regions.labels[rows]
+        labels = self.regions.style_labels if rows is None else self.regions.style_labels[rows]
         return RegionMaps(labels, self.regions.active, rasterizer)
+
+    def content_maps(self, rasterizer: Rasterizer, rows: Tensor | None = None) -> ContentMaps | None:
+        """Return the renderer of content weights; None if they are the same everywhere. See `maps` for arguments."""
+        if not self.content_weight or self.content_weights is None:
+            return None
+        return ContentMaps(self.content_weights if rows is None else self.content_weights[rows], rasterizer)
 
 
 def prepared_style(style: Style, settings: Settings, sh_dc: Tensor, weights: Tensor) -> Style:

@@ -16,7 +16,8 @@ from sgsst_core.loss.targets import ContentFeatures, ViewTarget
 from sgsst_core.loss.tiling import Division
 from sgsst_core.loss.view_images import ViewImages
 from sgsst_core.parallel.division import Piece
-from sgsst_core.regions.maps import ViewMaps
+from sgsst_core.regions.maps import ContentMaps, ViewMaps
+from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
 from sgsst_core.stylizing.training_background import Color, replace_background
 from sgsst_core.stylizing.views import Views
@@ -42,6 +43,7 @@ class ViewTargets:
         drawn: Whether the background color changes from step to step; content images are then cached instead of
             features.
         maps: Renderer of the maps of regions or depth bands; None for one part.
+        content_maps: Renderer of content weights; None for the same everywhere.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class ViewTargets:
         background: Color = (0.0, 0.0, 0.0),
         drawn: bool = False,
         maps: ViewMaps | None = None,
+        content_maps: ContentMaps | None = None,
     ) -> None:
         self.views = views
         self.loss = loss
@@ -68,10 +71,12 @@ class ViewTargets:
         self._background = background
         self._drawn = drawn
         self._maps = maps
+        self._content_maps = content_maps
         self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
-        content = int(memory * content_fraction(device.type, weighted=weighted, has_maps=maps is not None))
-        self._region_weights: Cache[int, list[list[Tensor]]] = Cache(
-            0 if maps is None else memory // 4, lambda every: sum(map(_pyramid_bytes, every))
+        has_maps = maps is not None or content_maps is not None
+        content = int(memory * content_fraction(device.type, weighted=weighted, has_maps=has_maps))
+        self._region_weights: Cache[tuple[int, bool], list[list[Tensor]]] = Cache(
+            memory // 4 if has_maps else 0, lambda every: sum(map(_pyramid_bytes, every))
         )
         cached = content if cache_content else 0
         images = cached // 2 if drawn else 0
@@ -96,6 +101,7 @@ class ViewTargets:
             coverage=coverage,
             division=division,
             regions=self.region_weights(index),
+            content_weights=self.content_weights(index),
             background=background or self._background,
         )
         images = functools.cache(lambda: self._content_images(index, division))
@@ -135,7 +141,16 @@ class ViewTargets:
     def region_weights(self, index: int) -> list[list[Tensor]] | None:
         """Return the map of each region in a view, in the format of `coverage`; None if the scene has no regions."""
         maps = self._maps
-        return None if maps is None else self._region_weights.get(index, lambda: self._rendered_regions(index, maps))
+        if maps is None:
+            return None
+        return self._region_weights.get((index, False), lambda: self._rendered_maps(index, maps.render, maps.count))
+
+    def content_weights(self, index: int) -> list[Tensor] | None:
+        """Return the relative content weights of a view, in the format of `coverage`; None if they are equal."""
+        maps = self._content_maps
+        if maps is None:
+            return None
+        return self._region_weights.get((index, True), lambda: self._rendered_maps(index, maps.render, 1))[0]
 
     def replace_background(self, index: int, image: Tensor, color: Color) -> Tensor:
         """Replace the background color of a view's `Views.render` [h, w, 3].
@@ -215,8 +230,8 @@ class ViewTargets:
         window = self.views.window(index, self.views.rasterizer.repeatable.coverage)
         return self.loss.targets.position_weights(self.views.whole(index, window))
 
-    def _rendered_regions(self, index: int, maps: ViewMaps) -> list[list[Tensor]]:
-        whole = self.views.whole(index, self.views.window(index, maps.render, maps.count))
+    def _rendered_maps(self, index: int, render: Callable[[Camera], Tensor], count: int) -> list[list[Tensor]]:
+        whole = self.views.whole(index, self.views.window(index, render, count))
         return [self.loss.targets.position_weights(weights) for weights in whole.unbind(2)]
 
     def _features(

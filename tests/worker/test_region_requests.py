@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.errors import SettingsError
+from sgsst_core.settings import checked
 from worker.region_requests import MOST_REGIONS, REST, RegionOptions, parse_selection, region_options, region_requests
 from worker.styles import MOST_STYLE_IMAGES, StyleFile
 
@@ -61,11 +62,13 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
         ["a=x.jpg:0.5", f"a={odd}", "rest=y=z.jpg"],
         ["a=3", "rest=0.5"],
         ["c"],
+        ["a=balanced", "rest=0.5"],
     )
     rest, first, second = region_requests(options)
     assert (rest.name, rest.selection, rest.styles, rest.weight) == (REST, None, (StyleFile(Path("y=z.jpg")),), 0.5)
     assert first.styles == (StyleFile(Path("x.jpg"), 0.5), StyleFile(odd))
     assert (first.weight, first.freeze, second.freeze, second.styles) == (3, False, True, ())
+    assert [each.content_weight for each in (rest, first, second)] == [0.5, 1e4, None]
 
 
 @pytest.mark.parametrize(
@@ -80,6 +83,11 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
         ((["a:sphere=0,0,0,1"], [], ["a=x"], []), "not a finite number"),
         ((["a:sphere=0,0,0,1"], ["a=x.jpg:0"], [], []), "the weight 0 is not a finite number greater than 0"),
         ((["a:sphere=0,0,0,1"], ["a=x.jpg"], [], ["a"]), "is frozen, so it cannot have a style or weight"),
+        ((["a:sphere=0,0,0,1"], [], [], ["a"], ["a=light"]), "is frozen, so it cannot have a style or weight"),
+        ((["a:sphere=0,0,0,1"], [], [], [], ["a"]), "--region-content-weight a: '' is not a weight. Give a number"),
+        ((["a:sphere=0,0,0,1"], [], [], [], ["a=-1"]), "the weight must be at least 0"),
+        ((["a:sphere=0,0,0,1"], [], [], [], ["a=nan"]), "the weight must be at least 0"),
+        (([], [], [], [], ["b=light"]), "there is no region 'b'"),
         ((["rest:sphere=0,0,0,1"], [], [], []), "takes no SPEC"),
         ((["a:" + "x" * 1001], [], [], []), "at most 1000 characters"),
         (
@@ -96,9 +104,20 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_invalid_options_are_refused(texts: tuple[list[str], list[str], list[str], list[str]], message: str) -> None:
+def test_invalid_options_are_refused(texts: tuple[list[str], ...], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         region_requests(region_options(*texts))
+
+
+def test_json_regions_have_content_weights_by_name_or_number() -> None:
+    options = [
+        checked(RegionOptions, {"name": name, "select": "sphere=0,0,0,1", "content_weight": weight})
+        for name, weight in (("a", "light"), ("b", 7), ("c", None))
+    ]
+    assert [each.content_weight for each in region_requests(options)] == [3e4, 7.0, None]
+    for weight in ("much", -1, 1e13):
+        with pytest.raises(SettingsError, match="content_weight"):
+            checked(RegionOptions, {"name": "a", "select": "sphere=0,0,0,1", "content_weight": weight})
 
 
 def test_json_regions_need_selections_and_unique_names() -> None:

@@ -113,11 +113,13 @@ def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.
         f"right={other}",
         "--region-weight",
         "right=2",
+        "--region-content-weight",
+        "right=balanced",
     ]
     options += ["--region", "left:half-space=-1,0,0,0.5", "--region-freeze", "left", "--region", "far:sphere=0,0,99,1"]
     assert main(files.stylize("--steps-sos", "2", "--warm-start", "--clamp-aware-gradient", *options)) == 0
     said = capsys.readouterr().out
-    assert "use other.png, with weight 2" in said
+    assert "use other.png, with weight 2, with content weight 10,000" in said
     assert "region far:           warning: ignored, because it has no Gaussians" in said
     before, after = second_reader(files.ply), second_reader(files.out)
     frozen = before["x"] <= -0.5
@@ -134,6 +136,7 @@ def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.
         "style": "other.png",
         "weight": 2.0,
         "freeze": False,
+        "content_weight": 1e4,
         "stylized": True,
     }
     assert by_name["left"]["gaussians"] == frozen.sum()

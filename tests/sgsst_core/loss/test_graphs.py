@@ -122,6 +122,20 @@ def test_graphs_include_feature_matching(
 
 
 @pytest.mark.usefixtures("without_triton")
+def test_graphs_copy_the_content_weights_of_each_view(tiny_weights: BackboneWeights) -> None:
+    loss = make_loss(tiny_weights, content_weight=1e4)
+    style, views, graphs = style_of(loss), [view_of(loss, 2) for _ in range(3)], LossGraphs(loss)
+    for seed, view in enumerate(views[1:]):
+        view.content_weights = loss.targets.position_weights(image(seed)[:, :, 0].contiguous())
+    for step in range(2 * FIRST_VISITS + 3):
+        view = views[step % 3]
+        expected = loss.evaluate(image(7), style, view, SCALES)
+        assert_same(graphs.evaluate(image(7), style, view, SCALES), expected)
+    assert graphs.problem is None
+    assert graphs.captured == 2  # with and without content weights
+
+
+@pytest.mark.usefixtures("without_triton")
 def test_each_kind_of_evaluation_has_its_own_graph(tiny_weights: BackboneWeights) -> None:
     """Graphs differ by scales and style targets, and interleaved ones do not interfere."""
     loss = make_loss(tiny_weights)

@@ -220,12 +220,15 @@ def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: P
     assert torch.equal(again.stylized(), whole.stylized())
 
 
+_OTHER_TREATMENT: dict[str, Any] = {"weight": 2.0, "style": None, "freeze": True, "content_weight": 1.0}
+
+
 def test_fingerprint_depends_on_regions() -> None:
     scene, views, settings = wall(), cameras(), make_settings()
     regions = halves(scene)
     moved = replace(regions, labels=1 - regions.labels)
     right = regions.every[1]
-    others = [replace(right, weight=2.0), replace(right, style=None), replace(right, freeze=True)]
+    others = [replace(right, **{name: value}) for name, value in _OTHER_TREATMENT.items()]
     every = [None, regions, moved, *(replace(regions, every=(regions.every[0], other)) for other in others)]
     fingerprints = [fingerprint(scene, views, style(), settings, "w", "", each) for each in every]
     assert len(set(fingerprints)) == len(every)

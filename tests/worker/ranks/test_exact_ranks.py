@@ -89,6 +89,7 @@ def gradient(
         weighted=weighted,
         regions=survey.regions if weighted else None,
         maps=styles.maps(rasterizer),
+        content_maps=styles.content_maps(rasterizer),
     )
     scales = scales or tuple(loss.tiling.scales((camera.height, camera.width)))
     target = view_targets.target(0, scales)
@@ -138,7 +139,7 @@ def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> No
     """Some of the three ranks have no pixel of a region, and one region is frozen."""
     scene, camera = wall(), cameras(1, 128, 96)[0]
     other = Style.of(synthetic_image(64, 80, seed=5, dtype=torch.float64))
-    every = (Region("rest"), Region("a", style=other, weight=3.0), Region("b", freeze=True))
+    every = (Region("rest"), Region("a", style=other, weight=3.0, content_weight=50.0), Region("b", freeze=True))
     labels = (scene.means[:, 1] > 0.8).to(torch.uint8) + 2 * (scene.means[:, 0] > 1).to(torch.uint8)
     regions = Regions(every, labels.clamp(max=2))
     arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss, regions
