@@ -13,6 +13,8 @@ export class ShareCard {
     this.path = `/v1/jobs/${id}/shares`;
     this.days = h("select", { "aria-label": say.lifetime }, DAYS.map((days) => h("option", { value: days, selected: days === 7 }, say.days(days))));
     this.link = h("div");
+    /** Id of the share whose link is shown. */
+    this.linked = "";
     this.list = h("ul.files");
     this.wrong = h("p.wrong", { hidden: true, role: "alert" });
     this.element = h("section.card.share", h("h2", say.title), h("p.help", say.help),
@@ -32,8 +34,9 @@ export class ShareCard {
   }
 
   async create() {
-    const { url } = await (await ask("POST", this.path, { json: { days: Number(this.days.value) } })).json();
+    const { id, url } = await (await ask("POST", this.path, { json: { days: Number(this.days.value) } })).json();
     const input = h("input", { type: "text", readOnly: true, value: new URL(url, location.href).href, "aria-label": say.link, onfocus: () => input.select() });
+    this.linked = id;
     put(this.link, h("div.row", input, h("button.primary", { type: "button", onclick: () => copy(input) }, say.copy)), h("p.help", say.once));
     input.focus();
     await this.show();
@@ -48,7 +51,7 @@ export class ShareCard {
   /** @param {string} id */
   async revoke(id) {
     await ask("DELETE", `${this.path}/${id}`);
-    put(this.link);
+    if (id === this.linked) put(this.link); // the link of another share is shown only once
     announce(say.revoked);
     await this.show();
   }

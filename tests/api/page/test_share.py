@@ -16,7 +16,18 @@ def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: S
     job_id = done(service, submit(service, files, **(STEPS | {"steps_sos": 2}), name="my wall"))
     watched = visit(f"/#/jobs/{job_id}")
     page = watched.page
+    page.get_by_label("Link expires after").select_option("1")
     page.get_by_role("button", name="Create a link").click()
+    page.get_by_role("button", name="Revoke").wait_for()
+    first = page.get_by_label("Link to this result").input_value()
+    page.get_by_label("Link expires after").select_option("30")
+    page.get_by_role("button", name="Create a link").click()
+    page.get_by_role("button", name="Revoke").nth(1).wait_for()
+    with service.client() as client:
+        shares = client.get(f"/v1/jobs/{job_id}/shares").json()["shares"]
+    page.get_by_role("button", name="Revoke").nth([share["id"] in first for share in shares].index(True)).click()
+    page.get_by_role("button", name="Revoke").nth(1).wait_for(state="detached")
+    assert first not in page.get_by_label("Link to this result").input_value(), "the second link stays to be copied"
     link = page.get_by_label("Link to this result").input_value()
     assert link.startswith(f"{service.url}/shared#shr_")
     page.get_by_role("button", name="Copy").click()
