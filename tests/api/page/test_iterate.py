@@ -40,7 +40,9 @@ def uploads_of(watched: Watched) -> list[str]:
 
 def started(watched: Watched, service: Service, name: str = "Start") -> dict[str, Any]:
     """Start the job of the form, and return it."""
-    with watched.page.expect_response(lambda answer: answer.url.endswith("/v1/jobs")) as answer:
+    with watched.page.expect_response(
+        lambda answer: answer.url.endswith("/v1/jobs") and answer.request.method == "POST"
+    ) as answer:
         watched.page.get_by_role("button", name=name, exact=True).click()
     assert answer.value.status == 202, answer.value.text()
     watched.page.wait_for_url(re.compile("#/jobs/job_"))
@@ -152,6 +154,7 @@ def test_each_painting_can_be_a_job_of_its_own(
     for job_id, name in zip(ids, ("scene · style", "scene · night"), strict=True):
         job = httpx.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()
         assert (job["name"], len(digests(job, "style"))) == (name, 1)
+    page.get_by_label("Wipe", exact=True).wait_for()
     tiles = page.get_by_role("list", name="Jobs side by side").get_by_role("listitem")
     assert tiles.count() == 2
     watched.settled()

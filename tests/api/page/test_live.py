@@ -18,9 +18,6 @@ from tests.api.service import Service, wait_for
 
 pytestmark = pytest.mark.slow
 
-#: Seconds of jobs that end by themselves while the page shows them.
-SECONDS = 25
-
 
 def watch(visit: Visit, job_id: str) -> Watched:
     """Open the page of a running job, and wait for its colors."""
@@ -28,6 +25,11 @@ def watch(visit: Visit, job_id: str) -> Watched:
     watched.page.locator(".side.right", has_text="So far").wait_for(state="attached")
     watched.page.get_by_label("Camera", exact=True).select_option("1")
     return watched
+
+
+def finish(service: Service, job_id: str) -> None:
+    """Ask a running job to end with its present colors."""
+    httpx.post(f"{service.url}/v1/jobs/{job_id}/finish").raise_for_status()
 
 
 def names(service: Service, job_id: str) -> set[str]:
@@ -56,10 +58,11 @@ def test_colors_arrive_while_the_job_runs(visit: Visit, service: Service, files:
 
 
 def test_view_of_a_running_job_becomes_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    job_id = submit(service, files, **LONG, max_seconds=SECONDS)
+    job_id = submit(service, files, **LONG)
     watched = watch(visit, job_id)
     page = watched.page
     page.locator("canvas.view").evaluate("(canvas) => { canvas.id = 'same'; }")
+    finish(service, job_id)
     page.locator(".side.right", has_text="Stylized").wait_for(state="attached")
     assert page.locator("canvas.view").get_attribute("id") == "same"
     page.get_by_label("Amount of style").wait_for()
@@ -73,11 +76,12 @@ def test_view_of_a_running_job_becomes_its_result(visit: Visit, service: Service
 
 
 def test_refined_scene_is_watched(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
-    job_id = submit(service, files, **LONG, refine=2, max_seconds=SECONDS)
+    job_id = submit(service, files, **LONG, refine=2)
     watched = watch(visit, job_id)
     watched.settled()
     (tmp_path / "live.ply").write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/live/scene.ply").content)
     assert read_scene_header(tmp_path / "live.ply").count > 616
+    finish(service, job_id)
     watched.page.locator(".side.right", has_text="Stylized").wait_for(state="attached")
     watched.settled()
     watched.check("status of 404")  # the page first asks for colors alone, which do not exist

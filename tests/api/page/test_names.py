@@ -74,6 +74,6 @@ def test_compared_jobs_have_different_labels(visit: Visit, service: Service, fil
 
     second = done(service, submit(service, files, **quick, seed=1))
     page.goto(f"{service.url}/#/compare/{ids[0]}/{second}")
-    page.locator(".side.right", has_text="style").wait_for()
+    page.get_by_label("Right").locator(f"option[value={second}]").wait_for(state="attached")
     assert page.locator(".side.right").inner_text() != page.locator(".side.left").inner_text()
     watched.check()
