@@ -24,7 +24,7 @@ from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Seconds that a test waits for anything before it fails. No test measures time.
-PATIENCE = 180.0
+PATIENCE = 600.0
 #: Command that runs another one, and stops it if this process is killed.
 _WITH_PARENT = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []
 #: Short intervals, so that tests see within seconds what otherwise takes minutes.
