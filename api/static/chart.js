@@ -117,5 +117,13 @@ export class LossChart {
   }
 }
 
-/** @param {number} value */
-const short = (value) => (value >= 1e6 || value < 1e-3 ? value.toExponential(0).replace("e+", "e") : rough(value));
+/**
+ * Return the label of a value, such as 0.05 or 3×10¹⁰.
+ *
+ * @param {number} value
+ */
+function short(value) {
+  if (value < 1e6 && value >= 1e-3) return rough(value);
+  const [digit, power] = value.toExponential(0).split("e");
+  return `${digit}×10${[...String(Number(power))].map((char) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(char)]).join("")}`;
+}

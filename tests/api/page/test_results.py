@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,9 @@ def test_chart_ends_with_the_loss_of_the_result(visit: Visit, service: Service, 
     label = watched.page.get_by_role("img", name="Loss over time").get_attribute("aria-label")
     shown = float(label.split(" to ")[1].split(" in ")[0].replace(",", ""))
     assert shown == pytest.approx(job["result"]["loss_after"], rel=0.01)
+    losses = watched.page.locator(".plot text[text-anchor=end]:not(.axis)").all_text_contents()
+    assert losses
+    assert all(re.fullmatch("[0-9.,]+|[1-9]×10[⁰¹²³⁴⁵⁶⁷⁸⁹]+", text) for text in losses), losses
     watched.check()
 
 
