@@ -22,19 +22,20 @@ def result_format(out: Path) -> SceneFormat:
     return format
 
 
-def check_is_not_scene(out: Path, scene: Path, remark: str = "") -> None:
-    """Check that an output is not the scene itself.
+def check_is_not_input(out: Path, path: Path, description: str = "scene itself", remark: str = "") -> None:
+    """Check that an output is not one of the inputs.
 
     Args:
         out: File to write.
-        scene: Scene to read.
+        path: File to read.
+        description: Name of the input in the message.
         remark: Text about the output for the message.
 
     Raises:
         OutputError: If both are the same file.
     """
-    if out.exists() and scene.exists() and out.samefile(scene):
-        raise OutputError(f"{out}{remark}: is the scene itself, which would be overwritten. Give another file name.")
+    if out.exists() and path.exists() and out.samefile(path):
+        raise OutputError(f"{out}{remark}: is the {description}, which would be overwritten. Give another file name.")
 
 
 def check_folder(folder: Path) -> None:

@@ -12,7 +12,7 @@ from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, JobVideo, ViewOptions
-from worker.outputs import check_folder, check_is_not_scene, result_format
+from worker.outputs import check_folder, check_is_not_input, result_format
 from worker.region_requests import RegionRequest
 from worker.styles import StyleFile
 
@@ -216,6 +216,7 @@ def check_request(request: StylizeRequest) -> Outputs:
     outputs = Outputs.of(out)
     for path in (outputs.ply, outputs.compressed):
         if path is not None:
-            check_is_not_scene(path, request.source.scene, "" if path == out else f" (the PLY beside {out.name})")
+            remark = "" if path == out else f" (the PLY beside {out.name})"
+            check_is_not_input(path, request.source.scene, remark=remark)
     check_folder(out.parent)
     return outputs

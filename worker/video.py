@@ -26,7 +26,7 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from worker.capture import about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view
 from worker.options import DEFAULT_SIDE, JobVideo, VideoOptions
-from worker.outputs import check_folder, check_is_not_scene
+from worker.outputs import check_folder, check_is_not_input
 from worker.request import SceneRequest, check_choice
 
 
@@ -81,7 +81,7 @@ def check_video_request(request: VideoRequest) -> None:
         )
     for scene in (source.scene, request.unstylized):
         if scene is not None:
-            check_is_not_scene(out, scene)
+            check_is_not_input(out, scene)
     check_folder(out.parent if out.suffix else out)
 
 

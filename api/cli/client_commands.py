@@ -32,7 +32,7 @@ from sgsst_core.files.formats import (
     result_name,
 )
 from sgsst_core.stylizing.progress_bar import clock, live_bar
-from worker.outputs import check_folder, check_is_not_scene, result_format
+from worker.outputs import check_folder, check_is_not_input, result_format
 from worker.region_requests import RegionOptions, RegionRequest, region_requests
 from worker.styles import parse_styles
 
@@ -71,7 +71,7 @@ def submit(
     """Submit a job to a service, with the options of stylize. With --out, wait for the result."""
     if out is not None:
         result_format(out)
-        check_is_not_scene(out, inputs.scene)
+        check_is_not_input(out, inputs.scene)
         check_folder(out.parent)
     styles, settings = _styles_and_parameters(inputs, options, parameters)
     files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": _masks(inputs.regions)}

@@ -43,7 +43,7 @@ from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import about_rendering, choose_axes, read_capture
 from worker.description import describe_scene
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
-from worker.outputs import check_folder, check_is_not_scene, result_format
+from worker.outputs import check_folder, check_is_not_input, result_format
 from worker.request import SceneRequest, StylizeRequest, check_choice
 from worker.styles import split_weight
 
@@ -68,12 +68,14 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     check_choice(source, request.images)
     if out.is_dir() or out.suffix.lower() != ".json":  # a mistyped path must not overwrite a scene or its cameras
         raise OutputError(f"{out}: not the name of a JSON file. Give one, such as plan.json.")
-    if source.cameras and out.exists() and source.cameras.exists() and out.samefile(source.cameras):
-        raise OutputError(f"{out}: is the camera file, which would be overwritten. Give another file name.")
+    if source.cameras:
+        check_is_not_input(out, source.cameras, "camera file")
     check_folder(out.parent)
     if sheet is not None:
         if sheet.is_dir() or sheet.suffix.lower() not in (".jpg", ".jpeg"):
             raise OutputError(f"{sheet}: not the name of a JPEG file. Give one, such as views.jpg.")
+        for image in request.styles:
+            check_is_not_input(sheet, image.path, "style image")
         check_folder(sheet.parent)
     file, capture = read_scene_and_capture(source, request.images)
     cameras = capture.cameras
@@ -210,7 +212,7 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
         InvalidInputError: If scene, cameras or output cannot be used.
     """
     _check_target(out, compare)
-    check_is_not_scene(out, source.scene)
+    check_is_not_input(out, source.scene)
     check_folder(out.parent)
     if compare and source.cameras is None:
         source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
@@ -281,7 +283,7 @@ def blend_files(texts: Sequence[str], out: Path, *, drop_invalid: bool, spz_axes
     fractions = normalized(weights)
     result_format(out)
     for path in paths:
-        check_is_not_scene(out, path)
+        check_is_not_input(out, path)
     check_folder(out.parent)
     files = [read_scene(path, drop_invalid=drop_invalid, spz_axes=spz_axes) for path in paths]
     blend = blend_scenes(files, weights)

@@ -346,6 +346,15 @@ def test_plan_sheet_shows_orbit_views(files: Files, capsys: pytest.CaptureFixtur
     assert "views.jpg" in capsys.readouterr().err
 
 
+def test_plan_does_not_overwrite_the_style(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    style = files.style.rename(files.style.with_suffix(".jpg"))
+    content = style.read_bytes()
+    command = ["plan", str(files.ply), "--style", str(style), "--orbit", "4", "--backbone", "vgg16"]
+    assert main([*command, "--sheet", str(style)]) == 2
+    assert "style.jpg: is the style image, which would be overwritten" in capsys.readouterr().err
+    assert style.read_bytes() == content
+
+
 def test_orbit_auto_chooses_number_of_views(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     write_scene(files.ply, ball())
     out = files.ply.with_name("renders")
