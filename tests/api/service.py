@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -114,6 +114,18 @@ class Service:
         """Send SIGKILL to the process that runs `module`."""
         process = wait_for(lambda: self.process(module), f"a process {module}", self.said)
         process.send_signal(signal.SIGKILL)
+
+    @contextlib.contextmanager
+    def killed(self, module: str) -> Iterator[None]:
+        """Kill the process that runs `module`, and have it restarted only after the `with` block."""
+        assert self._process is not None
+        supervisor = psutil.Process(self._process.pid)
+        supervisor.suspend()
+        try:
+            self.kill(module)
+            yield
+        finally:
+            supervisor.resume()
 
     def survivors(self) -> list[psutil.Process]:
         """Return all running processes that the service has started, including those in other sessions."""
