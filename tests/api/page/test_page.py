@@ -159,6 +159,8 @@ def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str,
     page = watched.page
     page.get_by_text("Adding detail · step").wait_for()
     page.get_by_role("img", name="Loss over time").wait_for()
+    step = page.locator(".state").inner_text()
+    wait_for(lambda: page.locator(".state").inner_text() != step, "news of the job: the stream is open", service.said)
     with service.killed("api.http.server"):
         page.get_by_text("Connection lost").wait_for()
     wait_for(service.ready, "the API to be back", service.said)
