@@ -312,9 +312,8 @@ class Settings(BaseModel):
 
 
 #: `paper` is the published schedule. The other presets reach the same loss sooner, with larger, decaying steps. Such
-#: steps push many colors below 0, so these presets need `clamp_aware_gradient`. They start from the style's
-#: colors, which optimization alone reaches only slowly (docs/quality.md). Phase 1 pays off for large views, but has no
-#: further effect after about 80 steps (docs/performance.md).
+#: steps push many colors below 0, so these presets need `clamp_aware_gradient`. They start from the style's colors,
+#: which optimization alone reaches only slowly (docs/quality.md). Phase 1 pays off for large views.
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
         "steps_coarse": 50,
