@@ -11,7 +11,6 @@ import sys
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import httpx
@@ -23,6 +22,7 @@ from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import ROOT, Service
+from tests.http_servers import serve
 from tests.small_scenes import wall, write_files
 
 MISSING = "job_1a1fe701a104f943e9d4d8cce5b818c"
@@ -251,7 +251,7 @@ class Stranger(BaseHTTPRequestHandler):
 
 def test_address_of_another_program_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     with ThreadingHTTPServer(("127.0.0.1", 0), Stranger) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
+        serve(server)
         url = f"http://127.0.0.1:{server.server_port}"
         for path, what in (("", "it sends text/html"), ("/moved", "it redirects to https://new.example/")):
             for command in (["status", MISSING], ["jobs"], ["download", MISSING]):

@@ -34,6 +34,7 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.quotas import Quotas
 from tests.api.service import Service, check_documented
+from tests.http_servers import serve
 from tests.small_scenes import wall, write_files
 
 #: Time limit of a test's waits in seconds.
@@ -75,7 +76,7 @@ class FileServer:
         self._server = Server(("127.0.0.1", 0), Handler)
         self.port = self._server.server_port
         self.origin = f"http://127.0.0.1:{self.port}"
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        serve(self._server)
 
     def url(self, path: str, answer: Answer) -> str:
         """Set the answer of a path, and return its URL."""

@@ -13,6 +13,8 @@ from typing import Any, Literal
 import httpx
 import pytest
 
+from tests.http_servers import serve
+
 #: "slow-down": 503, S3's response to too many requests. "not-implemented": 501. "reset": the connection is closed
 #: before the response. "cut-off": it is closed in the middle of the response. "silence": there is no response at all.
 Fault = Literal["slow-down", "not-implemented", "reset", "cut-off", "silence"]
@@ -76,7 +78,7 @@ class FaultyS3:
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = True
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        serve(self._server)
 
     def fail(self, fault: Fault, times: int, which: Callable[[str, str], bool] = lambda method, path: True) -> None:
         """Inject a fault into the next `times` requests for which `which(method, path)` is true."""

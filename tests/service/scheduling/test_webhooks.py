@@ -32,6 +32,7 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.tables import DeliveryRow
+from tests.http_servers import serve
 from tests.postgres import fresh_database, is_installed, server
 from tests.service.store.helpers import Clock
 
@@ -85,7 +86,7 @@ class Receiver:
             self._server.socket = context.wrap_socket(self._server.socket, server_side=True)
         self.port = self._server.server_port
         self.url = f"{'https' if certificate else 'http'}://127.0.0.1:{self.port}/hook"
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        serve(self._server)
 
     def close(self) -> None:
         self._server.shutdown()
