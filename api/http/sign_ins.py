@@ -34,7 +34,7 @@ class SignIns:
         self._failures: OrderedDict[str, deque[float]] = OrderedDict()
 
     def attempt(self, address: str) -> None:
-        """Count an attempt as failed until `succeeded` is called, so that parallel attempts cannot pass the limit.
+        """Count an attempt as failed until its outcome is known, so that parallel attempts cannot pass the limit.
 
         Raises:
             TooManyTriesError: If the address has failed too often recently.
@@ -48,6 +48,12 @@ class SignIns:
         self._failures.move_to_end(address)
         if len(self._failures) > _MOST_ADDRESSES:
             self._failures.popitem(last=False)
+
+    def withdraw(self, address: str) -> None:
+        """Forget the newest attempt of an address, whose key could not be looked up."""
+        failures = self._failures.get(address)
+        if failures:
+            failures.pop()
 
     def succeeded(self, address: str) -> None:
         """Forget the failures of an address."""

@@ -18,7 +18,7 @@ from api.http.documentation import headers, invalid, problems
 from api.http.multipart import BodyTypeError, NotUtf8Error, TooSlowError, check_media_type, read_json
 from api.http.schemas import SessionView, SignIn
 from api.http.sign_ins import TooManyTriesError
-from service.errors import TooLargeError
+from service.errors import ServiceError, TooLargeError
 
 router = APIRouter(prefix="/v1/session", tags=["session"])
 
@@ -66,7 +66,11 @@ async def sign_in(request: Request, context: ContextDep) -> Response:
     sign_in = SignIn.model_validate(await read_json(request, context.settings, _MAX_BODY))
     address = request.client.host if request.client else ""
     context.sign_ins.attempt(address)
-    key = await asyncio.to_thread(context.store.keys.find, sign_in.key)
+    try:
+        key = await asyncio.to_thread(context.store.keys.find, sign_in.key)
+    except ServiceError:
+        context.sign_ins.withdraw(address)
+        raise
     if key is None:
         raise UnknownKeyError
     context.sign_ins.succeeded(address)

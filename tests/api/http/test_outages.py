@@ -18,6 +18,7 @@ import httpx
 import pytest
 
 from api.http.app import create_app
+from api.http.sign_ins import MOST_FAILURES
 from service.examples import SHARE_ID, SHARE_TOKEN
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -170,6 +171,14 @@ def test_every_operation_reports_unavailable_database(outage: Outage, files: dic
         check_health(outage.service, 503)
     check_health(outage.service, 200)
     assert "Traceback" not in outage.service.said()
+
+
+def test_sign_ins_during_an_outage_do_not_count_as_failed(outage: Outage) -> None:
+    with outage.service.client() as browser:
+        with outage.kind("killed"):
+            for _ in range(MOST_FAILURES + 1):
+                check_away(browser.post("/v1/session", json={"key": outage.key}))
+        assert browser.post("/v1/session", json={"key": outage.key}).status_code == 204
 
 
 @pytest.mark.slow

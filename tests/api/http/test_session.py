@@ -340,6 +340,19 @@ def test_sign_in_failures_expire() -> None:
         tries.attempt("a")
 
 
+def test_attempt_whose_key_was_not_looked_up_does_not_count() -> None:
+    tries = SignIns(lambda: 0.0)
+    tries.withdraw("a")
+    for _ in range(MOST_FAILURES - 1):
+        tries.attempt("a")
+    for _ in range(MOST_FAILURES):
+        tries.attempt("a")
+        tries.withdraw("a")
+    tries.attempt("a")
+    with pytest.raises(TooManyTriesError):
+        tries.attempt("a")
+
+
 def test_session_expires(tmp_path: Path) -> None:
     now = 1000.0
     store = open_store(ServiceSettings(data=tmp_path, session_days=1), lambda: now)
