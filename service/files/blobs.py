@@ -34,6 +34,23 @@ BLOBS, UPLOADS = "blobs", "uploads"
 _MIN_FREE_INODES = 1000
 
 
+@contextmanager
+def disk_errors() -> Iterator[None]:
+    """Convert errors of the disk; missing files and a limit of open files are none.
+
+    Raises:
+        NoSpaceError: If the disk or a quota is full, or a file is too large for the file system.
+        StoreError: If the disk fails otherwise, or denies access.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOENT, errno.EMFILE, errno.ENFILE):
+            raise
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        raise (NoSpaceError if full else StoreError)(f"The service cannot write the file: {error.strerror}.") from error
+
+
 class Receiver:
     """File that is being received; `Blobs.add` turns it into a blob."""
 
@@ -42,7 +59,8 @@ class Receiver:
         self.size = 0
         self._limit = limit
         self._ensure_space = ensure_space
-        self._file = path.open("wb", buffering=0)
+        with disk_errors():
+            self._file = path.open("wb", buffering=0)
 
     def write(self, data: bytes) -> None:
         """Append bytes to the file.
@@ -50,6 +68,7 @@ class Receiver:
         Raises:
             TooLargeError: If the file exceeds its size limit.
             NoSpaceError: If the disk is too full.
+            StoreError: If the disk fails otherwise.
         """
         self.size += len(data)
         if self.size > self._limit:
@@ -233,6 +252,7 @@ class BlobFolder(Blobs):
         for path in (self._blobs, self.uploads):
             path.mkdir(parents=True, exist_ok=True)
 
+    @disk_errors()
     def add(self, path: Path, upload_id: str | None = None, *, link: bool = False) -> str:
         """Move or link a received file to its final path and return its SHA-256.
 
@@ -276,7 +296,8 @@ class BlobFolder(Blobs):
 
     def start_upload(self, upload_id: str) -> None:
         """Create an empty file for the upload."""
-        self.upload_path(upload_id).touch()
+        with disk_errors():
+            self.upload_path(upload_id).touch()
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
         """Return a writer to the upload's file."""
@@ -334,11 +355,15 @@ class _FileWriter:
         self._inputs, self._upload, self._seconds = inputs, upload, seconds
         self._offset = self._saved = upload.offset
         try:
-            self._file = path.open("r+b", buffering=0)
+            with disk_errors():
+                self._file = path.open("r+b", buffering=0)
         except FileNotFoundError:
             raise LostUploadError(upload.id) from None
-        except PermissionError:  # another request is turning the file into a blob, which is read-only
-            raise LockedError from None
+        except StoreError:
+            # while another request turns a complete upload into a blob, its file is read-only
+            if inputs.upload(upload.id, upload.owner).offset == upload.length:
+                raise LockedError from None
+            raise
         try:
             _lock(self._file)
             # read the row again: no other writer changes it while the lock is held
@@ -392,12 +417,9 @@ def write_all(file: object, data: bytes) -> None:
         StoreError: If the disk fails otherwise.
     """
     view = memoryview(data)
-    try:
+    with disk_errors():
         while view:
             view = view[file.write(view) :]  # type: ignore[attr-defined]
-    except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        raise (NoSpaceError if full else StoreError)(f"The service cannot write the file: {error.strerror}.") from error
 
 
 def flush_folder(folder: Path) -> None:

@@ -148,6 +148,7 @@ def describe_uploads(context: ContextDep) -> Response:
             IdempotencyError,
             BytesQuotaError,
             NoSpaceError,
+            StoreError,
         ),
     },
 )

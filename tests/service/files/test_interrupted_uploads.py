@@ -14,10 +14,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.errors import LockedError
+from service.errors import LockedError, StoreError
 from service.files.blobs import BlobFolder
 from service.settings import ServiceSettings
 from service.store import open_store
+from service.store.inputs import Inputs
 from tests.api.service import Service
 from tests.small_scenes import wall, write_files
 
@@ -112,17 +113,41 @@ def unprivileged() -> Iterator[None]:
         os.seteuid(user)
 
 
-def test_upload_that_becomes_a_blob_is_locked(tmp_path: Path) -> None:
+@contextmanager
+def blob_folder(tmp_path: Path) -> Iterator[tuple[Inputs, BlobFolder]]:
+    """Yield a database and a store of inputs, in which another user may read."""
     store = open_store(ServiceSettings(data=tmp_path))
     with tempfile.TemporaryDirectory() as folder:  # other users may not enter `tmp_path`
         Path(folder).chmod(0o755)
-        blobs = BlobFolder(Path(folder), store.inputs, 0)
-        row = store.inputs.create_upload("me", 5, "scene.ply", "", 3600)
+        yield store.inputs, BlobFolder(Path(folder), store.inputs, 0)
+    store.close()
+
+
+def test_upload_that_becomes_a_blob_is_locked(tmp_path: Path) -> None:
+    with blob_folder(tmp_path) as (inputs, blobs):
+        row = inputs.create_upload("me", 5, "scene.ply", "", 3600)
         blobs.start_upload(row.id)
         blobs.upload_path(row.id).chmod(0o400)
+        inputs.advance_upload(row.id, 0, 5, 3600)
         with unprivileged(), pytest.raises(LockedError):
             blobs.append(row, 3600)
-    store.close()
+
+
+def test_missing_write_permission_is_a_failure_of_the_store(tmp_path: Path) -> None:
+    with blob_folder(tmp_path) as (inputs, blobs):
+        row = inputs.create_upload("me", 5, "scene.ply", "", 3600)
+        blobs.start_upload(row.id)
+        received = blobs.receive(10)
+        received.close()
+        with unprivileged():
+            for write in (
+                lambda: blobs.append(row, 3600),
+                lambda: blobs.start_upload("upl_1"),
+                lambda: blobs.receive(10),
+                lambda: blobs.add(received.path),
+            ):
+                with pytest.raises(StoreError, match="cannot write the file: "):
+                    write()
 
 
 @pytest.mark.parametrize("killed", [False, True])
