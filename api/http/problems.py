@@ -149,11 +149,14 @@ def _unknown(at: str) -> str:
 
 async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
-    code = {404: "not-found", 405: "method-not-allowed"}.get(error.status_code, "http-error")
-    headers = dict(error.headers or {})
+    path, headers = request.scope["path"][:_SHOWN], dict(error.headers or {})
+    if error.status_code == 404:
+        return problem(404, "not-found", f"There is nothing at {path!r}. /docs lists all paths.", headers)
     if error.status_code == 405:
         headers["Allow"] = ", ".join(_allowed(request))  # the router lists only the methods of the first route
-    return problem(error.status_code, code, str(error.detail), headers)
+        detail = f"{path!r} does not support {request.method[:_SHOWN]}. Use one of {headers['Allow']}."
+        return problem(405, "method-not-allowed", detail, headers)
+    return problem(error.status_code, "http-error", str(error.detail), headers)
 
 
 def _allowed(request: Request) -> list[str]:

@@ -772,9 +772,12 @@ def test_stream_after_last_event_is_empty(client: httpx.Client, files: dict[str,
 
 
 def test_unknown_paths_and_methods(client: httpx.Client) -> None:
-    refused(client.get("/v1/nothing"), 404, "not-found")
+    answer = client.get("/v1/nothing")
+    refused(answer, 404, "not-found")
+    assert answer.json()["detail"] == "There is nothing at '/v1/nothing'. /docs lists all paths."
     answer = client.put("/v1/jobs")
     refused(answer, 405, "method-not-allowed")
+    assert answer.json()["detail"] == "'/v1/jobs' does not support PUT. Use one of GET, POST."
     assert answer.headers["allow"] == "GET, POST"
     for job_id in ("job_00000000000", "../x", "job_' OR 1=1", "a" * 5000):
         assert client.get(f"/v1/jobs/{job_id}").status_code == 404
