@@ -175,6 +175,8 @@ def count_votes(key: Path, files: Sequence[Path]) -> list[Share]:
         StudyError: If a file cannot be read, belongs to another study, or there are no votes.
     """
     known = _read(Key, key)
+    if any(len(tokens) != len(known.variants) for tokens in known.views):
+        raise StudyError(f"{key}: not the key of a study: a view lacks the token of a variant. Use an intact copy.")
     variant_of = [dict(zip(tokens, known.variants, strict=True)) for tokens in known.views]
     by_voter: dict[str, Votes] = {}
     for path in files:

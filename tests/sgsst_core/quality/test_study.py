@@ -107,6 +107,15 @@ def test_foreign_votes_are_refused(
         count_votes(study[1], [path])
 
 
+def test_key_that_lacks_tokens_is_refused(study: tuple[Path, Path], tmp_path: Path) -> None:
+    content = json.loads(study[1].read_text())
+    content["views"][1].pop()
+    key = tmp_path / "study.key.json"
+    key.write_text(json.dumps(content))
+    with pytest.raises(StudyError, match="not the key of a study: a view lacks the token of a variant"):
+        count_votes(key, [save_votes(tmp_path / "1.json", study[1], [0])])
+
+
 def test_repeated_views_are_refused(study: tuple[Path, Path], tmp_path: Path) -> None:
     token = json.loads(study[1].read_text())["views"][0][0]
     path = save_votes(tmp_path / "1.json", study[1], [0], votes=[{"view": 0, "chosen": token}] * 2)
