@@ -12,7 +12,7 @@ from sgsst_core.errors import SettingsError
 
 #: Maximum number of images of a style. More are probably a mistake.
 MOST_STYLE_IMAGES = 16
-_WEIGHTED = re.compile(r"(?P<path>.+):(?P<weight>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", re.DOTALL)
+_WEIGHTED = re.compile(r"(?P<file>.+):(?P<weight>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class StyleFile:
         return str(self.path) if self.weight == 1 else f"{self.path}:{self.weight!r}"
 
 
-def split_weight(text: str, exists: Callable[[Path], bool] = Path.exists) -> tuple[Path, float]:
-    """Return the path and weight of FILE or FILE:WEIGHT; see `parse_style`. The weight is 1 if there is none."""
+def split_weight(text: str, exists: Callable[[Path], bool] = Path.exists) -> tuple[str, float]:
+    """Return the file and weight of FILE or FILE:WEIGHT; see `parse_style`. The weight is 1 if there is none."""
     match = _WEIGHTED.fullmatch(text)
     if match is None or exists(Path(text)):
-        return Path(text), 1.0
-    return Path(match["path"]), float(match["weight"])
+        return text, 1.0
+    return match["file"], float(match["weight"])
 
 
 def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> StyleFile:
@@ -48,11 +48,11 @@ def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> Styl
     Raises:
         SettingsError: If the weight is not finite or not above 0.
     """
-    path, weight = split_weight(text, exists)
+    file, weight = split_weight(text, exists)
     if not (math.isfinite(weight) and weight > 0):
         given = text.rpartition(":")[2]
         raise SettingsError(f"--style {text}: the weight {given} is not a finite number greater than 0. Give one.")
-    return StyleFile(path, weight)
+    return StyleFile(Path(file), weight)
 
 
 def parse_styles(texts: Sequence[str]) -> tuple[StyleFile, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,24 +16,24 @@ from worker.styles import parse_styles
 if TYPE_CHECKING:
     from worker.request import StylizeRequest
 
-SceneArgument = Annotated[
-    Path,
-    typer.Argument(metavar="SCENE", help=f"3DGS scene: {SUFFIXES}.", show_default=False),
-]
-CamerasOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender)."
-    ),
-]
+_SCENE: Any = typer.Argument(metavar="SCENE", help=f"3DGS scene: {SUFFIXES}.", show_default=False)
+_CAMERAS: Any = typer.Option(
+    metavar="PATH",
+    help="cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender).",
+)
+SceneArgument = Annotated[Path, _SCENE]
+CamerasOption = Annotated[Path | None, _CAMERAS]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @dataclass(frozen=True)
 class JobInputs:
-    """Files and regions of a job, as given on the command line; see `with_arguments`."""
+    """Files and regions of a job, as given on the command line; see `with_arguments`.
 
-    scene: SceneArgument
+    Scene, style and cameras are texts, because `sgsst submit` also accepts URLs, which a `Path` would change.
+    """
+
+    scene: Annotated[str, _SCENE]
     style: Annotated[
         list[str],
         typer.Option(
@@ -42,7 +42,7 @@ class JobInputs:
             show_default=False,
         ),
     ]
-    cameras: CamerasOption = None
+    cameras: Annotated[str | None, _CAMERAS] = None
     images: Annotated[
         Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
     ] = None
@@ -104,7 +104,7 @@ class JobInputs:
         from worker.request import SceneRequest, StylizeRequest
 
         return StylizeRequest(
-            source=SceneRequest.of(self.scene, self.cameras, options),
+            source=SceneRequest.of(Path(self.scene), None if self.cameras is None else Path(self.cameras), options),
             styles=parse_styles(self.style),
             images=self.images,
             out=out,

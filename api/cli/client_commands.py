@@ -20,9 +20,9 @@ from api.cli.arguments import JobInputs, JsonOption
 from api.cli.console import INTERRUPTED, JOB_FAILED, error_console, out_console
 from api.cli.options import with_arguments, with_options
 from api.cli.progress_bars import transfer_bar
-from api.client.inputs import different_names
+from api.client.inputs import different_names, path_or_url
 from service.parameters import JobParameters
-from sgsst_core.errors import OutputError
+from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import (
     EXTRA_FORMATS,
     RESULT_SUFFIXES,
@@ -34,7 +34,7 @@ from sgsst_core.files.formats import (
 from sgsst_core.stylizing.progress_bar import clock, live_bar
 from worker.outputs import check_folder, check_is_not_input, result_format
 from worker.region_requests import RegionOptions, RegionRequest, region_requests
-from worker.styles import parse_styles
+from worker.styles import parse_styles, split_weight
 
 if TYPE_CHECKING:
     from stamina.instrumentation import RetryDetails
@@ -68,10 +68,13 @@ def submit(
     url: UrlOption = None,
     key: KeyOption = None,
 ) -> None:
-    """Submit a job to a service, with the options of stylize. With --out, wait for the result."""
+    """Submit a job to a service, with the options of stylize. With --out, wait for the result.
+
+    SCENE, --style and --cameras may be URLs, if the service allows their hosts.
+    """
     if out is not None:
         result_format(out)
-        check_is_not_input(out, inputs.scene)
+        check_is_not_input(out, Path(inputs.scene))
         check_folder(out.parent)
     styles, settings = _styles_and_parameters(inputs, options, parameters)
     files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": _masks(inputs.regions)}
@@ -95,18 +98,21 @@ def submit(
 
 def _styles_and_parameters(
     inputs: JobInputs, options: JobParameters, parameters: str
-) -> tuple[list[Path], dict[str, Any]]:
-    """Return the style images to send, those of regions last, and the parameters of the job."""
+) -> tuple[list[Path | str], dict[str, Any]]:
+    """Return the style images to send or their URLs, those of regions last, and the parameters of the job."""
     values = options.model_dump(mode="json", exclude_unset=True)
     styles = parse_styles(inputs.style)
     if len(styles) > 1:
         values["style_weights"] = [file.weight for file in styles]
+    images = [path_or_url(split_weight(text)[0]) for text in inputs.style]
     regions = inputs.regions
-    of_regions = [file for region in region_requests(regions) for file in region.styles]
-    images = [file.path for file in (*styles, *of_regions)]
+    if urls := [text for region in regions for text in region.style_texts if isinstance(path_or_url(text), str)]:
+        raise SettingsError(f"--region-style {urls[0]}: cannot be a URL. Download the image, and give its path.")
+    of_regions = [file.path for region in region_requests(regions) for file in region.styles]
     if regions:
-        values["regions"] = _regions_to_send(regions, different_names(images)[len(styles) :])
-    return images, values | _parse_parameters(parameters)
+        local = [image for image in images if isinstance(image, Path)]
+        values["regions"] = _regions_to_send(regions, different_names([*local, *of_regions])[len(local) :])
+    return [*images, *of_regions], values | _parse_parameters(parameters)
 
 
 def _masks(regions: Sequence[RegionOptions]) -> dict[str, Path]:
@@ -171,16 +177,20 @@ def download(
     key: KeyOption = None,
 ) -> None:
     """Download a job's result or other files; an interrupted download resumes."""
+    if format and name not in ("stylized.ply", "all"):
+        raise SettingsError(f"--format {format}: only stylized.ply is compressed. Omit --format for {name}.")
+    if format is None and out is not None and name == "stylized.ply":
+        format = _format_of(out)
+    if out is not None and name != "all":
+        _check_format(out, _stored_name(name, format))
     with _client(url, key) as client:
         digests = {entry["name"]: entry["sha256"] for entry in client.artifacts(job)}
         names = list(digests) if name == "all" else [name]
         written = []
         for each in names:
-            target = (out or Path(job)) / each if name == "all" else out or Path(Path(each).name)
-            chosen = (format or _format_of(target)) if each == "stylized.ply" else None
-            if format and out is None and each == "stylized.ply":
-                target = Path(result_name(each, by_name(format)))
-            stored = result_name(each, by_name(chosen)) if chosen else each
+            stored = _stored_name(each, format)
+            target = (out or Path(job)) / stored if name == "all" else out or Path(Path(stored).name)
+            chosen = format if stored != each else None
             if not (overwrite or (name == "all" and out is None)):  # that folder is named after the job
                 _check_target(target, digests.get(stored))
             with transfer_bar(error_console, each) as progress:
@@ -188,6 +198,21 @@ def download(
             if not as_json:
                 _print_compression_loss(client, job, chosen)
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
+
+
+def _stored_name(name: str, format: ExtraName | None) -> str:
+    """Return the name under which the service stores an artifact in a compressed format, which only results have."""
+    return result_name(name, by_name(format)) if format and name == "stylized.ply" else name
+
+
+def _check_format(out: Path, name: str) -> None:
+    """Raise an OutputError if the name of a file to write is that of another scene format than an artifact's."""
+    format, content = format_of_name(out.name), format_of_name(name)
+    if format and content and format is not content:
+        raise OutputError(
+            f"{out}: ends in {format.suffix}, but the format of the download is {content.title}. "
+            f"Give a name that ends in {content.suffix}."
+        )
 
 
 def _check_target(target: Path, sha256: str | None) -> None:

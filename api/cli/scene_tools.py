@@ -7,7 +7,7 @@ The functions check all inputs, compute, and write the outputs, but print nothin
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -74,8 +74,8 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     if sheet is not None:
         if sheet.is_dir() or sheet.suffix.lower() not in (".jpg", ".jpeg"):
             raise OutputError(f"{sheet}: not the name of a JPEG file. Give one, such as views.jpg.")
-        for image in request.styles:
-            check_is_not_input(sheet, image.path, "style image")
+        for path, description in _input_images(request):
+            check_is_not_input(sheet, path, description)
         check_folder(sheet.parent)
     file, capture = read_scene_and_capture(source, request.images)
     cameras = capture.cameras
@@ -105,6 +105,17 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))
     return plan
+
+
+def _input_images(request: StylizeRequest) -> Iterator[tuple[Path, str]]:
+    """Yield the path and the description of each image that a job may read."""
+    for style in (*request.styles, *(each for region in request.regions for each in region.styles)):
+        yield style.path, "style image"
+    for region in request.regions:
+        if region.selection and region.selection.kind == "masks" and region.selection.path:
+            yield from ((path, "mask") for path in region.selection.path.rglob("*"))
+    if request.images:
+        yield from ((path, "photo") for path in request.images.rglob("*"))
 
 
 # --- check ---------------------------------------------------------------------------------------------------------
@@ -277,7 +288,8 @@ def blend_files(texts: Sequence[str], out: Path, *, drop_invalid: bool, spz_axes
     Raises:
         InvalidInputError: If the weights, a scene or the output cannot be used.
     """
-    paths, weights = zip(*map(split_weight, texts), strict=True)
+    names, weights = zip(*map(split_weight, texts), strict=True)
+    paths = [Path(name) for name in names]
     if len(paths) < 2:
         raise SettingsError("There is one scene to blend. Give at least two, such as scene.ply:0.3 stylized.ply:0.7.")
     fractions = normalized(weights)

@@ -69,9 +69,10 @@ class Transport:
         """Send a request, and return its complete response.
 
         Raises:
-            RequestError: If the service refuses the request as faulty.
+            RequestError: If the service refuses the request as faulty, or a number of its JSON is not finite.
             ApiError: If the service fails or does not respond, even after retries.
         """
+        json_text(options.get("json"))
 
         async def once() -> httpx.Response:
             response = await self.http.request(method, path, **options)
@@ -91,6 +92,7 @@ class Transport:
         Raises:
             RequestError, ApiError: As for `call`.
         """
+        json_text(options.get("json"))
 
         async def once() -> httpx.Response | None:
             async with aconnect_sse(self.http, method, path, **options) as source:
@@ -180,6 +182,18 @@ def _is_address(url: str) -> bool:
     except httpx.InvalidURL:
         return False
     return parsed.scheme in ("http", "https") and bool(parsed.host)
+
+
+def json_text(value: object) -> str:
+    """Return a value as JSON.
+
+    Raises:
+        RequestError: If it contains a number that is not finite, which JSON lacks.
+    """
+    try:
+        return json.dumps(value, allow_nan=False)
+    except ValueError as error:
+        raise RequestError(f"{value}: contains a number that is not finite. Give finite numbers.") from error
 
 
 async def in_thread(function: Callable[..., T], *args: Any) -> T:

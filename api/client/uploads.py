@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import secrets
 from collections.abc import Mapping
 from functools import partial
@@ -14,7 +13,7 @@ from typing import Any
 from api.client.answers import ApiError, RequestError
 from api.client.downloads import Progress
 from api.client.inputs import InputFile, InputUrl, JobFiles, input_files
-from api.client.transport import Transport, in_thread
+from api.client.transport import Transport, in_thread, json_text
 
 #: Maximum bytes of a part; larger files are uploaded in parts.
 PART_BYTES = 16 << 20
@@ -102,6 +101,7 @@ async def _send_files(
     transport: Transport, files: JobFiles, parameters: Mapping[str, Any], progress: Progress
 ) -> list[tuple[str, Any]]:
     """Upload the large files, and return the form fields of the request, which contain the small files and the URLs."""
+    given = json_text({name: value for name, value in parameters.items() if value is not None})
     inputs = await in_thread(input_files, files)
     total = sum(file.size for file in inputs if isinstance(file, InputFile) and file.size > PART_BYTES)
     done = 0
@@ -116,8 +116,7 @@ async def _send_files(
         else:
             content = await in_thread(file.path.read_bytes)
             fields.append((file.role, (file.name, content, "application/octet-stream")))
-    given = {name: value for name, value in parameters.items() if value is not None}
-    fields.append(("parameters", (None, json.dumps(given))))
+    fields.append(("parameters", (None, given)))
     return fields
 
 

@@ -355,6 +355,25 @@ def test_plan_does_not_overwrite_the_style(files: Files, capsys: pytest.CaptureF
     assert style.read_bytes() == content
 
 
+def test_plan_does_not_overwrite_images_of_a_job(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = files.ply.with_name("images")
+    (folder / "left").mkdir(parents=True)
+    photo = files.style.rename(folder / "left" / "view_0.jpg")
+    content = photo.read_bytes()
+    other = photo.with_name("other.jpg")
+    other.write_bytes(content)
+    command = ["plan", str(files.ply), "--style", str(other), "--cameras", str(files.cameras), "--sheet", str(photo)]
+    region = ["--region", "near:sphere=0,0,0,1", "--region-style", f"near={photo}"]
+    for more, message in (
+        (["--images", str(folder)], "view_0.jpg: is the photo, which would be overwritten"),
+        (["--region", f"near:masks={folder}"], "view_0.jpg: is the mask, which would be overwritten"),
+        (region, "view_0.jpg: is the style image, which would be overwritten"),
+    ):
+        assert main([*command, *more]) == 2
+        assert message in capsys.readouterr().err
+    assert photo.read_bytes() == content
+
+
 def test_orbit_auto_chooses_number_of_views(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     write_scene(files.ply, ball())
     out = files.ply.with_name("renders")

@@ -211,6 +211,25 @@ def test_download_names_a_target_that_cannot_be_written(
     assert (tmp_path / "new" / "out.ply").read_bytes() == b"result"
 
 
+def test_name_of_another_format_is_refused_before_the_download(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is requested: the port of a closed socket refuses connections, which is another error."""
+    monkeypatch.setenv("SGSST_URL", "http://127.0.0.1:9")
+    for options, message in (
+        (["--format", "glb", "--out", "x.spz"], "x.spz: ends in .spz, but the format of the download is GLB"),
+        (["--format", "spz", "--out", "x.ply"], "x.ply: ends in .ply, but the format of the download is SPZ"),
+        (["--out", "x.splat"], "x.splat: ends in .splat, but the format of the download is PLY"),
+        (["blends/stylized_0.7.ply", "--out", "x.spz"], "Give a name that ends in .ply."),
+        (["blends/stylized_0.7.ply", "--format", "spz"], "only stylized.ply is compressed"),
+    ):
+        assert main(["download", MISSING, *options]) == 2
+        assert message in capsys.readouterr().err
+    for options in (["--format", "glb", "--out", "x.GLB"], ["--format", "glb", "--out", "x"], ["--out", "x.sog"]):
+        assert main(["download", MISSING, *options]) == 1
+        assert "cannot be reached" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("job_id", ["", "?", ".", "..", "a/b", "a b#c"])
 @pytest.mark.parametrize("command", ["status", "watch", "download", "cancel", "delete"])
 def test_id_that_no_job_has_is_refused(command: str, job_id: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import inspect
+import math
 import signal
 import socket
 import threading
@@ -206,6 +207,20 @@ def finish(store: Store, service: Service, job_id: str, content: bytes, folder: 
     store.leases.start(lease)
     store.leases.succeed(lease, [file], {"steps": 1})
     return content
+
+
+@both
+def test_numbers_that_are_not_finite_are_not_sent(connect: Any, files: dict[str, Path]) -> None:
+    """The port of a closed socket refuses connections, which is another error."""
+    with connect("http://127.0.0.1:9") as client:
+        for call in (
+            lambda: client.blend("job_1", math.nan),
+            lambda: client.blend("job_1", 0.5, {"job_2": -math.inf}),
+            lambda: client.video("job_1", seconds=math.inf),
+            lambda: client.submit(files["scene"], files["style"], orbit=2, content_weight=math.nan),
+        ):
+            with pytest.raises(RequestError, match=r"contains a number that is not finite\. Give finite numbers\."):
+                call()
 
 
 @both

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import ipaddress
+import json
 import socket
 import ssl
 import threading
@@ -19,6 +20,7 @@ from typing import Any
 import httpx
 import pytest
 
+from api.cli.main import main
 from api.client import Client
 from api.client.answers import RequestError
 from api.http.fetching import Fetcher, file_name
@@ -537,6 +539,26 @@ def test_client_submits_urls_and_files(service: Service, urls: dict[str, str], t
         assert names == [urls["style"].rsplit("/", 1)[1], "local.png"]
         with pytest.raises(RequestError, match="not among the hosts"):
             client.submit("https://evil.test/scene.ply", style, orbit=3)
+
+
+def test_submit_command_accepts_urls(
+    service: Service, urls: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    style = tmp_path / "local.png"
+    style.write_bytes(httpx.get(urls["style"]).content)
+    command = ["submit", urls["scene"], "--cameras", urls["cameras"], "--url", service.url, "--json"]
+    command += ["--style", f"{urls['style']}:2", "--style", str(style), "--region", "half:half-space=1,0,0,0"]
+    assert main([*command, "--region-style", f"half={style}"]) == 0
+    job = json.loads(capsys.readouterr().out)
+    assert job["parameters"]["style_weights"] == [2, 1]
+    assert job["parameters"]["regions"][0]["style"] == ["2_local.png:1.0"]
+    names = {role: [entry["name"] for entry in job["inputs"] if entry["role"] == role] for role in urls}
+    styles = ["style.png", "local.png", "2_local.png"]
+    assert names == {"scene": ["scene.ply"], "cameras": ["cameras.json"], "style": styles}
+    assert main([*command, "--region-style", f"half={urls['style']}"]) == 2
+    assert "cannot be a URL. Download the image" in capsys.readouterr().err
+    assert main(["submit", "http://evil.test/scene.ply", "--style", str(style), "--orbit=3", "--url", service.url]) == 2
+    assert "not among the hosts" in capsys.readouterr().err
 
 
 def test_requests_are_checked_before_anything_is_fetched(
