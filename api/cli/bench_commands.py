@@ -34,7 +34,7 @@ class VariantsInputs:
     scene: SceneArgument
     style: Annotated[Path, typer.Option(help="Style image.", show_default=False)]
     cameras: CamerasOption = None
-    seconds: Annotated[float, typer.Option(min=1, help="Seconds of optimization per variant.")] = 300.0
+    seconds: Annotated[float, typer.Option(min=1, max=1e6, help="Seconds of optimization per variant.")] = 300.0
 
     def request(self, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path) -> VariantsRequest:
         """Return the request for these variants, which are separated by commas."""

@@ -106,6 +106,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except BrokenPipeError:  # for example `sgsst weights list | head`
         return FAILURE
+    except OSError as error:  # such as a name that is too long, or a folder that denies access
+        if error.filename is None:
+            raise
+        problem = f"{error.filename}: {error.strerror}. Check the path."
+        if "--json" in arguments:
+            _print_json("path", problem)
+        else:
+            error_console.print(f"error: {problem}")
+        return BAD_INPUT
     except (MemoryError, RuntimeError) as error:
         if not _out_of_memory(error):
             raise

@@ -355,6 +355,30 @@ def test_plan_does_not_overwrite_the_style(files: Files, capsys: pytest.CaptureF
     assert style.read_bytes() == content
 
 
+def test_names_that_are_too_long_are_refused(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    long = "x" * 300
+    scene, style, cameras = str(files.ply), str(files.style), str(files.cameras)
+    for command in (
+        ["check", long, "--cameras", cameras],
+        ["convert", scene, f"{long}.spz"],
+        ["blend", scene, f"{long}:0.5", "--out", "blend.ply"],
+        ["study", "make", scene, f"name={long}", "--style", style, "--cameras", cameras],
+        ["plan", scene, "--style", style, "--cameras", cameras, "--out", f"{long}.json"],
+        ["submit", scene, "--style", style, "--cameras", long],
+    ):
+        assert main(command) == 2
+        assert re.search("^error: .*x{300}.*: File name too long. Check the path.$", capsys.readouterr().err)
+    assert main(["submit", scene, "--style", long, "--orbit", "3", "--json"]) == 2
+    assert json.loads(capsys.readouterr().err)["code"] == "path"
+
+
+def test_endless_benchmark_is_refused(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bench", "error-time", str(files.ply), "--style", str(files.style), "--cameras", str(files.cameras)]
+    for seconds in ("inf", "nan", "1e400"):
+        assert main([*command, "--seconds", seconds]) == 2
+        assert "--seconds" in capsys.readouterr().err
+
+
 def test_plan_does_not_overwrite_images_of_a_job(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     folder = files.ply.with_name("images")
     (folder / "left").mkdir(parents=True)
