@@ -9,6 +9,7 @@ import sys
 import pytest
 
 pytest.importorskip("triton")
+pytestmark = pytest.mark.slow
 #: Tests that compare kernels with float64 references, and that run on any device.
 COMPARISONS = (
     "tests/sgsst_core/rasterizer/test_triton.py",
@@ -31,7 +32,6 @@ def test_compiled_kernel_tests_pass() -> None:
     run("tests/ptx", "-m", "not slow")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("target", ["sm_80", "sm_90"])
 def test_kernel_comparisons_pass_on_target(target: str) -> None:
     run(f"--ptx-target={target}", "-k", f"not ({OTHERS})", "tests/ptx", *COMPARISONS)

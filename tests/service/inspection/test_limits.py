@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import pytest
 from PIL import Image
@@ -21,32 +23,45 @@ from sgsst_core.files.scene_file import write_scene
 from tests.small_scenes import wall, write_files
 
 
-def inspect(folder: Path, files: dict[str, Path], show: Show = lambda now: None, **limits: Any) -> dict[str, Any]:
-    """Inspect files with these limits in the settings, and return the findings; `show` receives progress."""
+class Inspect(Protocol):
+    """Function that inspects files and returns the findings; `show` receives progress."""
+
+    def __call__(self, files: dict[str, Path], show: Show = ...) -> dict[str, Any]: ...
+
+
+@contextmanager
+def inspecting(folder: Path, **limits: Any) -> Iterator[Inspect]:
+    """Yield a function that inspects files with these limits in the settings, in one process for all calls."""
     settings = ServiceSettings(data=folder / "data", **limits)
-    digests = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
-    inputs = [
-        {"role": role, "name": path.name, "sha256": digests[role], "size": path.stat().st_size}
-        for role, path in files.items()
-    ]
-
-    async def ask() -> dict[str, Any]:
-        blobs = BlobFolder(settings.folder, store.inputs, 0)
-        for path in files.values():
-            blobs.add(path, link=True)
-        inspector = Inspector(settings, store, blobs)
-        try:
-            rows = store.inputs.blobs(sorted(digests.values()))
-            return await inspector.inspect("validate", "local", inputs, rows, JobParameters(backbone="auto"), show)
-        finally:
-            await inspector.close()
-
     (folder / "data").mkdir(exist_ok=True)
     store = open_store(settings)
-    try:
-        return asyncio.run(ask())
-    finally:
-        store.close()
+    blobs = BlobFolder(settings.folder, store.inputs, 0)
+    inspector = Inspector(settings, store, blobs)
+
+    def inspect(files: dict[str, Path], show: Show = lambda now: None) -> dict[str, Any]:
+        digests = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
+        inputs = [
+            {"role": role, "name": path.name, "sha256": digests[role], "size": path.stat().st_size}
+            for role, path in files.items()
+        ]
+        for path in files.values():
+            blobs.add(path, link=True)
+        rows = store.inputs.blobs(sorted(digests.values()))
+        parameters = JobParameters(backbone="auto")
+        return runner.run(inspector.inspect("validate", "local", inputs, rows, parameters, show))
+
+    with asyncio.Runner() as runner:
+        try:
+            yield inspect
+        finally:
+            runner.run(inspector.close())
+            store.close()
+
+
+def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, Any]:
+    """Inspect files with these limits in the settings, and return the findings."""
+    with inspecting(folder, **limits) as ask:
+        return ask(files)
 
 
 @pytest.fixture

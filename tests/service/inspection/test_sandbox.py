@@ -23,7 +23,7 @@ from service.inspection.process import MAX_REPORTS
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.service.inspection import attack
-from tests.service.inspection.test_limits import inspect
+from tests.service.inspection.test_limits import inspecting
 from tests.small_scenes import wall, write_files
 
 COMPROMISED = Path(__file__).with_name("compromised.py")
@@ -67,12 +67,13 @@ def attacked(
     scene = folder / "attack" / "scene.ply"
     scene.parent.mkdir()
     scene.write_bytes(code)
-    with pytest.raises(RefusedInputError) as caught:
-        inspect(folder, {**files, "scene": scene})
-    reached: dict[str, Any] = json.loads(str(caught.value))
-    assert scene.read_bytes() == code
-    assert "landlock" in lacking or (Path(target["outside"]) / "there").read_text() == "there"
-    assert inspect(folder, files)["gaussians"] == 616, "others' files are checked as before"
+    with inspecting(folder) as inspect:
+        with pytest.raises(RefusedInputError) as caught:
+            inspect({**files, "scene": scene})
+        reached: dict[str, Any] = json.loads(str(caught.value))
+        assert scene.read_bytes() == code
+        assert "landlock" in lacking or (Path(target["outside"]) / "there").read_text() == "there"
+        assert inspect(files)["gaussians"] == 616, "others' files are checked as before"
     return reached
 
 
@@ -146,12 +147,13 @@ def test_forged_response_affects_only_its_own_request(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], answer: str
 ) -> None:
     scene = forger(monkeypatch, tmp_path, answer)
-    if answer.startswith('{"findings": {}}'):  # it may falsify the answer about its own files
-        assert inspect(tmp_path, {**files, "scene": scene}) == {}
-    else:
-        with pytest.raises(RefusedInputError, match="breaks their reader"):
-            inspect(tmp_path, {**files, "scene": scene})
-    assert inspect(tmp_path, files)["gaussians"] == 616
+    with inspecting(tmp_path) as inspect:
+        if answer.startswith('{"findings": {}}'):  # it may falsify the answer about its own files
+            assert inspect({**files, "scene": scene}) == {}
+        else:
+            with pytest.raises(RefusedInputError, match="breaks their reader"):
+                inspect({**files, "scene": scene})
+        assert inspect(files)["gaussians"] == 616
 
 
 def test_flood_of_progress_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path]) -> None:
@@ -159,7 +161,8 @@ def test_flood_of_progress_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path:
     flood = (json.dumps({"planning": progress}) + "\n") * (2 * MAX_REPORTS)
     scene = forger(monkeypatch, tmp_path, flood + '{"findings": {}}')
     shown: list[dict[str, Any]] = []
-    assert inspect(tmp_path, {**files, "scene": scene}, shown.append) == {}
+    with inspecting(tmp_path) as inspect:
+        assert inspect({**files, "scene": scene}, shown.append) == {}
     assert shown == [progress] * MAX_REPORTS
 
 

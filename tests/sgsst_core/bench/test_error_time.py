@@ -32,6 +32,7 @@ from tests.small_scenes import cameras, style, wall
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+@pytest.mark.slow
 def test_variants_are_evaluated_at_equal_times(
     tiny_weights: BackboneWeights, vgg16_weights: object, tmp_path: Path
 ) -> None:

@@ -208,7 +208,7 @@ def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
 
 
 def test_lines_are_named_and_phases_marked() -> None:
-    loss = draw_figures(sample_report())[0].svg["steps"]
+    loss = draw_figures(losses_alone(also="novel_views"))[0].svg["steps"]
     words = Page(loss).text
     for name in ("scale 0 (full size)", "scale 1 (1/2)", "mean", "Gram distance, novel views", "steps"):
         assert name in words
@@ -277,7 +277,7 @@ def test_hostile_names_are_escaped() -> None:
 
 
 def test_non_unicode_names_are_replaced(tmp_path: Path) -> None:
-    report = sample_report()
+    report = sample_report(0, 0)  # without charts
     report["scene"]["path"] = "caf\udce9.ply"  # Python's name for a file in another encoding
     write_page(tmp_path / "page.html", report, None)
     assert "caf?.ply" in (tmp_path / "page.html").read_text(encoding="utf-8")
