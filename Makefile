@@ -9,8 +9,10 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 
 # Tests are small, so several processes of one thread each are faster than one process of several threads. The tests of
 # a file share fixtures and therefore a process. The order of the folders starts long files first.
+# Bytecode is cached, because the tests start many processes.
 TEST_PROCESSES ?= 2
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 \
+  $(BIN)/pytest --numprocesses $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
 SPELLED := api benchmarks deploy docs service sgsst_core tests worker *.md Makefile mkdocs.yml pyproject.toml
 
