@@ -136,7 +136,7 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
         for entry in merged(error.errors())[:20]
     ]
     first = errors[0] if errors else {"at": "", "message": "invalid"}
-    return problem(422, "invalid-request", f"{first['at']}: {first['message']}", errors=errors)
+    return problem(422, "invalid-request", f"{first['at'] or 'body'}: {first['message']}", errors=errors)
 
 
 def _unknown(at: str) -> str:

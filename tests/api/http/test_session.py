@@ -273,6 +273,7 @@ def test_cross_origin_sign_in_is_rejected(service: Service, key: str) -> None:
         (b'{"key": ""}', "application/json", 422, "invalid-request"),
         (b'{"key": 5}', "application/json", 422, "invalid-request"),
         (b'{"key": "x", "more": 1}', "application/json", 422, "invalid-request"),
+        (b"[]", "application/json", 422, "invalid-request"),
         (b"[" * 4000, "application/json", 422, "invalid-request"),
         (b"key=x", "application/json", 422, "invalid-request"),
         (b"\xff", "application/json", 400, "malformed-body"),
@@ -283,6 +284,7 @@ def test_cross_origin_sign_in_is_rejected(service: Service, key: str) -> None:
 def test_malformed_sign_ins_are_rejected(browser: httpx.Client, body: bytes, kind: str, status: int, code: str) -> None:
     answer = browser.post("/v1/session", content=body, headers={"Content-Type": kind})
     refused(answer, status, code)
+    assert answer.json()["detail"][0] not in ": "
     assert "set-cookie" not in answer.headers
 
 
