@@ -2,7 +2,8 @@
 
 python -m benchmarks.first_picture SCENE STYLE OUT [--cameras FILE] [--preset preview] [--seconds 30]
 
-Without --cameras, views are an orbit of 24. Previews are written to OUT after each step until `--seconds` have passed.
+Without --cameras, views are an orbit of 24. Previews are written to OUT before planning, and then after each
+step until `--seconds` have passed.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from pathlib import Path
 import psutil
 
 from sgsst_core import make_settings
-from worker.execute import execute
 from worker.prepare import prepare
 from worker.previews import Previews
 from worker.request import SceneRequest, StylizeRequest
@@ -36,17 +36,21 @@ def main() -> None:
     settings, styles = make_settings(arguments.preset), (StyleFile(arguments.style),)
     arguments.out.mkdir(parents=True, exist_ok=True)
     request = StylizeRequest(source, styles, None, arguments.out / "stylized.ply", "vgg16", False, settings)
+    preview = Previews(
+        arguments.out / "previews",
+        0.0,
+        lambda path: print(f"{path.name}: {time.time() - started:.1f} s after the process started", flush=True),
+        print,
+    )
+    job = prepare(request, preview=preview)
+    from worker.execute import execute  # as jobs of the service do: after the first preview
+
     execute(
-        prepare(request),
+        job,
         progress=lambda progress: None,
         stop=lambda: time.time() - started > arguments.seconds,
         warn=print,
-        preview=Previews(
-            arguments.out / "previews",
-            0.0,
-            lambda path: print(f"{path.name}: {time.time() - started:.1f} s after the process started", flush=True),
-            print,
-        ),
+        preview=preview,
     )
 
 

@@ -1,6 +1,6 @@
 """Preparation of a job: read and check all inputs, find the checkpoint to resume from, and plan the work.
 
-Every rank calls the same functions. Nothing is written or printed.
+Every rank calls the same functions. Nothing is printed, and nothing is written but the first preview.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
 from worker.inputs import Inputs, read_inputs, together
+from worker.previews import Previews
 from worker.request import Outputs, Resume, StylizeRequest, check_request
 
 Warn = Callable[[str], None]
@@ -62,8 +63,11 @@ def prepare(
     resume: Resume | None = None,
     warn: Warn = lambda line: None,
     show_planning: ShowPlanning | None = None,
+    preview: Previews | None = None,
 ) -> Job:
-    """Read and check all inputs of a job, and plan it. Nothing is written. Every rank must call this function.
+    """Read and check all inputs of a job, and plan it. Every rank must call this function.
+
+    Nothing is written but the first preview.
 
     Args:
         request: Job to prepare.
@@ -72,6 +76,7 @@ def prepare(
         warn: Callback for checkpoints that cannot be used.
         show_planning: Callback for the progress of the survey of the views. It is not called if the checkpoint's plan
             is used.
+        preview: Writer of previews, used on rank 0 of a new job; None to write none.
 
     Raises:
         InvalidInputError: If an input cannot be used. Every rank raises the same error.
@@ -86,6 +91,8 @@ def prepare(
     resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
+    if preview and not resumed and collectives.rank == 0:
+        preview.write_first(inputs, settings)
     refinement, scene_file = resumed.plan.refinement if resumed else None, inputs.scene_file
     if settings.growth > 1:
         with timer("refining"):

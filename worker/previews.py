@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from sgsst_core.files.images import save_jpg
-from sgsst_core.scene.camera import resized
+from sgsst_core.planning.measuring import LOSS_VIEWS
+from sgsst_core.scene.camera import resized, spread
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.first_view import render_first_view
 from sgsst_core.stylizing.result_colors import transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
+from worker.inputs import Inputs
 from worker.live import LiveColors
 
 #: Minimum time between two previews, as a fraction of the job's elapsed time. It limits the number of previews.
@@ -28,8 +32,9 @@ _THUMBNAIL = "thumbnail.jpg"
 class Previews:
     """Preview callback for `loop.Callbacks.preview`.
 
-    A preview is a render of the first evaluation view with the current colors. One is also written before the first
-    step, with the colors of a warm start, so that users get a first impression of the result within seconds.
+    A preview is a render of one view with the current colors. The first one is written before the job is planned, or
+    before the first step on a GPU. It has the colors of a warm start, so that users get a first impression of the
+    result within seconds.
 
     Args:
         folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview. Colors are written to
@@ -49,22 +54,29 @@ class Previews:
         self._seconds = seconds
         self._written = written
         self._warn = warn
-        self._started = self._last = time.monotonic()
+        self._started = time.monotonic()
+        #: Time of the last preview; None before the first.
+        self._last: float | None = None
         self.live = LiveColors(folder.parent / "live", warn)
+
+    def write_first(self, inputs: Inputs, settings: Settings) -> None:
+        """Write the first preview of a job that has not been planned, unless a GPU will plan it within seconds."""
+        if torch.cuda.is_available():
+            return
+        camera = inputs.cameras[_shown_view(range(len(inputs.cameras)))]
+        camera = resized(camera, min(camera.side, _SIDE))
+        self._write(
+            0, lambda: render_first_view(inputs.scene_file.scene, camera, inputs.style, settings, inputs.regions)
+        )
 
     def __call__(self, stylizer: Stylizer) -> None:
         """Write a preview and the colors, each if enough time has passed since the last time."""
         self.live(stylizer)
-        now = time.monotonic()
-        if stylizer.step and now - self._last < max(self._seconds, _SHARE * (now - self._started)):
+        now, last = time.monotonic(), self._last
+        wait = max(self._seconds, _SHARE * (now - self._started))
+        if last is not None and (not stylizer.step or now - last < wait):
             return
-        try:
-            path = self._write(stylizer)
-        except Exception as error:
-            self._warn(f"The preview could not be rendered: {error}")
-        else:
-            self._written(path)
-        self._last = time.monotonic()
+        self._write(stylizer.step, lambda: _rendered(stylizer, _colors(stylizer), _SIDE))
 
     def finish(self, stylizer: Stylizer) -> None:
         """Write the thumbnail of a finished job: a view whose left half is unstylized. It replaces the previews."""
@@ -79,22 +91,43 @@ class Previews:
         else:
             self._written(path)
 
-    def _write(self, stylizer: Stylizer) -> Path:
-        path = self._path(f"step_{stylizer.step:07d}.jpg")
-        colors = stylizer.shown() if stylizer.step else transferred_colors(stylizer.job).to(stylizer.sh_dc.device)
-        save_jpg(path, _rendered(stylizer, colors, _SIDE))
-        return path
+    def _write(self, step: int, render: Callable[[], Tensor | None]) -> None:
+        """Write the preview of a step, if there is an image to write."""
+        try:
+            image = render()
+            if image is None:
+                return
+            path = self._path(f"step_{step:07d}.jpg")
+            save_jpg(path, image)
+        except Exception as error:
+            self._warn(f"The preview could not be rendered: {error}")
+        else:
+            self._written(path)
+        self._last = time.monotonic()
 
     def _path(self, name: str) -> Path:
         self._folder.mkdir(parents=True, exist_ok=True)
         return self._folder / name
 
 
+def _shown_view(covered: Sequence[int]) -> int:
+    """Return the index of the view that previews show, given those of the views that see anything.
+
+    It is the first of those on which the loss is evaluated, if there is time for all of these.
+    """
+    return spread(covered, LOSS_VIEWS[0])[0]
+
+
+def _colors(stylizer: Stylizer) -> Tensor:
+    """Return the colors [n, 3] of a preview: before the first step, those of a warm start even if the job has none."""
+    return stylizer.shown() if stylizer.step else transferred_colors(stylizer.job).to(stylizer.sh_dc.device)
+
+
 def _rendered(stylizer: Stylizer, colors: Tensor, side: int) -> Tensor:
-    """Render the first evaluation view with colors [n, 3] at a limited size, on this rank alone."""
-    views, index = stylizer.job.views, stylizer.job.evaluation_views[0]
+    """Render the view that previews show with colors [n, 3] at a limited size, on this rank alone."""
+    views = stylizer.job.views
+    index = _shown_view(views.covered)
     camera = views.cameras[index]
-    if camera.side > side:
-        camera = resized(camera, side)
+    camera = resized(camera, min(camera.side, side))
     with torch.no_grad():
         return views.rasterizer.render(views.colors(index, colors), camera)

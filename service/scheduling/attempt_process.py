@@ -115,14 +115,16 @@ class AttemptProcess:
 
     def _run_alone(self) -> Result:
         from worker.description import describe
-        from worker.execute import execute
         from worker.prepare import prepare
         from worker.previews import Previews
         from worker.request import Resume
 
         resume = Resume(self._task.resume, required=False)
-        job = prepare(self._request(), resume=resume, warn=log, show_planning=report_planning)
+        preview = Previews(_PREVIEWS, self._task.preview_seconds, report_preview, log)
+        job = prepare(self._request(), resume=resume, warn=log, show_planning=report_planning, preview=preview)
         report_prepared(describe(job))
+
+        from worker.execute import execute  # imports matplotlib, which the first preview need not wait for
 
         return execute(
             job,
@@ -130,7 +132,7 @@ class AttemptProcess:
             stop=self._stopping.is_set,
             finish=self._finishing.is_set,
             warn=log,
-            preview=Previews(_PREVIEWS, self._task.preview_seconds, report_preview, log),
+            preview=preview,
             checkpoint_seconds=self._task.checkpoint_seconds,
             show_video=_VideoReport(),
         )

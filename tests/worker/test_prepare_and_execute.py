@@ -95,6 +95,21 @@ def test_plan_for_another_device_reuses_the_survey(request_: StylizeRequest) -> 
     assert run_job(second).stopped == "finished"
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU writes it after planning")
+def test_first_preview_precedes_planning(request_: StylizeRequest, tmp_path: Path) -> None:
+    happened: list[str | tuple[int, int]] = []
+    previews = Previews(tmp_path / "previews", 3600, lambda path: happened.append(path.name), pytest.fail)
+    job = prepare(request_, preview=previews, show_planning=lambda now: happened.append((now.done, now.total)))
+    assert happened == ["step_0000000.jpg", (0, 3), (1, 3), (2, 3), (3, 3)]
+    first = (tmp_path / "previews" / "step_0000000.jpg").read_bytes()
+    execute(job, progress=lambda now: None, stop=lambda: False, warn=pytest.fail, preview=previews)
+    assert happened[5:] == ["thumbnail.jpg"], "the first preview is written once, and the hour is not over"
+    assert (tmp_path / "previews" / "step_0000000.jpg").read_bytes() == first
+    without = small_request(tmp_path / "without", 8)
+    run_job(prepare(without))
+    assert request_.out.read_bytes() == without.out.read_bytes()
+
+
 def test_watchers_get_the_refined_scene(tmp_path: Path) -> None:
     request = small_request(tmp_path, 2, refine=3.0)
     write_scene(request.source.scene, large_wall())

@@ -233,17 +233,20 @@ class RankProcess:
 
     def _job(self, task: RankTask, collectives: Collectives) -> Result:
         from worker.description import describe
-        from worker.execute import execute
         from worker.prepare import prepare
         from worker.previews import Previews
 
         started = time.monotonic()
+        preview = None
+        if task.preview_folder:
+            preview = Previews(task.preview_folder, task.preview_seconds, self._add_preview, self._add_warning)
         job = prepare(
             task.request,
             collectives=collectives,
             resume=task.resume,
             warn=self._add_warning,
             show_planning=lambda planning: self._update(planning=planning),
+            preview=preview,
         )
         job.workers |= task.workers
         if task.rank == 0:
@@ -257,15 +260,15 @@ class RankProcess:
                 lost["seconds_to_resume"] = round(task.seconds_since_loss + since, 3)
             self._update(progress=current)
 
+        from worker.execute import execute  # imports matplotlib, which the first preview need not wait for
+
         return execute(
             job,
             progress=progress,
             stop=self._stop.is_set,
             finish=self._finish.is_set,
             warn=self._add_warning,
-            preview=Previews(task.preview_folder, task.preview_seconds, self._add_preview, self._add_warning)
-            if task.preview_folder
-            else None,
+            preview=preview,
             saved=lambda step: self._update(saved=step) if task.workplace is None else None,
             checkpoint_seconds=task.checkpoint_seconds,
             run_id=task.run_id,
