@@ -8,28 +8,39 @@ layer without a factor takes that of the previous layer. Results are added to be
 NAME. With several seeds, figures are means, and "spread" is the largest difference between two seeds. "sliced" is the
 sliced Wasserstein distance between the colors of pixels and style, in 8-bit levels; no loss term and no color
 initialization optimizes it.
+
+With --region SPEC, the cameras are those that show the region. The additional setting `region_content_weight` is its
+own content weight, and "region_content" is "content" over its pixels alone, on black.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.inputs import input_parser, read_inputs
+from benchmarks.inputs import input_parser, read_inputs, read_views
 from benchmarks.judged import compare_rows, judged, write_sheet
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.bench.judging import make_judge, make_novel_views
+from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.loss.feature_scale import with_scales
 from sgsst_core.quality.dists import may_judge
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
-from sgsst_core.scene.camera import Camera
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
+from worker.region_requests import parse_selection
+from worker.selecting import select
 
 COLUMNS = (
     "style",
@@ -38,12 +49,15 @@ COLUMNS = (
     "color_distance",
     "sliced",
     "content",
+    "region_content",
     "dists",
     "background_sensitivity",
     "seconds",
 )
 #: Number of color directions of the sliced distance, and number of quantiles along each.
 DIRECTIONS, QUANTILES = 64, 1024
+#: Minimum fraction of a view's pixels that must belong to the region of `--region`.
+LEAST_REGION = 0.01
 
 
 def main() -> None:
@@ -57,30 +71,72 @@ def main() -> None:
     parser.add_argument("--steps-sos", type=int, default=60)
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--settings", default="{}", help="JSON, of all rows")
+    parser.add_argument("--region", help="SPEC of a region, as in `sgsst stylize --region NAME:SPEC`")
     parser.add_argument("--out", type=Path, help="folder for a contact sheet and the colors")
     arguments = parser.parse_args()
     scene, cameras, style = read_inputs(arguments, arguments.views, arguments.resolution)
+    region = JudgedRegion(read_scene(arguments.scene), arguments.region) if arguments.region else None
+    if region:
+        every = read_views(arguments.cameras, scene, sys.maxsize, arguments.resolution)
+        cameras = spread([camera for camera in every if region.is_shown_by(camera)], arguments.views)
     base = {"steps_coarse": arguments.steps_coarse, "steps_sos": arguments.steps_sos, "early_stop": False}
     base |= json.loads(arguments.settings)
     description = {"scene": arguments.scene.parent.name, "style": arguments.style.name, "views": arguments.views}
     description |= {"resolution": arguments.resolution, "steps": [arguments.steps_coarse, arguments.steps_sos]}
     description |= {"settings": json.loads(arguments.settings)}
+    description |= {"region": arguments.region} if region else {}
     judge, wanted = _judge(scene, cameras, style, base), quantiles(style, torch.ones(style.shape[:2]))
     rows = {name: json.loads(text or "{}") for name, _, text in (row.partition("=") for row in arguments.rows)}
 
     def run(row: str, seed: int) -> tuple[torch.Tensor, dict[str, float]]:
-        colors, seconds = _run(scene, cameras, style, base | rows[row] | {"seed": seed})
-        figures = {**_judged(judge, colors, wanted), "seconds": seconds}
-        if not may_judge("vgg16", (base | rows[row]).get("content_weight", 1.0)):
+        values = base | rows[row] | {"seed": seed}
+        own, content_weight = values.pop("region_content_weight", None), values.get("content_weight", 1.0)
+        regions = region.regions(own) if region and own is not None else None
+        colors, seconds = _run(scene, cameras, style, values, regions)
+        figures = {**_judged(judge, colors, wanted, region), "seconds": seconds}
+        if not may_judge("vgg16", max(content_weight, own or 0.0)):
             figures.pop("dists", None)
         return colors, figures
 
-    unstylized = scene.sh_dc, _judged(judge, scene.sh_dc, wanted)
+    unstylized = scene.sh_dc, _judged(judge, scene.sh_dc, wanted, region)
     colors = compare_rows(
         "equal_steps", arguments.name, description, COLUMNS, unstylized, list(rows), arguments.seeds, run
     )
     if arguments.out:
         write_sheet(arguments.out, arguments.name, judge, style, colors)
+
+
+class JudgedRegion:
+    """Region of a scene whose content is judged by itself.
+
+    Args:
+        file: Scene.
+        text: SPEC of the region.
+    """
+
+    def __init__(self, file: SceneFile, text: str) -> None:
+        self._labels = select(parse_selection(text, "--region"), file, [], NEAR).to(torch.uint8)
+        self._maps = RegionMaps(self._labels, (1,), make_rasterizer("cpu", file.scene))
+        self._lpips = Lpips()
+
+    def is_shown_by(self, camera: Camera) -> bool:
+        """Return whether the region takes at least `LEAST_REGION` of a view."""
+        return float(self._maps.render(camera).mean()) >= LEAST_REGION
+
+    def regions(self, content_weight: float) -> Regions:
+        """Return the regions of a job in which this one has its own content weight."""
+        return Regions((Region("rest"), Region("region", content_weight=content_weight)), self._labels)
+
+    def content(self, judge: Judge, sh_dc: torch.Tensor) -> float:
+        """Return the LPIPS of colors [N, 3] against the unstylized scene, mean over the region's pixels on black."""
+        distance = pixels = 0.0
+        for camera in judge.cameras:
+            images = [judge.renders(colors, camera)[0] for colors in (sh_dc, judge.scene.sh_dc)]
+            fraction = self._maps.render(camera)[..., 0].double()
+            distance += float((self._lpips.distance(*images).map * fraction).sum())
+            pixels += float(fraction.sum())
+        assert pixels, "no judged view shows the region: choose another region, or more cameras"
+        return distance / pixels
 
 
 def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
@@ -89,9 +145,10 @@ def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: d
     return make_judge(stylizer, make_novel_views(stylizer), Lpips())
 
 
-def _judged(judge: Judge, sh_dc: torch.Tensor, wanted: torch.Tensor) -> dict[str, float]:
+def _judged(judge: Judge, sh_dc: torch.Tensor, wanted: torch.Tensor, region: JudgedRegion | None) -> dict[str, float]:
     sliced = [sliced_distance(judge.renders(sh_dc, view), wanted) for view in judge.cameras]
-    return {**judged(judge, sh_dc), "sliced": sum(sliced) / len(sliced)}
+    own = {"region_content": region.content(judge, sh_dc)} if region else {}
+    return {**judged(judge, sh_dc), **own, "sliced": sum(sliced) / len(sliced)}
 
 
 def sliced_distance(renders: list[torch.Tensor], wanted: torch.Tensor) -> float:
@@ -118,11 +175,12 @@ def quantiles(image: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
 
 
 def _run(
-    scene: Scene, cameras: list[Camera], style: torch.Tensor, values: dict[str, Any]
+    scene: Scene, cameras: list[Camera], style: torch.Tensor, values: dict[str, Any], regions: Regions | None
 ) -> tuple[torch.Tensor, float]:
     """Run a job, and return its colors [N, 3] and the CPU seconds of its steps."""
     weights = _weights(values.pop("factor", None))
-    stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **values), weights=weights)
+    settings = make_settings("standard", **values)
+    stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, regions=regions)
     before = time.process_time()
     for _ in range(stylizer.job.total_steps):
         stylizer.run_step()
