@@ -79,7 +79,6 @@ def run_rank(rank: int, address: str, folder: str, sizes: Sizes) -> None:
     try:
         torch.save(follow(collectives, sizes), Path(folder) / f"{rank}.pt")
     finally:
-        collectives.close()
         dist.destroy_process_group()
 
 

@@ -25,7 +25,7 @@ from sgsst_core.loss.targets import ContentFeatures, StyleTarget, StyleTargets, 
 from sgsst_core.loss.terms import POSITION_TERMS, TERMS, LossTerms
 from sgsst_core.loss.tiling import RENDERING, Divider, Division, Tiling
 from sgsst_core.loss.view_images import ViewImages
-from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
+from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Size, rounds
 from sgsst_core.settings import Settings, StyleLossName
 from sgsst_core.timing import Timer
@@ -216,13 +216,14 @@ class SosLoss:
     def _collect(self, passes: Sequence[_ScalePass], *, cache: bool) -> list[dict[PartitionTile, Activations]]:
         """Run the first pass of some scales, and set the values of their terms.
 
-        Ranks start merging the statistics of all these scales before the first backward pass.
+        The ranks' statistics of all these scales are merged together, so that ranks wait for each other only once.
 
         Returns:
             Cached activations of each scale.
         """
         cached: list[dict[PartitionTile, Activations]] = []
-        merged: list[Merged] = []
+        collected: list[list[LayerStatistics]] = []
+        numbers: list[Tensor] = []
         fits = iter(self.tiling.cached([tile.outer.pixels for pass_ in passes for tile in pass_.tiles]))
         for pass_ in passes:
             cached.append({})
@@ -238,13 +239,16 @@ class SosLoss:
                         values[term.name] = values[term.name] + term.value(tile, activations.features)
                 if cache_this:
                     cached[-1][tile] = activations
-            numbers = torch.stack(list(values.values()))
-            merged.append(self.collectives.all_reduce_statistics(statistics or pass_.statistics.zero(), numbers))
-        for pass_, wait in zip(passes, merged, strict=True):
-            with self.timer("communication"):
-                statistics, numbers = wait()
-            with self.timer("statistics"):
-                values = dict(zip(TERMS, numbers.unbind(), strict=True)) | pass_.statistics.compare(statistics)
+            collected.append(statistics or pass_.statistics.zero())
+            numbers += values.values()
+        with self.timer("communication"):
+            every = [each for own in collected for each in own]
+            merged, sums = self.collectives.all_reduce_statistics(every, torch.stack(numbers))
+        parts = iter(merged)
+        with self.timer("statistics"):
+            for pass_, own, added in zip(passes, collected, sums.split(len(TERMS)), strict=True):
+                compared = pass_.statistics.compare([next(parts) for _ in own])
+                values = dict(zip(TERMS, added.unbind(), strict=True)) | compared
                 pass_.values = torch.stack(list(values.values()))
         return cached
 

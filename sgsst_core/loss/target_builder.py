@@ -16,7 +16,7 @@ from sgsst_core.loss.position_term import ScaledView
 from sgsst_core.loss.statistics_terms import compared_layers
 from sgsst_core.loss.targets import ContentFeatures, LayerTarget, StyleTarget, StyleTargets, StyleVectors, ViewTarget
 from sgsst_core.loss.tiling import Divider
-from sgsst_core.parallel.collectives import ALONE, Collectives, Merged
+from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, Size, rounds
 from sgsst_core.scene.pyramid import coverage_pyramid, downscale, resize_area, style_size
 from sgsst_core.settings import StyleLossName
@@ -112,19 +112,21 @@ class TargetBuilder:
         division = self._divider.divide({scale: _size(image) for scale, image in scaled.items()})
         targets: dict[int, dict[str, LayerTarget]] = {}
         for scales in rounds(list(scaled), self._collectives.size):
-            pending = {scale: self._merged_statistics(scaled[scale], division.tiles[scale]) for scale in scales}
-            for scale, merged in pending.items():
-                with self._timer("communication"):
-                    statistics = merged()[0]
+            every = [each for scale in scales for each in self._own_statistics(scaled[scale], division.tiles[scale])]
+            with self._timer("communication"):
+                numbers = torch.zeros(0, dtype=torch.float64, device=every[0].mean.device)
+                parts = iter(self._collectives.all_reduce_statistics(every, numbers)[0])
+            for scale in scales:
+                statistics = {layer: next(parts) for layer in self._compared}
                 targets[scale] = {
                     layer: LayerTarget.of(own)
-                    for layer, own in zip(self._compared, statistics, strict=True)
+                    for layer, own in statistics.items()
                     if min(_size(scaled[scale])) >= layer_stride(layer)
                 }
         return targets
 
-    def _merged_statistics(self, image: Tensor, tiles: Sequence[PartitionTile]) -> Merged:
-        """Compute the statistics of this rank's tiles of an image [h, w, 3], and start merging those of all ranks."""
+    def _own_statistics(self, image: Tensor, tiles: Sequence[PartitionTile]) -> list[LayerStatistics]:
+        """Return the statistics of this rank's tiles of an image [h, w, 3], by layer."""
         size, device = _size(image), image.device
         total: list[LayerStatistics] = []
         for tile in tiles:
@@ -132,10 +134,7 @@ class TargetBuilder:
             with self._timer("statistics"):
                 own = [layer_statistics(features[c][tile.owned_cells(c, size)[1].slices]) for c in self._compared]
                 total = [merge(*pair) for pair in zip(total, own, strict=True)] if total else own
-        zero = [LayerStatistics.zero(self._network.channels(layer), device) for layer in self._compared]
-        return self._collectives.all_reduce_statistics(
-            total or zero, torch.zeros(0, dtype=torch.float64, device=device)
-        )
+        return total or [LayerStatistics.zero(self._network.channels(layer), device) for layer in self._compared]
 
     def _style_vectors(self, images: Sequence[Tensor], weights: Sequence[float]) -> StyleVectors | None:
         """Compute the style vectors of weighted images [h, w, 3] at one scale.

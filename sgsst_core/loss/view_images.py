@@ -7,7 +7,7 @@ and the halo of this piece. Each rank's pixels of coarser scales are put togethe
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -16,7 +16,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.position_term import ScaledView
 from sgsst_core.loss.tiling import Division
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.parallel.division import Shares
+from sgsst_core.parallel.division import ImageExchange, Shares
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.timing import Timer
 
@@ -46,12 +46,11 @@ class ViewImages:
         whole = Rectangle(0, 0, image.shape[0], image.shape[1])
         self._own = _Pixels(image, 0, whole if shares is None else shares.windows[collectives.rank])
         self._size = whole.shape if shares is None else shares.size
-        self._finest: int | None = None if shares is None else shares.scale
-        self._coarse: _Pixels | None = None
+        self._shares = shares
         self._exchange: _Exchange | None = None
-        scale = None if shares is None else shares.exchanged_scale(division.pieces)
-        if shares is not None and scale is not None:
-            self._exchange = _Exchange.of(shares, division, scale, collectives, timer)
+        self._coarse: dict[int, _Pixels] = {}
+        if shares is not None and any(scale != shares.scale for scale in division.pieces):
+            self._exchange = _Exchange.of(shares, division, collectives, timer)
             self._coarse = self._exchange.gathered(self._own, background)
 
     def scaled(self, scale: int) -> ScaledView:
@@ -64,14 +63,16 @@ class ViewImages:
 
     def gradient(self) -> Tensor:
         """Return this rank's summand of the gradient with respect to the image, [h, w, 3]."""
-        if self._exchange is not None and self._coarse is not None:
+        if self._exchange is not None:
             self._exchange.add_gradient(self._coarse, self._own)
         assert self._own.gradient is not None
         return self._own.gradient
 
     def _source(self, scale: int) -> _Pixels:
         """Return the pixels from which those of a scale are computed."""
-        return self._own if self._coarse is None or scale == self._finest else self._coarse
+        if self._shares is None or scale == self._shares.scale:
+            return self._own
+        return self._coarse[self._shares.exchanged_scale(scale)]
 
 
 @dataclass
@@ -105,50 +106,45 @@ class _Pixels:
 
 @dataclass(frozen=True)
 class _Exchange:
-    """Exchange of a coarser image between ranks.
+    """Exchange of coarser images between ranks.
 
     Attributes:
-        scale: Scale of the image.
         own: This rank's part of the view, relative to its window.
-        parts: Rectangle of the image that each rank computes.
-        windows: Rectangle of the image that each rank needs.
+        images: Rectangles of each exchanged image by scale.
         collectives: Collectives of the ranks.
         timer: Timer for `communication`.
     """
 
-    scale: int
     own: Rectangle
-    parts: Sequence[Rectangle]
-    windows: Sequence[Rectangle]
+    images: dict[int, ImageExchange]
     collectives: Collectives
     timer: Timer
 
     @staticmethod
-    def of(shares: Shares, division: Division, scale: int, collectives: Collectives, timer: Timer) -> _Exchange:
+    def of(shares: Shares, division: Division, collectives: Collectives, timer: Timer) -> _Exchange:
         rank = collectives.rank
         by_rank = [list(itertools.chain(*own)) for own in zip(*division.pieces.values(), strict=True)]
-        return _Exchange(
-            scale,
-            shares.parts[rank].within(shares.windows[rank]),
-            [part.at_scale(scale) for part in shares.parts],
-            shares.coarse_windows(by_rank, division.halo, scale),
-            collectives,
-            timer,
-        )
+        own = shares.parts[rank].within(shares.windows[rank])
+        return _Exchange(own, shares.exchanges(by_rank, division.halo), collectives, timer)
 
-    def gathered(self, pixels: _Pixels, background: tuple[float, float, float]) -> _Pixels:
-        """Return the pixels of the image that this rank needs, given those that it renders."""
-        own, area = downscale(pixels.image[self.own.slices], self.scale), self.windows[self.collectives.rank]
-        image = own.new_empty((*area.shape, 3))
-        for channel, color in zip(image.unbind(-1), background, strict=True):
-            channel.fill_(color)  # scalars are kernel arguments, so the host does not wait for a copy to the device
+    def gathered(self, pixels: _Pixels, background: tuple[float, float, float]) -> dict[int, _Pixels]:
+        """Return the pixels of each image that this rank needs, given those that it renders."""
+        own = [downscale(pixels.image[self.own.slices], scale) for scale in self.images]
+        areas = [exchange.windows[self.collectives.rank] for exchange in self.images.values()]
+        images = [pixels.image.new_empty((*area.shape, 3)) for area in areas]
+        for image in images:
+            for channel, color in zip(image.unbind(-1), background, strict=True):
+                channel.fill_(color)  # scalars are kernel arguments, so the host does not wait for a copy to the device
         with self.timer("communication"):
-            self.collectives.gather_parts(own, self.parts, image, self.windows)
-        return _Pixels(image, self.scale, area)
+            self.collectives.gather_parts([*self.images.values()], own, images)
+        return {
+            scale: _Pixels(image, scale, area) for scale, image, area in zip(self.images, images, areas, strict=True)
+        }
 
-    def add_gradient(self, coarse: _Pixels, pixels: _Pixels) -> None:
-        """Add the sum of all ranks' gradients of the image to the gradient of the pixels that this rank renders."""
-        assert coarse.gradient is not None
+    def add_gradient(self, coarse: Mapping[int, _Pixels], pixels: _Pixels) -> None:
+        """Add the sums of all ranks' gradients of the images to the gradient of the pixels that this rank renders."""
+        gradients = [image.gradient for image in coarse.values() if image.gradient is not None]
         with self.timer("communication"):
-            own = self.collectives.reduce_parts(coarse.gradient, self.parts, self.windows)
-        pixels.add_gradient(self.scale, own, area=self.own)
+            own = self.collectives.reduce_parts([*self.images.values()], gradients)
+        for scale, gradient in zip(self.images, own, strict=True):
+            pixels.add_gradient(scale, gradient, area=self.own)

@@ -12,14 +12,10 @@ from typing import Any, Literal, Protocol, TypeVar, get_args
 
 from torch import Tensor
 
-from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics
+from sgsst_core.parallel.division import ImageExchange
 
 T = TypeVar("T")
-
-#: Function that waits for a pending `all_reduce_statistics`. It returns the statistics merged over all ranks, and the
-#: sum [k] float64 of all ranks' numbers. On a GPU, only the device waits; the caller is not blocked.
-Merged = Callable[[], tuple[list[LayerStatistics], Tensor]]
 
 #: Purposes for which tensors are sent.
 Traffic = Literal["image", "statistics", "gradient"]
@@ -50,20 +46,22 @@ class Collectives(Protocol):
         ...
 
     def gather_parts(
-        self, part: Tensor, parts: Sequence[Rectangle], window: Tensor, windows: Sequence[Rectangle]
+        self, exchanges: Sequence[ImageExchange], parts: Sequence[Tensor], windows: Sequence[Tensor]
     ) -> None:
-        """Fill each rank's window of an image from every rank's part of it.
+        """Fill each rank's windows of some images from every rank's parts of them.
 
         Args:
-            part: [h, w, ...], part of this rank.
-            parts: Rectangle of each rank's part in the image; they are disjoint.
-            window: [h, w, ...], window of this rank. Pixels in no part are left unchanged.
-            windows: Rectangle of each rank's window in the image; may be empty.
+            exchanges: Rectangles of the parts and windows of each image.
+            parts: [h, w, ...], part of this rank of each image.
+            windows: [h, w, ...], window of this rank of each image. Pixels in no part are left unchanged.
         """
         ...
 
-    def reduce_parts(self, window: Tensor, parts: Sequence[Rectangle], windows: Sequence[Rectangle]) -> Tensor:
-        """Return this rank's part [h, w, ...] of the sum of all ranks' windows; adjoint of `gather_parts`."""
+    def reduce_parts(self, exchanges: Sequence[ImageExchange], windows: Sequence[Tensor]) -> list[Tensor]:
+        """Return this rank's part [h, w, ...] of the sum of all ranks' windows, for each image.
+
+        This is the adjoint of `gather_parts`.
+        """
         ...
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
@@ -74,11 +72,17 @@ class Collectives(Protocol):
         """Return the elementwise OR of all ranks' masks [n] bool, identical on all ranks."""
         ...
 
-    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
-        """Start merging the ranks' statistics of disjoint positions, by layer, and summing their numbers [k] float64.
+    def all_reduce_statistics(
+        self, parts: Sequence[LayerStatistics], numbers: Tensor
+    ) -> tuple[list[LayerStatistics], Tensor]:
+        """Merge all ranks' statistics of disjoint positions, and sum their numbers; identical on all ranks.
 
-        Returns immediately. The returned function waits for the result, which is identical on all ranks. No other kind
-        of collective may be started before all pending functions have been called.
+        Args:
+            parts: Statistics of this rank's positions, such as of each layer at each scale.
+            numbers: [k] float64, numbers to sum over the ranks.
+
+        Returns:
+            Merged statistics in the order of `parts`, and the sums [k] float64.
         """
         ...
 
@@ -122,16 +126,17 @@ class _Alone:
     sent: Mapping[Traffic, int] = MappingProxyType(dict.fromkeys(TRAFFIC, 0))
 
     def gather_parts(
-        self, part: Tensor, parts: Sequence[Rectangle], window: Tensor, windows: Sequence[Rectangle]
+        self, exchanges: Sequence[ImageExchange], parts: Sequence[Tensor], windows: Sequence[Tensor]
     ) -> None:
-        shared = parts[0].intersection(windows[0])
-        window[shared.within(windows[0]).slices] = part[shared.within(parts[0]).slices]
+        for exchange, part, window in zip(exchanges, parts, windows, strict=True):
+            exchange.in_window(window, 0, 0).copy_(exchange.in_part(part, 0, 0))
 
-    def reduce_parts(self, window: Tensor, parts: Sequence[Rectangle], windows: Sequence[Rectangle]) -> Tensor:
-        total = window.new_zeros((*parts[0].shape, *window.shape[2:]))
-        shared = parts[0].intersection(windows[0])
-        total[shared.within(parts[0]).slices] = window[shared.within(windows[0]).slices]
-        return total
+    def reduce_parts(self, exchanges: Sequence[ImageExchange], windows: Sequence[Tensor]) -> list[Tensor]:
+        totals = []
+        for exchange, window in zip(exchanges, windows, strict=True):
+            totals.append(window.new_zeros((*exchange.parts[0].shape, *window.shape[2:])))
+            exchange.in_part(totals[-1], 0, 0).copy_(exchange.in_window(window, 0, 0))
+        return totals
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         return tensor
@@ -139,8 +144,10 @@ class _Alone:
     def union(self, mask: Tensor) -> Tensor:
         return mask
 
-    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
-        return lambda: (list(parts), numbers)
+    def all_reduce_statistics(
+        self, parts: Sequence[LayerStatistics], numbers: Tensor
+    ) -> tuple[list[LayerStatistics], Tensor]:
+        return list(parts), numbers
 
     def all_gather(self, value: T) -> list[T]:
         return [value]

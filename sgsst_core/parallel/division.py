@@ -7,8 +7,10 @@ rounding of results, because partition tiles give exact gradients for any divisi
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from torch import Tensor
 
 from sgsst_core.features.partition import PartitionTile, Rectangle, partition
 from sgsst_core.features.vgg import ALIGNMENT
@@ -44,6 +46,35 @@ class Piece:
 
 
 @dataclass(frozen=True)
+class ImageExchange:
+    """Rectangles of an image that ranks have and need.
+
+    Attributes:
+        parts: Rectangle of each rank's part; they are disjoint.
+        windows: Rectangle that each rank needs; may be empty.
+    """
+
+    parts: Sequence[Rectangle]
+    windows: Sequence[Rectangle]
+
+    def in_part(self, part: Tensor, rank: int, other: int) -> Tensor:
+        """Return the pixels [h, w, ...] of a rank's part that are in another rank's window."""
+        return part[self.parts[rank].intersection(self.windows[other]).within(self.parts[rank]).slices]
+
+    def in_window(self, window: Tensor, rank: int, other: int) -> Tensor:
+        """Return the pixels [h, w, ...] of a rank's window that are in another rank's part."""
+        return window[self.windows[rank].intersection(self.parts[other]).within(self.windows[rank]).slices]
+
+    def moved(self, rank: int) -> tuple[int, int]:
+        """Return the number of pixels that a rank sends to others, and that it receives from them."""
+        others = [other for other in range(len(self.parts)) if other != rank]
+        return (
+            sum(self.parts[rank].intersection(self.windows[other]).pixels for other in others),
+            sum(self.parts[other].intersection(self.windows[rank]).pixels for other in others),
+        )
+
+
+@dataclass(frozen=True)
 class Shares:
     """Rectangles of a view, at full size, that the ranks render. Those of a rank without pixels are empty.
 
@@ -71,28 +102,36 @@ class Shares:
             tuple(piece.tile(halo).outer.at_full_size(scale) if piece else _NOTHING for piece in own),
         )
 
-    def exchanged_scale(self, scales: Iterable[int]) -> int | None:
-        """Return the scale of the image that ranks exchange to compute some scales; None if they need none.
+    def exchanged_scale(self, scale: int) -> int:
+        """Return the scale of the exchanged image from which ranks compute their pixels of a coarser scale.
 
-        Coarser scales are computed from it. The edges of parts are between its pixels.
+        It is the scale itself, unless its pixels are too large for the edges of parts to lie between them.
         """
-        coarser = [scale for scale in scales if scale != self.scale]
-        return min(*coarser, self.scale + ALIGNMENT.bit_length() - 1) if coarser else None
+        return min(scale, self.scale + ALIGNMENT.bit_length() - 1)
 
-    def coarse_windows(self, by_rank: Sequence[Sequence[Piece]], halo: int, scale: int) -> list[Rectangle]:
-        """Return the rectangle of the exchanged image that each rank needs for its pieces of coarser scales.
+    def exchanges(self, by_rank: Sequence[Sequence[Piece]], halo: int) -> dict[int, ImageExchange]:
+        """Return the exchange of each image, by its scale, that gives ranks their pieces of coarser scales.
 
         Args:
             by_rank: Pieces of each rank.
             halo: Width in pixels of the halo around a tile.
-            scale: Scale of the exchanged image.
         """
-        return [
-            self._coarse_window([p for p in pieces if p.scale != self.scale and p.region.pixels], halo, scale)
-            for pieces in by_rank
-        ]
+        coarser = [[piece for piece in pieces if piece.scale != self.scale] for pieces in by_rank]
+        scales = sorted({self.exchanged_scale(piece.scale) for pieces in coarser for piece in pieces})
+        return {
+            scale: ImageExchange(
+                tuple(part.at_scale(scale) for part in self.parts),
+                tuple(
+                    self._window([p for p in pieces if self.exchanged_scale(p.scale) == scale], halo, scale)
+                    for pieces in coarser
+                ),
+            )
+            for scale in scales
+        }
 
-    def _coarse_window(self, pieces: Sequence[Piece], halo: int, scale: int) -> Rectangle:
+    def _window(self, pieces: Sequence[Piece], halo: int, scale: int) -> Rectangle:
+        """Return the rectangle of an exchanged image that contains the pixels of some pieces and of their halos."""
+        pieces = [piece for piece in pieces if piece.region.pixels]
         if not pieces:
             return _NOTHING
         outer = [piece.tile(halo).outer.at_full_size(piece.scale - scale) for piece in pieces]
@@ -115,9 +154,10 @@ def divide(
 ) -> tuple[tuple[Piece, ...], ...]:
     """Divide pieces among ranks in proportion to their speeds.
 
-    The ranks are recursively split into two halves, and the pieces are divided between the halves: larger pieces go to
-    one half, smaller pieces to the other, and the piece in between is split so that the costs, including halos, match
-    the speeds. Each split therefore adds two halos in total, instead of two per scale.
+    The ranks are recursively split into two halves, and the pieces are divided between the halves. Only pieces that
+    cost more than a rank's average are split, because each split adds two halos; smaller pieces go to the half with
+    less work. The largest piece is split last, so that the costs, including halos, match the speeds. Coarse scales are
+    thereby spread over the ranks: each rank has few pieces, and no rank receives most of the exchanged images.
 
     Args:
         pieces: One piece per scale.
@@ -152,40 +192,44 @@ def _divide(pieces: tuple[Piece, ...], speeds: tuple[float, ...], costs: _Costs)
     if len(speeds) == 1:
         return (tuple(sorted(pieces, key=lambda piece: piece.scale)),)
     half = len(speeds) // 2
-    fraction = sum(speeds[:half]) / sum(speeds)
-    first, second = _halves(pieces, fraction, costs.of)
+    first, second = _halves(pieces, sum(speeds[:half]) / sum(speeds), len(speeds), costs)
     return _divide(first, speeds[:half], costs) + _divide(second, speeds[half:], costs)
 
 
 def _halves(
-    pieces: tuple[Piece, ...], fraction: float, cost: Callable[[Piece], float]
+    pieces: tuple[Piece, ...], fraction: float, ranks: int, costs: _Costs
 ) -> tuple[tuple[Piece, ...], tuple[Piece, ...]]:
-    """Divide pieces into two sets; the first set has a given fraction of the cost."""
-    ordered = sorted(pieces, key=lambda piece: -cost(piece))
-    costs = [cost(piece) for piece in ordered]
-    total = sum(costs)
-    before = 0.0
-    index = 0  # index of the piece to split
-    while index < len(ordered) - 1 and before + costs[index] < fraction * total:
-        before += costs[index]
-        index += 1
+    """Divide the pieces of some ranks into two sets; the first set has a given fraction of the cost."""
+    total = sum(map(costs.of, pieces))
     if not total:
-        return tuple(ordered), ()
-    after = total - before - costs[index]
+        return pieces, ()
+    largest, *others = sorted(pieces, key=lambda piece: -costs.of(piece))
+    halves: tuple[list[Piece], list[Piece]] = [], []
+    loads = [0.0, 0.0]
 
     def load(parts: tuple[Piece | None, Piece | None]) -> float:
-        own, other = (cost(part) if part else 0 for part in parts)
-        return max((before + own) / fraction, (after + other) / (1 - fraction))
+        own, other = (costs.of(part) if part else 0 for part in parts)
+        return max((loads[0] + own) / fraction, (loads[1] + other) / (1 - fraction))
 
-    left, right = min(_splits(ordered[index]), key=load)
-    first = (*ordered[:index], *((left,) if left else ()))
-    return first, (*((right,) if right else ()), *ordered[index + 1 :])
+    for piece in [*others, largest]:
+        is_split = piece is largest or costs.of(piece) > total / ranks
+        parts = min(_splits(piece) if is_split else _whole(piece), key=load)
+        for side, part in enumerate(parts):
+            if part is not None:
+                halves[side].append(part)
+                loads[side] += costs.of(part)
+    return tuple(halves[0]), tuple(halves[1])
+
+
+def _whole(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
+    """Return both ways to divide a piece without splitting it."""
+    return [(piece, None), (None, piece)]
 
 
 def _splits(piece: Piece) -> list[tuple[Piece | None, Piece | None]]:
     """Return all ways to split a piece in two: at every 16th row or column, or not at all."""
     area = piece.region
-    splits: list[tuple[Piece | None, Piece | None]] = [(piece, None), (None, piece)]
+    splits = _whole(piece)
 
     def part(region: Rectangle) -> Piece:
         return Piece(piece.scale, piece.size, region)

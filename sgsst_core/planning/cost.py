@@ -29,7 +29,7 @@ from sgsst_core.features.vgg import layer_stride
 from sgsst_core.loss.nearest import MATCH_BYTES, MOST_VECTORS, working_bytes
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.tiling import RENDERING, Tiling
-from sgsst_core.parallel.collectives import Traffic
+from sgsst_core.parallel.collectives import TRAFFIC, Traffic
 from sgsst_core.parallel.division import Piece, Shares, Size, divide, loads, rounds
 from sgsst_core.parallel.shown import gaussians_sent
 from sgsst_core.planning.facts import Link, NetworkFacts, Probe
@@ -87,7 +87,7 @@ _COLOR_BYTES = 12
 #: Bytes per pixel of the content image at all scales, float32. It is cached if the background changes from step to
 #: step.
 _IMAGE_BYTES = 16
-#: Bytes per pixel of a region's map at all scales, float32, and number of maps computed by one render.
+#: Bytes per pixel of coverage or of a region's map at all scales, float32, and number of maps computed by one render.
 MAP_BYTES, MAPS_OF_A_RENDER = 16 / 3, 3
 #: Memory of measurements and report, apart from iterations and tile intersections: libraries, LPIPS, images.
 MEASURING_BYTES = 100 << 20
@@ -333,6 +333,7 @@ class ViewCosts:
         content: Content features at all scales, including their render.
         content_coarse: Content features of the coarsest scale alone.
         images: Content images, from which features are computed with another background color.
+        coverage: Coverage, if it weights statistics.
         maps: Maps of the regions.
         raster: Time in seconds of a render and its gradient with recomputed weights.
         raster_cached: Time in seconds of a render and its gradient with cached weights.
@@ -348,6 +349,7 @@ class ViewCosts:
     content: ViewData
     content_coarse: ViewData
     images: ViewData
+    coverage: ViewData
     maps: ViewData
     raster: float
     raster_cached: float
@@ -388,12 +390,15 @@ class ViewCosts:
             # Features depend on the step's background color, so images are cached in their place.
             images, rendered = ViewData(rendered, _IMAGE_BYTES * pixels, content_budget / 2), 0.0
             content_budget = 0
-        maps = ViewData(0.0)
+        coverage = maps = ViewData(0.0)
+        if plan.weighted:
+            coverage = ViewData(_RENDER * raster.seconds, MAP_BYTES * pixels, view_budget / 4)
         if probe.maps:
             renders = 1 + -(-probe.maps // MAPS_OF_A_RENDER)  # plus one for the background
             maps = ViewData(_RENDER * renders * raster.seconds, MAP_BYTES * probe.maps * pixels, view_budget / 4)
         coarse_content = content * (coarse.pixels / work.pixels)  # bytes are in proportion to pixels
         return ViewCosts(
+            coverage=coverage,
             maps=maps,
             intersections=intersections,
             surveyed=surveyed,
@@ -424,7 +429,8 @@ class ViewCosts:
             content_coarse=part.data(self.content_coarse, 1 / part.ranks),
             # Images are counted with their whole sizes, on which all ranks agree.
             images=replace(part.data(self.images, part.window), budget=self.images.budget * part.memory * part.window),
-            maps=part.data(self.maps, 1.0),  # every rank has the whole maps
+            coverage=part.data(self.coverage, 1.0),  # every rank has the whole coverage, and the whole maps
+            maps=part.data(self.maps, 1.0),
             raster=part.seconds(self.raster, raster),
             raster_cached=part.seconds(self.raster_cached, raster),
         )
@@ -437,16 +443,18 @@ class ViewCosts:
         return uncached + self.colors.always
 
     def later(self, *, coarse: bool) -> float:
-        """Return the time in seconds to recompute uncached content and region maps at every visit."""
-        return (self.content_coarse if coarse else self.content).always + self.images.always + self.maps.always
+        """Return the time in seconds to recompute uncached content, coverage and region maps at every visit."""
+        content = (self.content_coarse if coarse else self.content).always
+        return content + self.images.always + self.coverage.always + self.maps.always
 
     def first(self, *, coarse: bool) -> float:
         """Return the additional time in seconds of a view's first visit in a phase."""
         content = (self.content_coarse if coarse else self.content).once + self.images.once
         if self.in_coarse and not coarse:
             return content
-        intersections = (1 - self.reused) * self.intersections.once + self.colors.once + self.maps.once
-        return content + intersections + (self.weights.once if self.weights else 0.0)
+        maps = self.coverage.once + self.maps.once
+        intersections = (1 - self.reused) * self.intersections.once + self.colors.once
+        return content + maps + intersections + (self.weights.once if self.weights else 0.0)
 
 
 def proportional(seconds: float) -> Callable[[RankPart], float]:
@@ -468,7 +476,7 @@ class IterationWork:
         halo: Pixels around a partition tile.
         pixel: Seconds per pixel through the network: both passes and statistics.
         raster: Function that returns the time in seconds of render, gradient and uncached data of the view for a part.
-        fixed: Seconds that every rank needs regardless of their number: comparing statistics, and the optimizer.
+        fixed: Seconds that every rank needs regardless of their number, such as those of the optimizer.
         gaussians: Number of optimized Gaussians.
         forward: Seconds per pixel of a forward pass alone, for pixels whose activations are not cached.
         held: Number of pixels whose activations a single rank can hold (see `choose_tile_size`).
@@ -480,6 +488,8 @@ class IterationWork:
         rendered: One piece for each scale of the job, whose division determines what each rank renders; empty if these
             are `pieces`.
         rendering: Cost of rendering a pixel that the division assumes; see `Tiling`.
+        launch: Seconds to launch the kernels of a partition tile, during which a GPU works on; 0 on a CPU.
+        graphs: Whether a single rank launches all kernels of the loss as one CUDA graph, in almost no time.
     """
 
     pieces: tuple[Piece, ...]
@@ -497,6 +507,8 @@ class IterationWork:
     largest_tile: int | None = None
     rendered: tuple[Piece, ...] = ()
     rendering: float = 0.0
+    launch: float = 0.0
+    graphs: bool = False
 
     def computing(self, ranks: int, groups: int = 1) -> float:
         """Return the computing time in seconds of the rank with most work.
@@ -521,12 +533,13 @@ class IterationWork:
     def _network(self, shard: Sequence[Piece], ranks: int, held: float) -> float:
         """Return the time in seconds of a rank's pieces, split into partition tiles as its memory requires."""
         areas = {piece.scale: self._areas(piece, held) for piece in shard if piece.region.pixels}
+        launching = 0.0 if self.graphs and ranks == 1 else self.launch * sum(map(len, areas.values()))
         seconds = 0.0
         for scales in rounds(list(areas), ranks):
             together = [area for scale in scales for area in areas[scale]]
             twice = computed_twice(together, cached_tiles(together, held, self.working))
             seconds += sum(together) * self.pixel + twice * self.forward
-        return seconds
+        return max(seconds, launching)
 
     def _areas(self, piece: Piece, held: float) -> list[int]:
         size = choose_tile_size(
@@ -535,16 +548,20 @@ class IterationWork:
         return [tile.outer.pixels for tile in partition(*piece.size, size, self.halo, piece.region)]
 
     def communication(self, ranks: int, link: Link) -> float:
-        """Return the time in seconds that ranks wait for data.
+        """Return the time in seconds that ranks wait for data."""
+        return sum(self.waiting(ranks, link).values())
 
-        Only the statistics of the last scale count; other scales' reductions overlap computation.
-        """
+    def waiting(self, ranks: int, link: Link) -> dict[Traffic, float]:
+        """Return the time in seconds that ranks wait for data, by purpose."""
         if ranks == 1:
-            return 0.0
+            return dict.fromkeys(TRAFFIC, 0.0)
         busiest = max(max(sent, received) for sent, received in self._image_bytes(ranks))
-        image = 2 * (link.all_gather(0, ranks) + busiest / link.bandwidth)
-        statistics = link.all_reduce(_FIRST_BYTES, ranks) + link.all_reduce(_SECOND_BYTES, ranks)
-        return image + statistics + link.all_reduce(self._gradient_bytes, ranks)
+        scales = len(self.pieces)
+        return {
+            "image": 2 * (link.all_gather(0, ranks) + busiest / link.bandwidth),
+            "statistics": sum(link.all_reduce(scales * size, ranks) for size in (_FIRST_BYTES, _SECOND_BYTES)),
+            "gradient": link.all_reduce(self._gradient_bytes, ranks),
+        }
 
     def sent(self, ranks: int) -> dict[Traffic, int]:
         """Return the bytes that a rank sends for each purpose, at all scales, as counted by `Collectives.sent`.
@@ -572,17 +589,9 @@ class IterationWork:
 
     def _image_bytes(self, ranks: int) -> list[tuple[int, int]]:
         """Return the bytes of the image that each rank sends and receives; those of its gradient go the other way."""
-        shares = self._shares(ranks)
-        scale = shares.exchanged_scale(piece.scale for piece in self.pieces)
-        if scale is None:
-            return [(0, 0)] * ranks
-        windows = shares.coarse_windows(self.shards(ranks), self.halo, scale)
-        parts = [part.at_scale(scale) for part in shares.parts]
-        shared = [[12 * part.intersection(window).pixels for window in windows] for part in parts]
-        return [
-            (sum(shared[rank]) - shared[rank][rank], sum(row[rank] for row in shared) - shared[rank][rank])
-            for rank in range(ranks)
-        ]
+        exchanges = self._shares(ranks).exchanges(self.shards(ranks), self.halo).values()
+        moved = [[exchange.moved(rank) for exchange in exchanges] for rank in range(ranks)]
+        return [(12 * sum(sent for sent, _ in each), 12 * sum(received for _, received in each)) for each in moved]
 
     @property
     def _gradient_bytes(self) -> int:
@@ -759,6 +768,8 @@ class CostModel:
     def _sampled(self, *, coarsest: bool) -> list[IterationWork]:
         """Return the work of iterations of a sample of views: of phase 1, or on all scales."""
         network, sharing, plan = self._probe.network, self._probe.machine.sharing, self._plan
+        tile = network.fixed.both  # on a GPU, the time to launch its kernels
+        fixed, launch = (tile, 0.0) if self._probe.machine.device == "cpu" else (0.0, tile)
         sample = range(0, len(self.sizes), max(1, len(self.sizes) // _SAMPLED_VIEWS))
 
         def raster(part: RankPart) -> float:
@@ -771,7 +782,7 @@ class CostModel:
                 network.halo,
                 network.rate.both,
                 raster,
-                network.fixed.both * len(pieces),
+                fixed * len(pieces),
                 int(plan.seen.sum()),
                 forward=network.rate.features,
                 held=self.tiling.held * sharing,
@@ -782,6 +793,8 @@ class CostModel:
                 largest_tile=network.largest_tile,
                 rendered=rendered,
                 rendering=self.tiling.rendering,
+                launch=launch,
+                graphs=plan.graphs,
             )
             for pieces, rendered in zip(self._pieces(sample, coarsest=coarsest), self._pieces(sample), strict=True)
         ]
@@ -993,13 +1006,14 @@ class _PeakMemory:
     def _content(self) -> int:
         """Return the size in bytes of content features: those of the coarsest scale in phase 1, all of them in phase 2.
 
-        Content images, if they are cached instead, and maps of regions are included.
+        Content images, if they are cached instead, coverage and maps of regions are included.
         """
         views = self.views
-        content, coarse, images, maps = views.content, views.content_coarse, views.images, views.maps
+        content, coarse = views.content, views.content_coarse
         in_sos = self._visited(self.settings.steps_sos)
         features = in_sos * content.bytes + (self._all_visited - in_sos) * coarse.bytes
-        beside = sum(min(self._all_visited * data.bytes, data.budget) for data in (images, maps))
+        others = views.images, views.coverage, views.maps
+        beside = sum(min(self._all_visited * data.bytes, data.budget) for data in others)
         return int(min(features, content.budget) + beside)
 
     def _weights(self) -> int:

@@ -12,7 +12,7 @@ from sgsst_core.budget import Cache
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.tiling import Divider
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.parallel.division import Shares
+from sgsst_core.parallel.division import ImageExchange, Shares
 from sgsst_core.parallel.shown import ShownGaussians
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
@@ -108,7 +108,8 @@ class Views:
         image = own.new_zeros((*shares.size, *own.shape[2:]))
         with self.timer("communication"):
             everything = Rectangle(0, 0, *shares.size)
-            self.collectives.gather_parts(own, shares.parts, image, [everything] * self.collectives.size)
+            exchange = ImageExchange(shares.parts, [everything] * self.collectives.size)
+            self.collectives.gather_parts([exchange], [own], [image])
         return image
 
     def shares(self, index: int) -> Shares | None:

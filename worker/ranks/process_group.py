@@ -13,8 +13,8 @@ import os
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import timedelta
 from ipaddress import ip_address
 from typing import Any, TypeVar
@@ -25,9 +25,9 @@ from torch import Tensor
 from torch.distributed.distributed_c10d import _set_pg_timeout
 
 from sgsst_core.errors import SgsstError
-from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics
-from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, Merged, Traffic
+from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, Traffic
+from sgsst_core.parallel.division import ImageExchange
 from worker.processes import interface_towards, listen, split_address
 from worker.ranks.messages import decode, encode
 
@@ -77,11 +77,9 @@ def process_group(
     # that the job has left out by then.
     world: Any = dist.group.WORLD
     world.bound_device_id = None
-    collectives = ProcessGroupCollectives(world, device, timeout, sharing)
     try:
-        yield collectives
+        yield ProcessGroupCollectives(world, device, timeout, sharing)
     finally:
-        collectives.close()
         dist.destroy_process_group()
 
 
@@ -155,6 +153,23 @@ def with_index(device: torch.device | str) -> torch.device:
     return indexed
 
 
+@dataclass(frozen=True)
+class _Stack:
+    """Statistics of several parts with the same number of channels: count [k, 1], mean [k, c], centered [k, c, c]."""
+
+    count: Tensor
+    mean: Tensor
+    centered: Tensor
+
+    @staticmethod
+    def of(parts: Sequence[LayerStatistics]) -> _Stack:
+        return _Stack(
+            torch.stack([part.count for part in parts])[:, None],
+            torch.stack([part.mean for part in parts]),
+            torch.stack([part.centered for part in parts]),
+        )
+
+
 class ProcessGroupCollectives:
     """`Collectives` of a torch.distributed group.
 
@@ -182,65 +197,57 @@ class ProcessGroupCollectives:
         self._named = _named(device, _backend(device, gpu_sharing))
         self._timeout = timeout
         self.sent: dict[Traffic, int] = dict.fromkeys(TRAFFIC, 0) if sent is None else sent
-        self._subgroups: list[ProcessGroupCollectives] = []
         self._halves: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
-        # Statistics are exchanged while the next scale is computed: on a separate stream of a GPU, or in a thread on a
-        # CPU. It must be a single thread, because exchanges are matched by their order.
-        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
-        self._background = ThreadPoolExecutor(1, thread_name_prefix="collectives")
         self.local_size = self.all_gather(_machine()).count(_machine())
 
-    def close(self) -> None:
-        """Finish pending exchanges. No exchange may be started afterwards."""
-        for subgroup in self._subgroups:
-            subgroup.close()
-        self._background.shutdown(cancel_futures=True)
-
     def gather_parts(
-        self, part: Tensor, parts: Sequence[Rectangle], window: Tensor, windows: Sequence[Rectangle]
+        self, exchanges: Sequence[ImageExchange], parts: Sequence[Tensor], windows: Sequence[Tensor]
     ) -> None:
         """See `Collectives`."""
-        own_part, own_window = parts[self.rank], windows[self.rank]
-        sent = [own_part.intersection(other).within(own_part) for other in windows]
-        received = [own_window.intersection(other).within(own_window) for other in parts]
-        for area, values in zip(received, self._exchange(part, sent, received), strict=True):
-            window[area.slices] = values
+        ranks, own = range(self.size), self.rank
+        sent = [[each.in_part(part, own, r) for r in ranks] for each, part in zip(exchanges, parts, strict=True)]
+        received = [[each.in_window(w, own, r) for r in ranks] for each, w in zip(exchanges, windows, strict=True)]
+        for target, values in self._exchange(sent, received):
+            target.copy_(values)
 
-    def reduce_parts(self, window: Tensor, parts: Sequence[Rectangle], windows: Sequence[Rectangle]) -> Tensor:
+    def reduce_parts(self, exchanges: Sequence[ImageExchange], windows: Sequence[Tensor]) -> list[Tensor]:
         """See `Collectives`."""
-        own_part, own_window = parts[self.rank], windows[self.rank]
-        sent = [own_window.intersection(other).within(own_window) for other in parts]
-        received = [own_part.intersection(other).within(own_part) for other in windows]
-        total = window.new_zeros((*own_part.shape, *window.shape[2:]))
-        for area, values in zip(received, self._exchange(window, sent, received), strict=True):
-            total[area.slices] += values  # in the order of ranks, whichever this one is
-        return total
+        ranks, own = range(self.size), self.rank
+        totals = [
+            window.new_zeros((*each.parts[own].shape, *window.shape[2:]))
+            for each, window in zip(exchanges, windows, strict=True)
+        ]
+        sent = [[each.in_window(w, own, r) for r in ranks] for each, w in zip(exchanges, windows, strict=True)]
+        received = [[each.in_part(total, own, r) for r in ranks] for each, total in zip(exchanges, totals, strict=True)]
+        for target, values in self._exchange(sent, received):
+            target += values  # in the order of ranks, whichever this one is
+        return totals
 
-    def _exchange(self, image: Tensor, sent: Sequence[Rectangle], received: Sequence[Rectangle]) -> list[Tensor]:
-        """Send a rectangle of an image [h, w, ...] to each rank.
+    def _exchange(
+        self, sent: Sequence[Sequence[Tensor]], received: Sequence[Sequence[Tensor]]
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Send a rectangle of each image to each rank, all in one message.
 
         Args:
-            image: Image of this rank.
-            sent: Rectangle of the image for each rank; may be empty.
-            received: Rectangle of the size that each rank sends to this one.
+            sent: Rectangles of each image for each rank; may be empty.
+            received: Rectangles of the sizes that each rank sends to this one.
 
-        Returns:
-            Values [h, w, ...] from each rank.
+        Yields:
+            Each of `received` and the values for it, ordered by rank.
         """
-        beside = image.shape[2:]
-        values = [image[area.slices] for area in sent]
-        others = [part.reshape(-1) for rank, part in enumerate(values) if rank != self.rank]
-        flat = torch.cat(others)
-        counts = [area.pixels * beside.numel() for area in sent]
-        expected = [area.pixels * beside.numel() for area in received]
-        counts[self.rank] = expected[self.rank] = 0
-        into = image.new_empty(sum(expected))
+        others = [rank for rank in range(self.size) if rank != self.rank]
+        flat = torch.cat([image[rank].reshape(-1) for rank in others for image in sent])
+        counts, expected = (
+            [sum(image[rank].numel() for image in images) * (rank != self.rank) for rank in range(self.size)]
+            for images in (sent, received)
+        )
+        into = flat.new_empty(sum(expected))
         self.sent["image"] += flat.nbytes
         dist.all_to_all_single(into, flat, expected, counts, group=self._group)
-        return [
-            values[rank] if rank == self.rank else part.view(*area.shape, *beside)
-            for rank, (part, area) in enumerate(zip(into.split(expected), received, strict=True))
-        ]
+        values = iter(into.split([image[rank].numel() for rank in others for image in received]))
+        for rank in range(self.size):
+            for source, target in zip(sent, received, strict=True):
+                yield target[rank], source[rank] if rank == self.rank else next(values).view_as(target[rank])
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         """See `Collectives`."""
@@ -256,52 +263,44 @@ class ProcessGroupCollectives:
         dist.all_reduce(tensor, operation, group=self._group)
         return tensor
 
-    def all_reduce_statistics(self, parts: Sequence[LayerStatistics], numbers: Tensor) -> Merged:
-        """See `Collectives`."""
-        if self._stream is None:
-            return self._background.submit(self._merge, list(parts), numbers).result
-        return self._merge_on(self._stream, list(parts), numbers)
+    def all_reduce_statistics(
+        self, parts: Sequence[LayerStatistics], numbers: Tensor
+    ) -> tuple[list[LayerStatistics], Tensor]:
+        """See `Collectives`.
 
-    def _merge_on(self, stream: torch.cuda.Stream, parts: list[LayerStatistics], numbers: Tensor) -> Merged:
-        """Merge on a stream of the GPU, concurrently with the caller's stream and without blocking the host."""
-        stream.wait_stream(torch.cuda.current_stream(self._device))
-        _keep_for(stream, parts, numbers)
-        with torch.cuda.stream(stream):
-            merged, added = self._merge(parts, numbers)
-        ended = stream.record_event()
+        First the means are merged, then the second moments about the common mean. The second moment C of all positions
+        is the sum over ranks r of C_r + n_r (mean_r - mean)(mean_r - mean)^T. This generalizes the pairwise update of
+        Chan et al. (1979) to many parts. All terms are positive semidefinite, so there is no cancellation.
 
-        def wait() -> tuple[list[LayerStatistics], Tensor]:
-            caller = torch.cuda.current_stream(self._device)
-            caller.wait_event(ended)
-            _keep_for(caller, merged, added)
-            return merged, added
-
-        return wait
-
-    def _merge(self, parts: list[LayerStatistics], numbers: Tensor) -> tuple[list[LayerStatistics], Tensor]:
-        """Merge the statistics of all ranks: first the means, then the second moments about the common mean.
-
-        The second moment C of all positions is the sum over ranks r of C_r + n_r (mean_r - mean)(mean_r - mean)^T. This
-        generalizes the pairwise update of Chan et al. (1979) to many parts. All terms are positive semidefinite, so
-        there is no cancellation.
+        Parts with the same number of channels are processed together, because on a GPU the time to launch many small
+        kernels would be longer than the exchange.
         """
         if not parts:
-            return [], self.all_reduce(numbers.clone(), "statistics")
-        sums = [torch.cat([part.count[None], part.count * part.mean]) for part in parts]
-        flat = self.all_reduce(torch.cat([*sums, numbers]), "statistics")
-        *totals, added = flat.split([*(len(part) for part in sums), len(numbers)])
-        means = [total[1:] / total[0].clamp_min(torch.finfo(total.dtype).tiny) for total in totals]
-        moments = []
-        for part, mean in zip(parts, means, strict=True):
-            away = part.mean - mean
-            moment = part.centered + torch.outer(away, away) * part.count
-            moments.append(moment[self._half(moment)])  # symmetric: one triangle is enough
-        halves = self.all_reduce(torch.cat(moments), "statistics").split([len(moment) for moment in moments])
-        merged = [
-            LayerStatistics(total[0], mean, self._symmetric(half, len(mean)))
-            for total, mean, half in zip(totals, means, halves, strict=True)
-        ]
-        return merged, added
+            return [], self.all_reduce(numbers, "statistics")
+        indices: dict[int, list[int]] = {}
+        for index, part in enumerate(parts):
+            indices.setdefault(len(part.mean), []).append(index)
+        stacks = [_Stack.of([parts[index] for index in some]) for some in indices.values()]
+        sums = [torch.cat([stack.count, stack.count * stack.mean], dim=1) for stack in stacks]
+        flat = self.all_reduce(torch.cat([*(each.flatten() for each in sums), numbers]), "statistics")
+        *totals, added = flat.split([*(each.numel() for each in sums), len(numbers)])
+        counts, means, moments = [], [], []
+        for stack, total in zip(stacks, totals, strict=True):
+            count, weighted = total.view(len(stack.count), -1).tensor_split([1], dim=1)
+            mean = weighted / count.clamp_min(torch.finfo(total.dtype).tiny)
+            away = stack.mean - mean
+            moment = stack.centered + away[:, :, None] * away[:, None, :] * stack.count[..., None]
+            rows, columns = self._half(moment[0])
+            moments.append(moment[:, rows, columns])  # symmetric: one triangle is enough
+            counts.append(count)
+            means.append(mean)
+        halves = self.all_reduce(torch.cat([each.flatten() for each in moments]), "statistics")
+        merged: dict[int, LayerStatistics] = {}
+        values = halves.split([each.numel() for each in moments])
+        for some, count, mean, half in zip(indices.values(), counts, means, values, strict=True):
+            centered = self._symmetric(half.view(len(some), -1), mean.shape[1])
+            merged |= zip(some, map(LayerStatistics, count[:, 0], mean, centered), strict=True)
+        return [merged[index] for index in range(len(parts))], added
 
     def _half(self, matrix: Tensor) -> tuple[Tensor, Tensor]:
         """Return the row indices [n] and column indices [n] of a matrix's upper triangle with diagonal, cached."""
@@ -311,13 +310,13 @@ class ProcessGroupCollectives:
             self._halves[key] = rows, columns
         return self._halves[key]
 
-    def _symmetric(self, half: Tensor, channels: int) -> Tensor:
-        """Return the symmetric matrix [channels, channels] that has this upper triangle."""
-        matrix = half.new_empty((channels, channels))
-        rows, columns = self._half(matrix)
-        matrix[rows, columns] = half
-        matrix[columns, rows] = half
-        return matrix
+    def _symmetric(self, halves: Tensor, channels: int) -> Tensor:
+        """Return the symmetric matrices [k, channels, channels] that have these upper triangles [k, n]."""
+        matrices = halves.new_empty((len(halves), channels, channels))
+        rows, columns = self._half(matrices[0])
+        matrices[:, rows, columns] = halves
+        matrices[:, columns, rows] = halves
+        return matrices
 
     def all_gather(self, value: T) -> list[T]:
         """See `Collectives`."""
@@ -380,17 +379,9 @@ class ProcessGroupCollectives:
         return own
 
     def _of_group(self, group: Any) -> ProcessGroupCollectives:
-        own = ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing, self.sent)
-        self._subgroups.append(own)
-        return own
+        return ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing, self.sent)
 
 
 def _machine() -> tuple[str, str]:
     """Return an identifier of the machine. A container counts as a machine, because it has its own memory limit."""
     return socket.gethostname(), os.environ.get("HOSTNAME", "")
-
-
-def _keep_for(stream: torch.cuda.Stream, parts: Sequence[LayerStatistics], numbers: Tensor) -> None:
-    """Prevent reuse of the memory of these tensors, which another stream owns, until `stream` has used them."""
-    for tensor in (numbers, *(tensor for part in parts for tensor in (part.count, part.mean, part.centered))):
-        tensor.record_stream(stream)

@@ -89,19 +89,33 @@ def test_shares_contain_each_pixel_of_the_finest_scale_once(height: int, width: 
 
 @settings(max_examples=60, deadline=None)
 @given(height=st.integers(64, 700), width=st.integers(64, 700), scales=st.integers(2, 7), ranks=st.integers(1, 9))
-def test_coarse_windows_contain_the_pixels_of_coarser_pieces(height: int, width: int, scales: int, ranks: int) -> None:
+def test_exchanged_windows_contain_the_pixels_of_coarser_pieces(
+    height: int, width: int, scales: int, ranks: int
+) -> None:
     by_rank = divide(tuple(piece for piece in view(height, width, scales) if piece.region.pixels), HALO, (1.0,) * ranks)
     shares = Shares.of((height, width), by_rank, HALO)
-    scale = shares.exchanged_scale({piece.scale for pieces in by_rank for piece in pieces})
-    assert scale == 1
-    for pieces, window in zip(by_rank, shares.coarse_windows(by_rank, HALO, scale), strict=True):
-        coarser = [piece for piece in pieces if piece.scale > 0 and piece.region.pixels]
-        assert bool(window.pixels) == bool(coarser)
-        for piece in coarser:
-            outer, area = piece.tile(HALO).outer, window.at_scale(piece.scale - scale)
-            assert outer.intersection(area) == outer
-            assert area.top << piece.scale - scale == window.top
-            assert area.left << piece.scale - scale == window.left
+    exchanges = shares.exchanges(by_rank, HALO)
+    assert [*exchanges] == [*range(1, min(scales, 5))], "at larger scales, a pixel may belong to two parts"
+    for scale, exchange in exchanges.items():
+        for pieces, window in zip(by_rank, exchange.windows, strict=True):
+            own = [piece for piece in pieces if shares.exchanged_scale(piece.scale) == scale and piece.scale > 0]
+            assert bool(window.pixels) == any(piece.region.pixels for piece in own)
+            for piece in own:
+                further = piece.scale - scale
+                outer, area = piece.tile(HALO).outer, window.at_scale(further)
+                assert not piece.region.pixels or outer.intersection(area) == outer
+                assert area.top << further == window.top
+                assert area.left << further == window.left
+
+
+def test_coarse_scales_are_spread_over_the_ranks() -> None:
+    """Each rank has one piece of a coarser scale at most, and needs little of the exchanged images."""
+    size = 3361, 5187
+    by_rank = divide(view(*size, 4), HALO, (1.0,) * 8)
+    exchanges = Shares.of(size, by_rank, HALO).exchanges(by_rank, HALO)
+    assert max(map(len, by_rank)) == 2
+    received = [sum(exchange.moved(rank)[1] for exchange in exchanges.values()) for rank in range(8)]
+    assert max(received) < 0.55 * (size[0] // 2) * (size[1] // 2)
 
 
 def test_several_ranks_evaluate_all_scales_together() -> None:

@@ -128,6 +128,28 @@ def test_content_on_a_gpu_uses_the_memory_of_unneeded_coverage(device: str, weig
     assert taken[1] - taken[0] == int(fraction * view_memory(plan, 10 * GIGABYTE))  # type: ignore[operator]
 
 
+def test_coverage_that_weights_statistics_takes_memory_and_a_render() -> None:
+    """It is cached at all scales, in a quarter of the memory for views at most."""
+    measurements = probe(raster=replace(LARGE, seconds=2.0))
+    off, on = (
+        plan_of(measurements, position_weights=weights, steps_coarse=0, keep=("uncovered",))
+        for weights in ("off", "on")
+    )
+    assert off.prediction is not None
+    assert on.prediction is not None
+    taken = sum(height * width for height, width in measurements.sizes) * 16 / 3
+    assert on.prediction.peak_bytes - off.prediction.peak_bytes == pytest.approx(taken, abs=2)
+    assert on.prediction.first_visit - off.prediction.first_visit == pytest.approx(0.5 * 2.0)
+    huge = replace(measurements, sizes=tuple((height * 40, width * 40) for height, width in measurements.sizes))
+    off, on = (
+        plan_of(huge, position_weights=weights, steps_coarse=0, keep=("uncovered",)) for weights in ("off", "on")
+    )
+    assert off.prediction is not None
+    assert on.prediction is not None
+    assert on.prediction.peak_bytes - off.prediction.peak_bytes <= view_memory(on, 10 * GIGABYTE) // 4
+    assert on.prediction.seconds > off.prediction.seconds
+
+
 def test_gpu_memory_includes_rasterizer_and_measurements() -> None:
     def peak(measured: bool = False, **raster: Any) -> int:
         measurements = probe(device="cuda", rasterizer="triton", raster=RasterCost(0.01, **raster))

@@ -41,14 +41,28 @@ def test_gradients_of_gaussians_that_the_view_shows_are_communicated() -> None:
     assert sent(None) - sent(20_000) == pytest.approx(saved)
 
 
-def test_ranks_wait_for_the_sent_bytes_except_statistics_of_other_scales() -> None:
-    one_scale = replace(work(scales=1), shown=20_000)
+def test_ranks_wait_for_the_sent_bytes() -> None:
     link = Link(1e6, 0.0)
     for ranks in (2, 3, 4):
-        sent = one_scale.sent(ranks)
-        assert one_scale.communication(ranks, link) == pytest.approx(sum(sent.values()) / 1e6, rel=1e-5)
-        assert replace(work(scales=3), shown=20_000).sent(ranks)["statistics"] == pytest.approx(3 * sent["statistics"])
+        sent, more = (replace(work(scales=scales), shown=20_000).sent(ranks) for scales in (1, 3))
+        waiting = replace(work(scales=3), shown=20_000).waiting(ranks, link)
+        assert more["statistics"] == pytest.approx(3 * sent["statistics"])
+        assert more["gradient"] == sent["gradient"]
+        for kind in ("statistics", "gradient"):
+            assert waiting[kind] == pytest.approx(more[kind] / 1e6, rel=1e-5)
+        assert more["image"] / 1e6 <= waiting["image"] <= 2 * more["image"] / 1e6, "of the busier direction"
     assert set(work().sent(1).values()) == {0}
+
+
+def test_launches_take_time_only_if_the_gpu_has_less_work() -> None:
+    """Launching the tiles of both scales takes 0.2 s, and their pixels 1.15 s."""
+    plain = replace(work(), raster=proportional(0.0))
+    assert replace(plain, launch=0.1).computing(1) == plain.computing(1)
+    idle = replace(plain, launch=2.0)
+    assert idle.computing(1) == pytest.approx(2 * 2.0 + plain.fixed)
+    assert replace(idle, graphs=True).computing(1) == plain.computing(1), "a graph is launched at once"
+    tiles = max(map(len, idle.shards(4)))
+    assert replace(idle, graphs=True).computing(4) == pytest.approx(tiles * 2.0 + plain.fixed)
 
 
 def test_groups_sum_complete_gradients() -> None:

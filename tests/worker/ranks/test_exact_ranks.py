@@ -175,9 +175,9 @@ def test_gradient_of_some_scales_matches_one_rank(
 def test_partly_cached_activations_preserve_the_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, 48)
-    memory = int(30_000 * FeatureNetwork(tiny_weights(), dtype=torch.float64).held_bytes_per_pixel())
+    memory = int(20_000 * FeatureNetwork(tiny_weights(), dtype=torch.float64).held_bytes_per_pixel())
     results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, memory)
-    assert set(results[0][2]) == {True, False}
+    assert {flag for result in results for flag in result[2]} == {True, False}
     for actual, actual_loss, _ in results:
         assert relative_error(actual, expected) < 1e-9
         assert actual_loss == pytest.approx(loss, rel=1e-9)

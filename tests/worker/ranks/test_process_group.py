@@ -17,6 +17,7 @@ from sgsst_core.errors import RanksDriftedError, SceneError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut, same_on_all
+from sgsst_core.parallel.division import ImageExchange
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights
@@ -76,10 +77,16 @@ def window(rank: int, area: Rectangle) -> Tensor:
 
 
 def exchange_parts(collectives: Collectives, windows: list[Rectangle]) -> tuple[Tensor, Tensor]:
-    parts, own = areas(collectives.size), windows[collectives.rank]
-    filled = torch.full((*own.shape, 3), 0.5)
-    collectives.gather_parts(window(7, parts[collectives.rank]), parts, filled, windows)
-    return filled, collectives.reduce_parts(window(collectives.rank, own), parts, windows)
+    """Exchange two images at once: one with these windows, and one whose windows are the parts of the next rank."""
+    parts, rank = areas(collectives.size), collectives.rank
+    exchanges = [ImageExchange(parts, windows), ImageExchange(parts, [*parts[1:], parts[0]])]
+    filled = [torch.full((*each.windows[rank].shape, 3), 0.5) for each in exchanges]
+    collectives.gather_parts(exchanges, [window(7, parts[rank]), window(8, parts[rank])], filled)
+    assert torch.equal(filled[1], window(8, exchanges[1].windows[rank]))
+    own = [window(rank, each.windows[rank]) for each in exchanges]
+    totals = collectives.reduce_parts(exchanges, own)
+    assert torch.equal(totals[1], window((rank - 1) % collectives.size, parts[rank]))
+    return filled[0], totals[0]
 
 
 @pytest.mark.parametrize(
@@ -118,25 +125,31 @@ def numbers(*values: float) -> Tensor:
 
 
 def merge(collectives: Collectives, empty: int | None) -> list[tuple[LayerStatistics, float]]:
-    parts = [LayerStatistics.zero(5)] if collectives.rank == empty else [layer_statistics(features(collectives.rank))]
-    waiting = [collectives.all_reduce_statistics(parts, numbers(0.5 * (turn + 1))) for turn in range(3)]
-    merged = [wait() for wait in waiting]
-    return [(statistics[0], float(added)) for statistics, added in merged]
+    """Merge three statistics at once, of which the second has fewer channels."""
+    every = [features(collectives.rank), features(collectives.rank)[..., 1:4], features(collectives.rank)]
+    own = [
+        LayerStatistics.zero(values.shape[-1]) if collectives.rank == empty else layer_statistics(values)
+        for values in every
+    ]
+    merged, added = collectives.all_reduce_statistics(own, numbers(0.5, 1.0, 1.5))
+    return list(zip(merged, added.tolist(), strict=True))
 
 
 @pytest.mark.parametrize("empty", [None, 0, 2])
 def test_merged_statistics_match_one_rank(empty: int | None) -> None:
     present = [features(rank).reshape(-1, 5) for rank in range(3) if rank != empty]
-    expected = layer_statistics_reference(torch.cat(present)[None])
     for result in on_ranks(3, merge, empty):
         for turn, (statistics, number) in enumerate(result):
+            channels = torch.cat(present)[None][..., 1:4] if turn == 1 else torch.cat(present)[None]
+            expected = layer_statistics_reference(channels)
             assert number == pytest.approx(1.5 * (turn + 1))
             assert float(statistics.count) == float(expected.count)
             assert relative_error(statistics.mean, expected.mean) < 1e-14
             assert relative_error(statistics.std(), expected.std()) < 1e-10
             assert relative_error(statistics.gram(), expected.gram()) < 1e-12
-            assert float(statistics.std()[2]) < 1e-12
-            assert float(statistics.std()[3]) == 0.0
+            constant, zero = (1, 2) if turn == 1 else (2, 3)
+            assert float(statistics.std()[constant]) < 1e-12
+            assert float(statistics.std()[zero]) == 0.0
 
 
 def test_merged_empty_statistics_are_empty() -> None:
@@ -146,7 +159,7 @@ def test_merged_empty_statistics_are_empty() -> None:
 
 
 def merge_empty(collectives: Collectives) -> LayerStatistics:
-    return collectives.all_reduce_statistics([LayerStatistics.zero(4)], numbers(0.0))()[0][0]
+    return collectives.all_reduce_statistics([LayerStatistics.zero(4)], numbers(0.0))[0][0]
 
 
 def values(collectives: Collectives) -> dict[str, Any]:
@@ -235,9 +248,10 @@ def test_ranks_that_only_add_communication_are_excluded() -> None:
 def test_single_rank_collectives_return_their_input() -> None:
     band = image(0)
     filled = torch.zeros_like(band)
-    ALONE.gather_parts(band, [WHOLE], filled, [WHOLE])
+    exchange = ImageExchange([WHOLE], [WHOLE])
+    ALONE.gather_parts([exchange], [band], [filled])
     assert torch.equal(filled, band)
-    assert torch.equal(ALONE.reduce_parts(band, [WHOLE], [WHOLE]), band)
+    assert torch.equal(ALONE.reduce_parts([exchange], [band])[0], band)
     assert ALONE.all_reduce(band) is band
     assert ALONE.all_gather("a") == ["a"]
 

@@ -65,19 +65,13 @@ def test_nccl_gradient_matches_one_rank(name: str, tmp_path: Path, exact_convolu
     assert relative_error(actual[0], expected) < 1e-5
 
 
-def merge_during_other_work(rank: int, size: int, address: str, folder: str) -> None:
-    """Merge statistics of three scales concurrently, while the main stream reuses freed memory."""
+def merge_three(rank: int, size: int, address: str, folder: str) -> None:
+    """Merge statistics of three scales at once."""
     with process_group(rank, size, address, device=f"cuda:{rank}", timeout=timedelta(seconds=60)) as collectives:
-        waiting = []
-        for turn in range(3):
-            part = layer_statistics(features(10 * turn + rank).to(f"cuda:{rank}"))
-            numbers = torch.tensor([turn + 0.5], dtype=torch.float64, device=part.mean.device)
-            waiting.append(collectives.all_reduce_statistics([part], numbers))
-            del part, numbers
-            for _ in range(20):
-                torch.randn(64, 64, dtype=torch.float64, device=f"cuda:{rank}")
-        merged = [wait() for wait in waiting]
-        sums = [(parts[0].count, parts[0].mean, parts[0].centered, numbers) for parts, numbers in merged]
+        own = [layer_statistics(features(10 * turn + rank).to(f"cuda:{rank}")) for turn in range(3)]
+        numbers = torch.arange(3, dtype=torch.float64, device=f"cuda:{rank}") + 0.5
+        merged, added = collectives.all_reduce_statistics(own, numbers)
+        sums = [(part.count, part.mean, part.centered, number) for part, number in zip(merged, added, strict=True)]
         torch.save([[value.cpu() for value in values] for values in sums], Path(folder) / f"{rank}.pt")
         link = probe_link(collectives, torch.device("cuda"))
         assert 1e8 < link.bandwidth < 1e13
@@ -89,10 +83,10 @@ def features(seed: int) -> Tensor:
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA GPUs")
-def test_statistics_merge_concurrently_with_other_work(tmp_path: Path) -> None:
+def test_statistics_of_scales_merge_at_once(tmp_path: Path) -> None:
     address = f"127.0.0.1:{free_port()}"
     multiprocessing.spawn(  # type: ignore[attr-defined]
-        merge_during_other_work, (2, address, str(tmp_path)), nprocs=2
+        merge_three, (2, address, str(tmp_path)), nprocs=2
     )
     first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
     for turn, (own, other) in enumerate(zip(first, second, strict=True)):

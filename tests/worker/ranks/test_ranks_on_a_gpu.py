@@ -51,15 +51,14 @@ def test_two_ranks_match_one_and_synchronize_once_per_step() -> None:
 
 
 def merge_three(collectives: Collectives) -> list[tuple[Tensor, Tensor]]:
-    """Merge statistics of three scales concurrently on the communication stream."""
     own = torch.randn(9 + collectives.rank, 7, 16, generator=torch.Generator().manual_seed(collectives.rank))
     part = layer_statistics(own.to("cuda"))
     numbers = torch.ones(1, dtype=torch.float64, device="cuda")
-    waiting = [collectives.all_reduce_statistics([part], numbers * turn) for turn in range(3)]
-    return [(statistics[0].gram().cpu(), added.cpu()) for statistics, added in (wait() for wait in waiting)]
+    merged, added = collectives.all_reduce_statistics([part] * 3, numbers * torch.arange(3, device="cuda"))
+    return [(statistics.gram().cpu(), number) for statistics, number in zip(merged, added.cpu(), strict=True)]
 
 
-def test_statistics_merge_on_their_own_stream() -> None:
+def test_statistics_merge_on_a_gpu() -> None:
     every = torch.cat(
         [torch.randn(9 + rank, 7, 16, generator=torch.Generator().manual_seed(rank)) for rank in range(2)]
     )

@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.features.vgg import STYLE_LAYERS
+from sgsst_core.features.vgg import HALO, STYLE_LAYERS
 from sgsst_core.loss.terms import TERMS
 from sgsst_core.loss.tiling import Divider, Tiling
 from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
+from sgsst_core.parallel.division import ImageExchange, Piece, Shares, divide
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -139,9 +140,9 @@ def windows() -> list[Rectangle]:
 
 
 def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
-    parts, own = quarters(), windows()[collectives.rank]
-    collectives.gather_parts(torch.zeros(24, WIDTH, 3), parts, torch.zeros(*own.shape, 3), windows())
-    collectives.reduce_parts(torch.zeros(*own.shape, 3), parts, windows())
+    exchange, own = ImageExchange(quarters(), windows()), windows()[collectives.rank]
+    collectives.gather_parts([exchange], [torch.zeros(24, WIDTH, 3)], [torch.zeros(*own.shape, 3)])
+    collectives.reduce_parts([exchange], [torch.zeros(*own.shape, 3)])
     collectives.all_reduce(torch.zeros(1000, 3))
     collectives.union(torch.zeros(300, dtype=torch.bool))
     pair = collectives.split_group(collectives.size // 2)
@@ -178,10 +179,16 @@ def test_step_record_has_sent_bytes() -> None:
     """Each of two ranks sends twice half of what they add. Of the image, only the coarser scales are exchanged."""
     layer = CHANNELS + 1 + CHANNELS * (CHANNELS + 1) // 2
     statistics = 8 * (len(STYLE_LAYERS) * layer + len(TERMS))
+    halo = HALO[tiny_weights().name]
     for result in on_ranks(2, run_two_steps):
+        sizes = [(HEIGHT >> scale, WIDTH >> scale) for scale in range(result["scales"])]
+        pieces = tuple(Piece(scale, size, Rectangle(0, 0, *size)) for scale, size in enumerate(sizes))
+        by_rank = divide(pieces, halo, (1.0, 1.0))
+        exchanges = Shares.of((HEIGHT, WIDTH), by_rank, halo).exchanges(by_rank, halo)
+        assert [*exchanges] == [*range(1, result["scales"])]
         assert result["shown"] == int(shown_of(wall(), cameras(1, WIDTH, HEIGHT)[0]).sum())
         assert result["steps"][1] == {
-            "image": 12 * (WIDTH // 2) * (HEIGHT // 2),
+            "image": 12 * sum(sum(exchange.moved(0)) for exchange in exchanges.values()),
             "statistics": result["scales"] * statistics,
             "gradient": 12 * result["shown"],
         }
