@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import SUFFIXES
 from worker.options import StylizeOptions
 from worker.region_requests import RegionOptions, region_options, region_requests
@@ -99,9 +100,14 @@ class JobInputs:
         """Return the request of a job on this machine.
 
         Raises:
-            SettingsError: If options are malformed or contradict each other.
+            SettingsError: If options are malformed or contradict each other, or a file is a URL.
         """
+        from api.client.inputs import path_or_url
         from worker.request import SceneRequest, StylizeRequest
+
+        for text in (self.scene, self.cameras or "", *self.style):
+            if isinstance(path_or_url(text), str):
+                raise SettingsError(f"{text}: only `sgsst submit` takes URLs. Download the file, and give its path.")
 
         return StylizeRequest(
             source=SceneRequest.of(Path(self.scene), None if self.cameras is None else Path(self.cameras), options),

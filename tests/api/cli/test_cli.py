@@ -1256,6 +1256,15 @@ def test_help_and_version_import_no_pytorch() -> None:
     assert subprocess.run([sys.executable, "-c", check], env=environment).returncode == 0
 
 
+@pytest.mark.parametrize("role", ["ply", "style", "cameras"])
+def test_urls_are_refused_unchanged(files: Files, role: str, capsys: pytest.CaptureFixture[str]) -> None:
+    url = "https://files.example.com/file"
+    arguments = [url if each == str(getattr(files, role)) else each for each in files.stylize()]
+    assert main(arguments) == 2
+    assert f"{url}: only `sgsst submit` takes URLs" in capsys.readouterr().err
+    assert not files.out.parent.exists()
+
+
 def test_error_is_one_line_on_stderr(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "api.cli", "render", "missing.ply", "--orbit", "2", "--out", "renders"]
