@@ -111,9 +111,9 @@ def test_changes_restore_regions_with_masks(
     page.get_by_role("button", name="Same with changes").click()
     watched.settled()
     row = page.get_by_role("group", name="Region 1")
+    row.get_by_text("308 Gaussians selected by hand").wait_for()
     for name, value in {"Name": "left", "Weight": "0.25", "Style": "night.png"}.items():
         assert row.get_by_label(name).input_value() == value
-    row.get_by_text("308 Gaussians selected by hand").wait_for()
     again = started(watched, service)
     assert not sent
     assert again["parameters"]["regions"] == before["parameters"]["regions"]

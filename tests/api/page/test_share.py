@@ -37,7 +37,9 @@ def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: S
     other.settled()
     other.wipe("Home")
     assert other.page.locator(".side.right").inner_text() == "Stylized"
-    assert other.page.get_by_label("Camera", exact=True).locator("option").count() == 4
+    options = other.page.get_by_label("Camera", exact=True).locator("option")
+    options.nth(3).wait_for(state="attached")
+    assert options.count() == 4, "three cameras, and the free view"
     assert other.page.locator("a, form, .blend:visible").count() == 0, "nothing but the viewer"
     other.check()
 
