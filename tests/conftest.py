@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 from collections.abc import Iterator
@@ -20,7 +21,10 @@ if not torch.cuda.is_available():
 
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import BackboneWeights, fetch_network_weights, load_network_weights
-from tests import networks
+from tests import networks, triton_interpreter
+
+if os.environ.get("TRITON_INTERPRET") == "1" and importlib.util.find_spec("triton"):
+    triton_interpreter.cache_names_of_builtins()
 
 
 def pytest_make_parametrize_id(val: object) -> str | None:

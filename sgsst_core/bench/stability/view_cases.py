@@ -35,11 +35,9 @@ _SMALL_MEMORY = 300 << 20
 
 def cases() -> list[Case]:
     """Return all cases of this group."""
-    sizes = [(1, 1), (15, 17), (16, 16), (17, 16), (31, 33), (1, 333), (333, 1), (4096, 16)]
-    entries = [Case(f"{w} x {h} pixels, rendered", "views", _IMAGE, partial(_size, w, h)) for w, h in sizes]
     sizes = [(1, 1), (15, 17), (16, 16), (3, 200), (33, 47), (4096, 16)]
+    entries = [Case(name, "views", _IMAGE, partial(_rendered, make)) for name, make in _VIEWS.items()]
     entries += [Case(f"{w} x {h} pixels, stylized", "views", _LOSS, partial(_stylized_size, w, h)) for w, h in sizes]
-    entries += [Case(name, "views", _IMAGE, partial(_rendered, make)) for name, make in _VIEWS.items()]
     return [
         *entries,
         Case("cameras that see nothing", "views", "views that were not left out", _blind),
@@ -52,8 +50,8 @@ def _rendered(make: Callable[[], tuple[Scene, Camera]], full: bool) -> CaseResul
     return compare_rasterizers(*make())
 
 
-def _size(width: int, height: int, full: bool) -> CaseResult:
-    return compare_rasterizers(ordinary(200), camera(width, height, focal=max(width, height) / 2))
+def _size(width: int, height: int) -> tuple[Scene, Camera]:
+    return ordinary(200), camera(width, height, focal=max(width, height) / 2)
 
 
 def _stylized_size(width: int, height: int, full: bool) -> CaseResult:
@@ -94,7 +92,9 @@ def _empty() -> Scene:
     )
 
 
+_SIZES = [(1, 1), (15, 17), (16, 16), (17, 16), (31, 33), (1, 333), (333, 1), (4096, 16)]
 _VIEWS: dict[str, Callable[[], tuple[Scene, Camera]]] = {
+    **{f"{width} x {height} pixels, rendered": partial(_size, width, height) for width, height in _SIZES},
     "field of view of 170 degrees": partial(_field_of_view, 170),
     "field of view of 179.9 degrees": partial(_field_of_view, 179.9),
     "field of view of 179.99999 degrees": partial(_field_of_view, 179.99999),
