@@ -6,10 +6,12 @@ import errno
 import inspect as source
 import json
 import os
+import secrets
 import socket
 import struct
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from service.inspection.process import MAX_REPORTS
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.service.inspection import attack
-from tests.service.inspection.test_limits import inspecting
+from tests.service.inspection.test_limits import Inspect, inspecting
 from tests.small_scenes import wall, write_files
 
 COMPROMISED = Path(__file__).with_name("compromised.py")
@@ -35,15 +37,38 @@ pytestmark = pytest.mark.skipif(bool(sandbox.missing()), reason=f"the kernel lac
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
+    """Return files with a name of their own, so that findings about those of another test are not reused."""
     scene, cameras, style = write_files(tmp_path, wall())
-    return {"scene": scene, "cameras": cameras, "style": style}
+    return {"scene": scene.rename(tmp_path / f"{secrets.token_hex(4)}.ply"), "cameras": cameras, "style": style}
+
+
+@contextmanager
+def compromised(folder: Path, *lacking: str) -> Iterator[Inspect]:
+    """Yield a function that inspects files in a compromised process, whose parent's environment has secrets."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED), *lacking))
+        for name in ("PGPASSWORD", "AWS_SECRET_ACCESS_KEY", "RAY_AUTH_TOKEN"):
+            patch.setenv(name, "secret")
+        with inspecting(folder) as inspect:
+            yield inspect
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the process that several tests attack."""
+    return tmp_path_factory.mktemp("shared")
+
+
+@pytest.fixture(scope="module")
+def inspect_shared(shared: Path) -> Iterator[Inspect]:
+    """Yield a function that inspects files in a compromised process which survives the attacks of all tests."""
+    with compromised(shared) as inspect:
+        yield inspect
 
 
 @pytest.fixture
-def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
+def target(tmp_path: Path) -> Iterator[dict[str, Any]]:
     """Yield the description of an attack's targets, among them a listening socket on loopback."""
-    for name in ("PGPASSWORD", "AWS_SECRET_ACCESS_KEY", "RAY_AUTH_TOKEN"):
-        monkeypatch.setenv(name, "secret")
     outside = tmp_path / "outside"
     outside.mkdir()
     (outside / "there").write_text("there")
@@ -59,21 +84,19 @@ def target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str
 
 
 def attacked(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, files: dict[str, Path], target: dict[str, Any], *lacking: str
+    inspect: Inspect, folder: Path, files: dict[str, Path], target: dict[str, Any], *, landlock: bool = True
 ) -> dict[str, Any]:
     """Run the attack in a reader, and return the outcomes that it reports."""
-    monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED), *lacking))
     code = f"# attack\n{source.getsource(attack)}\nreached = attack({target!r})\n".encode()
     scene = folder / "attack" / "scene.ply"
     scene.parent.mkdir()
     scene.write_bytes(code)
-    with inspecting(folder) as inspect:
-        with pytest.raises(RefusedInputError) as caught:
-            inspect({**files, "scene": scene})
-        reached: dict[str, Any] = json.loads(str(caught.value))
-        assert scene.read_bytes() == code
-        assert "landlock" in lacking or (Path(target["outside"]) / "there").read_text() == "there"
-        assert inspect(files)["gaussians"] == 616, "others' files are checked as before"
+    with pytest.raises(RefusedInputError) as caught:
+        inspect({**files, "scene": scene})
+    reached: dict[str, Any] = json.loads(str(caught.value))
+    assert scene.read_bytes() == code
+    assert not landlock or (Path(target["outside"]) / "there").read_text() == "there"
+    assert inspect(files)["gaussians"] == 616, "others' files are checked as before"
     return reached
 
 
@@ -82,9 +105,10 @@ def allowed(outcomes: dict[str, str]) -> set[str]:
 
 
 def test_compromised_reader_reaches_nothing(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
+    inspect_shared: Inspect, shared: Path, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
-    reached = attacked(monkeypatch, tmp_path, files, target)
+    target["data"] = str(shared / "data")
+    reached = attacked(inspect_shared, tmp_path, files, target)
     assert allowed(reached["files"]) == {"read own scene"}, reached["files"]
     assert allowed(reached["calls"]) == set(), reached["calls"]
     assert set(reached["files"].values()) | set(reached["calls"].values()) <= {"done", "EACCES", "EPERM", "EXDEV"}
@@ -96,10 +120,11 @@ def test_compromised_reader_reaches_nothing(
 
 
 def test_seccomp_alone_blocks_network_and_processes(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
+    tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
     target["data"] = target["outside"]  # whatever can be written to is worthless and grows by at most one byte
-    reached = attacked(monkeypatch, tmp_path, files, target, "landlock")
+    with compromised(tmp_path, "landlock") as inspect:
+        reached = attacked(inspect, tmp_path, files, target, landlock=False)
     assert allowed(reached["calls"]) == set(), reached["calls"]
     for name in ("write a huge file", "write outside", "write to own scene"):
         assert reached["files"][name] == "EFBIG", reached["files"]
@@ -107,9 +132,10 @@ def test_seccomp_alone_blocks_network_and_processes(
 
 
 def test_landlock_alone_blocks_files_and_signals(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
+    tmp_path: Path, files: dict[str, Path], target: dict[str, Any]
 ) -> None:
-    reached = attacked(monkeypatch, tmp_path, files, target, "seccomp")
+    with compromised(tmp_path, "seccomp") as inspect:
+        reached = attacked(inspect, tmp_path, files, target)
     assert allowed(reached["files"]) == {"read own scene"}, reached["files"]
     refused = {"trace the parent", "trace the API", "memory that is a file"}
     refused |= {"connect"} if sandbox._landlock_version() >= 4 else set()
@@ -118,9 +144,8 @@ def test_landlock_alone_blocks_files_and_signals(
     assert "secret" not in reached["environment"].values()
 
 
-def forger(monkeypatch: pytest.MonkeyPatch, folder: Path, answer: str) -> Path:
+def forger(folder: Path, answer: str) -> Path:
     """Write a scene that takes over its reader, sends an answer in the reader's place, and ends it."""
-    monkeypatch.setattr(inspector, "COMMAND", (sys.executable, str(COMPROMISED)))
     scene = folder / "attack" / "scene.ply"
     scene.parent.mkdir()
     write = f"os.write(descriptor, {answer.encode()!r} + bytes([10]))"
@@ -144,25 +169,23 @@ def forger(monkeypatch: pytest.MonkeyPatch, folder: Path, answer: str) -> Path:
     ],
 )
 def test_forged_response_affects_only_its_own_request(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path], answer: str
+    inspect_shared: Inspect, tmp_path: Path, files: dict[str, Path], answer: str
 ) -> None:
-    scene = forger(monkeypatch, tmp_path, answer)
-    with inspecting(tmp_path) as inspect:
-        if answer.startswith('{"findings": {}}'):  # it may falsify the answer about its own files
-            assert inspect({**files, "scene": scene}) == {}
-        else:
-            with pytest.raises(RefusedInputError, match="breaks their reader"):
-                inspect({**files, "scene": scene})
-        assert inspect(files)["gaussians"] == 616
+    scene = forger(tmp_path, answer)
+    if answer.startswith('{"findings": {}}'):  # it may falsify the answer about its own files
+        assert inspect_shared({**files, "scene": scene}) == {}
+    else:
+        with pytest.raises(RefusedInputError, match="breaks their reader"):
+            inspect_shared({**files, "scene": scene})
+    assert inspect_shared(files)["gaussians"] == 616
 
 
-def test_flood_of_progress_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: dict[str, Path]) -> None:
+def test_flood_of_progress_is_bounded(inspect_shared: Inspect, tmp_path: Path, files: dict[str, Path]) -> None:
     progress = {"step": 1, "total": 2, "fraction": 0.5, "eta_s": None}
     flood = (json.dumps({"planning": progress}) + "\n") * (2 * MAX_REPORTS)
-    scene = forger(monkeypatch, tmp_path, flood + '{"findings": {}}')
+    scene = forger(tmp_path, flood + '{"findings": {}}')
     shown: list[dict[str, Any]] = []
-    with inspecting(tmp_path) as inspect:
-        assert inspect({**files, "scene": scene}, shown.append) == {}
+    assert inspect_shared({**files, "scene": scene}, shown.append) == {}
     assert shown == [progress] * MAX_REPORTS
 
 
