@@ -93,12 +93,12 @@ def server(*, durable: bool = False) -> Iterator[str]:
         yield started.url
 
 
-def fresh_database(url: str) -> str:
-    """Create an empty database on a server, and return the database's URL."""
+def fresh_database(url: str, template: str = "template1") -> str:
+    """Create a database on a server, empty or as a copy of another, and return the database's URL."""
     name = f"t{os.urandom(6).hex()}"
     engine = create_engine(f"{url}/postgres", isolation_level="AUTOCOMMIT")
     with engine.connect() as connection:
-        connection.execute(text(f"CREATE DATABASE {name}"))
+        connection.execute(text(f"CREATE DATABASE {name} TEMPLATE {template}"))
     engine.dispose()
     return f"{url}/{name}"
 

@@ -20,8 +20,8 @@ import pytest
 
 from tests.api.service import ROOT, Service, wait_for
 from tests.postgres import fresh_database
+from tests.service.conftest import postgres  # noqa: F401 (a fixture)
 from tests.service.files.s3 import environment_of, s3_server
-from tests.service.store.conftest import postgres  # noqa: F401 (a fixture)
 from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow

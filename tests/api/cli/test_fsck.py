@@ -22,10 +22,11 @@ from service.files.objects import ObjectStore
 from service.files.staging import CHECKPOINT
 from service.files.stored_blobs import open_blobs
 from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
 from service.store.jobs import NewJob
 from service.store.leases import Lease
 from tests.service.files.s3 import environment_of, s3_server
+from tests.stores import new_store
 
 HOUR = 3600.0
 MISSING, DAMAGED, ORPHANED, ROLLED_BACK = 4, 8, 16, 32
@@ -69,7 +70,7 @@ class Files:
 
     def __post_init__(self) -> None:
         self.settings = ServiceSettings()
-        self.store = open_store(self.settings)
+        self.store = new_store(self.settings)
         self.artifacts = Artifacts(self.settings.artifacts_url)
         self.blobs = open_blobs(self.settings, self.store.inputs, self.artifacts)
 

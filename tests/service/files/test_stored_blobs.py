@@ -18,9 +18,10 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder, Receiver, write_all
 from service.files.stored_blobs import StoredBlobs
 from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
 from service.store.tables import UploadRow
 from tests.service.files.s3 import Fault, FaultyS3, environment_of, s3_server
+from tests.stores import new_store
 
 MB = 1 << 20
 HOUR = 3600.0
@@ -82,7 +83,7 @@ def fleet(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
         monkeypatch.setenv(name, value)
     url = f"s3://inputs/{os.urandom(4).hex()}"
     assert httpx.put(f"{server}/inputs").status_code == 200
-    store = open_store(ServiceSettings(data=tmp_path / "database"))
+    store = new_store(ServiceSettings(data=tmp_path / "database"))
     yield Fleet(tmp_path, store, url, s3)
     s3.heal()
     store.close()

@@ -22,10 +22,11 @@ from service.scheduling.running import RunningAttempt
 from service.scheduling.scheduler import Holding
 from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
 from service.store.jobs import NewJob
 from service.store.leases import Lease
 from tests.api.service import wait_for
+from tests.stores import new_store
 
 SHA = "a" * 64
 
@@ -37,7 +38,7 @@ def settings(tmp_path: Path) -> ServiceSettings:
 
 @pytest.fixture
 def store(settings: ServiceSettings) -> Iterator[Store]:
-    opened = open_store(settings)
+    opened = new_store(settings)
     opened.inputs.add_blob(SHA, "aa/blob", 3)
     yield opened
     opened.close()
@@ -144,7 +145,7 @@ def test_attempt_is_abandoned_before_an_unrenewed_lease_expires(
 ) -> None:
     """The database does not respond: the thread that renews leases waits for it, and others will take over the job."""
     settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, lease_seconds=8)
-    store = open_store(settings)
+    store = new_store(settings)
     store.inputs.add_blob(SHA, "aa/blob", 3)
     released = threading.Event()
     abandoned = threading.Event()
@@ -213,7 +214,7 @@ def test_leftovers_of_a_killed_dispatcher_are_swept(settings: ServiceSettings, s
 def test_job_with_a_lost_or_damaged_input_fails(tmp_path: Path, damage: str, code: str) -> None:
     """The job is retried as often as any other job without progress, and not forever."""
     settings = ServiceSettings(data=tmp_path / "data", poll_seconds=0.05, retry_seconds=0.01, max_attempts=2)
-    store = open_store(settings)
+    store = new_store(settings)
     blobs = BlobFolder(settings.folder, store.inputs, 0)
     (tmp_path / "scene").write_bytes(b"scene")
     sha256 = blobs.add(tmp_path / "scene")

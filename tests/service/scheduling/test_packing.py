@@ -18,9 +18,10 @@ from service.scheduling.packing import Capacity, Grant, QueuedJob
 from service.scheduling.scheduler import Holding
 from service.scheduling.selection import JobSelector
 from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
 from service.store.jobs import NewJob
 from service.store.tables import ReservationRow
+from tests.stores import new_store
 
 GB = 1_000_000_000
 SHA = "a" * 64
@@ -38,7 +39,7 @@ class Queue:
     def __init__(self, folder: Path, gpus: int, parallel_jobs: int | None = None, name: str = "here") -> None:
         self.now = 1_000_000.0
         settings = ServiceSettings(data=folder)
-        self.store = open_store(settings, lambda: self.now)
+        self.store = new_store(settings, lambda: self.now)
         self.store.inputs.add_blob(SHA, "aa/blob", 3)
         capacity, clocks = Capacity(machine(gpus), parallel_jobs), ClockWatch(self.store, settings.lease_seconds)
         self.selector = JobSelector(name, self.store, capacity, clocks)

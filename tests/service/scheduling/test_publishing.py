@@ -12,9 +12,10 @@ from safetensors.numpy import save_file
 from service.files.artifacts import Artifacts
 from service.scheduling.publishing import Publisher
 from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
 from service.store.jobs import NewJob
 from service.store.leases import Lease
+from tests.stores import new_store
 
 SHA = "a" * 64
 
@@ -26,7 +27,7 @@ def settings(tmp_path: Path) -> ServiceSettings:
 
 @pytest.fixture
 def store(settings: ServiceSettings) -> Iterator[Store]:
-    opened = open_store(settings)
+    opened = new_store(settings)
     opened.inputs.add_blob(SHA, "aa/blob", 3)
     yield opened
     opened.close()

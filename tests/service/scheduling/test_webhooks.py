@@ -33,8 +33,8 @@ from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.tables import DeliveryRow
 from tests.http_servers import serve
-from tests.postgres import fresh_database, is_installed, server
 from tests.service.store.helpers import Clock
+from tests.stores import migrated_database, new_store
 
 #: Time limit of a test's waits in seconds.
 PATIENCE = 60.0
@@ -122,7 +122,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def store(tmp_path: Path, clock: Clock) -> Iterator[Store]:
-    opened = open_store(_settings(tmp_path), clock)
+    opened = new_store(_settings(tmp_path), clock)
     yield opened
     opened.close()
 
@@ -334,14 +334,14 @@ def test_slow_receivers_do_not_delay_other_messages(tmp_path: Path, store: Store
 
 
 @pytest.mark.parametrize("backend", ["sqlite", "postgresql"])
-def test_messages_are_claimed_fairly_and_once(backend: str, tmp_path: Path, clock: Clock) -> None:
-    if backend == "postgresql" and not is_installed():
-        pytest.skip("PostgreSQL's server is not installed")
+def test_messages_are_claimed_fairly_and_once(
+    backend: str, request: pytest.FixtureRequest, tmp_path: Path, clock: Clock
+) -> None:
     if backend == "sqlite":
-        _check_turns(open_store(_settings(tmp_path), clock))
+        _check_turns(new_store(_settings(tmp_path), clock))
         return
-    with server() as url:
-        _check_turns(open_store(_settings(tmp_path, database=fresh_database(url)), clock))
+    database = migrated_database(request.getfixturevalue("postgres"))
+    _check_turns(open_store(_settings(tmp_path, database=database), clock))
 
 
 def _check_turns(store: Store) -> None:

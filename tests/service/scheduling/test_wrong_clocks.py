@@ -23,27 +23,18 @@ from service.store.jobs import NewJob
 from service.store.leases import Lease
 from service.store.tables import DispatcherRow
 from tests.api.service import ROOT, SETTINGS, wait_for
-from tests.postgres import fresh_database, is_installed, server
 from tests.service.store.helpers import Clock
+from tests.stores import migrated_database
 
 SHA = "a" * 64
 DAY = 86_400.0
 LEASE = 6.0
 
 
-@pytest.fixture(scope="module")
-def postgres() -> Iterator[str]:
-    """Run a PostgreSQL server for the tests; skip them if it is not installed."""
-    if not is_installed():
-        pytest.skip("PostgreSQL's server is not installed")
-    with server() as url:
-        yield url
-
-
 @pytest.fixture(params=["sqlite", "postgresql"])
 def settings(request: pytest.FixtureRequest, tmp_path: Path) -> ServiceSettings:
-    """Return the settings of a service with an empty database and short leases."""
-    database = None if request.param == "sqlite" else fresh_database(request.getfixturevalue("postgres"))
+    """Return the settings of a service with a new database and short leases."""
+    database = None if request.param == "sqlite" else migrated_database(request.getfixturevalue("postgres"))
     return ServiceSettings(data=tmp_path / "data", database=database, poll_seconds=0.05, lease_seconds=LEASE)
 
 

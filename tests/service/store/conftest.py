@@ -8,17 +8,9 @@ from pathlib import Path
 import pytest
 
 from service.store import Store, open_store
-from tests.postgres import fresh_database, is_installed, server
+from tests.postgres import fresh_database
 from tests.service.store.helpers import SHA, Clock, store_settings
-
-
-@pytest.fixture(scope="session")
-def postgres() -> Iterator[str]:
-    """Run a PostgreSQL server for the tests; skip them if it is not installed."""
-    if not is_installed():
-        pytest.skip("PostgreSQL's server is not installed")
-    with server() as url:
-        yield url
+from tests.stores import migrated_database, new_store
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -32,9 +24,13 @@ def clock() -> Clock:
     return Clock()
 
 
-@pytest.fixture
-def store(database: str | None, tmp_path: Path, clock: Clock) -> Iterator[Store]:
-    opened = open_store(store_settings(tmp_path, database), clock)
+@pytest.fixture(params=["sqlite", "postgresql"])
+def store(request: pytest.FixtureRequest, tmp_path: Path, clock: Clock) -> Iterator[Store]:
+    if request.param == "sqlite":
+        opened = new_store(store_settings(tmp_path, None), clock)
+    else:
+        database = migrated_database(request.getfixturevalue("postgres"))
+        opened = open_store(store_settings(tmp_path, database), clock)
     opened.inputs.add_blob(SHA, "aa/blob", 3)
     yield opened
     opened.close()

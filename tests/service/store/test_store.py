@@ -37,6 +37,7 @@ from tests.service.store.helpers import (
     queue,
     store_settings,
 )
+from tests.stores import new_store
 
 
 def test_migrations_create_the_tables_of_the_models(store: Store, tmp_path: Path) -> None:
@@ -520,7 +521,7 @@ class StoreMachine(RuleBasedStateMachine):
         super().__init__()
         self.folder = Path(tempfile.mkdtemp(prefix="sgsst-store-"))
         self.clock = Clock()
-        self.store = open_store(store_settings(self.folder, None), self.clock)
+        self.store = new_store(store_settings(self.folder, None), self.clock)
         self.store.inputs.add_blob(SHA, "aa/blob", 3)
         self.status: dict[str, str] = {}
         self.held: dict[str, tuple[Lease, float]] = {}

@@ -1,0 +1,18 @@
+"""Fixtures for tests of the service."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.postgres import is_installed, server
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[str]:
+    """Run a PostgreSQL server for the tests, and yield its URL; skip them if it is not installed."""
+    if not is_installed():
+        pytest.skip("PostgreSQL's server is not installed")
+    with server() as url:
+        yield url
