@@ -28,9 +28,10 @@ _NOBODY = 65534
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    return {"scene": ply, "cameras": cameras, "style": style}
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """Run the API process; tests that kill it start it again."""
+    with Service(tmp_path_factory.mktemp("service") / "data", alone=True) as running:
+        yield running
 
 
 def append(service: Service, where: str, offset: int, content: bytes, checksum: str = "") -> httpx.Response:
@@ -39,22 +40,20 @@ def append(service: Service, where: str, offset: int, content: bytes, checksum: 
     return httpx.patch(f"{service.url}{where}", content=content, headers=headers, timeout=60)
 
 
-def begin(service: Service, path: Path) -> str:
+def begin(service: Service, content: bytes) -> str:
     """Create an upload with all bytes except the last one, and return its URL path."""
-    content = path.read_bytes()
     headers = {**TUS, "Upload-Length": str(len(content))}
     where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
     assert append(service, where, 0, content[:-1]).status_code == 204
     return where
 
 
-def die_at_the_end(service: Service, path: Path, where: str, *, linked: bool) -> None:
+def write_the_end(service: Service, content: bytes, where: str, *, linked: bool) -> None:
     """Reproduce the state after the last byte was written; if `linked`, after the blob was created too."""
-    service.stop(signal.SIGKILL)
     settings = ServiceSettings(data=service.data, min_free_bytes=0)
     store = open_store(settings)
     blobs = BlobFolder(settings.folder, store.inputs, 0)
-    upload_id, content = where.rsplit("/", 1)[1], path.read_bytes()
+    upload_id = where.rsplit("/", 1)[1]
     part = blobs.upload_path(upload_id)
     part.write_bytes(content)
     store.inputs.advance_upload(upload_id, len(content) - 1, 1, 3600)
@@ -63,42 +62,44 @@ def die_at_the_end(service: Service, path: Path, where: str, *, linked: bool) ->
     store.close()
 
 
-@pytest.mark.parametrize("linked", [False, True])
-def test_last_part_can_be_sent_again(files: dict[str, Path], tmp_path: Path, linked: bool) -> None:
-    content = files["scene"].read_bytes()
-    with Service(tmp_path / "data", alone=True) as service:
-        where = begin(service, files["scene"])
-        die_at_the_end(service, files["scene"], where, linked=linked)
-        service.start()
+def test_last_part_can_be_sent_again(service: Service) -> None:
+    contents = {linked: os.urandom(10_000) for linked in (False, True)}
+    places = {linked: begin(service, content) for linked, content in contents.items()}
+    service.stop(signal.SIGKILL)
+    for linked, content in contents.items():
+        write_the_end(service, content, places[linked], linked=linked)
+    service.start()
+    for linked, content in contents.items():
+        where, sha256 = places[linked], hashlib.sha256(content).hexdigest()
         assert httpx.head(f"{service.url}{where}", headers=TUS).headers["upload-offset"] == str(len(content))
         assert append(service, where, len(content), b"").status_code == 204
         shown = httpx.get(f"{service.url}{where}").json()
-        assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())
-        blobs = [path for path in (service.data / "blobs").glob("*/*") if path.is_file()]
-        assert [path.read_bytes() for path in blobs] == [content]
-        assert not any((service.data / "uploads").iterdir())
+        assert (shown["complete"], shown["sha256"]) == (True, sha256)
+    blobs = [path.read_bytes() for path in (service.data / "blobs").glob("*/*") if path.is_file()]
+    assert [blobs.count(content) for content in contents.values()] == [1, 1]
+    assert not any((service.data / "uploads").iterdir())
 
 
 @pytest.mark.slow
-def test_job_can_use_the_finished_upload_at_once(files: dict[str, Path], tmp_path: Path) -> None:
-    with Service(tmp_path / "data", alone=True) as service:
-        where = begin(service, files["scene"])
-        die_at_the_end(service, files["scene"], where, linked=True)
-        service.start()
-        body = {"style": ("style.png", files["style"].read_bytes())}
-        data = {"scene": where.rsplit("/", 1)[1], "parameters": '{"orbit": 2}'}
-        answer = httpx.post(f"{service.url}/v1/jobs", files=body, data=data, timeout=60)
-        assert answer.status_code == 202, answer.text
-        assert httpx.get(f"{service.url}{where}").json()["complete"]
+def test_job_can_use_the_finished_upload_at_once(service: Service, tmp_path: Path) -> None:
+    scene, _, style = write_files(tmp_path, wall())
+    where = begin(service, scene.read_bytes())
+    service.stop(signal.SIGKILL)
+    write_the_end(service, scene.read_bytes(), where, linked=True)
+    service.start()
+    body = {"style": ("style.png", style.read_bytes())}
+    data = {"scene": where.rsplit("/", 1)[1], "parameters": '{"orbit": 2}'}
+    answer = httpx.post(f"{service.url}/v1/jobs", files=body, data=data, timeout=60)
+    assert answer.status_code == 202, answer.text
+    assert httpx.get(f"{service.url}{where}").json()["complete"]
 
 
-def test_missing_bytes_are_not_read_as_zeros(files: dict[str, Path], tmp_path: Path) -> None:
-    with Service(tmp_path / "data", alone=True) as service:
-        where = begin(service, files["scene"])
-        part = service.data / "uploads" / f"{where.rsplit('/', 1)[1]}.part"
-        part.unlink()
-        answer = append(service, where, files["scene"].stat().st_size - 1, b"x")
-        assert (answer.status_code, answer.json()["code"]) == (404, "not-found")
+def test_missing_bytes_are_not_read_as_zeros(service: Service) -> None:
+    where = begin(service, os.urandom(10_000))
+    part = service.data / "uploads" / f"{where.rsplit('/', 1)[1]}.part"
+    part.unlink()
+    answer = append(service, where, 9_999, b"x")
+    assert (answer.status_code, answer.json()["code"]) == (404, "not-found")
 
 
 @contextmanager
@@ -151,21 +152,18 @@ def test_missing_write_permission_is_a_failure_of_the_store(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_digest_of_an_upload_in_parts_equals_that_of_its_file(
-    files: dict[str, Path], tmp_path: Path, killed: bool
-) -> None:
-    content = files["scene"].read_bytes()
+def test_digest_of_an_upload_in_parts_equals_that_of_its_file(service: Service, killed: bool) -> None:
+    content = os.urandom(30_000)
     middle = len(content) // 2
-    with Service(tmp_path / "data", alone=True) as service:
-        headers = {**TUS, "Upload-Length": str(len(content))}
-        where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
-        assert append(service, where, 0, content[:middle]).status_code == 204
-        wrong = base64.b64encode(hashlib.sha256(b"another").digest()).decode()
-        assert append(service, where, middle, bytes(100), f"sha256 {wrong}").status_code == 460
-        if killed:  # the digest so far is lost
-            service.stop(signal.SIGKILL)
-            service.start()
-        assert append(service, where, middle, content[middle:-1]).status_code == 204
-        assert append(service, where, len(content) - 1, content[-1:]).status_code == 204
-        shown = httpx.get(f"{service.url}{where}").json()
-        assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())
+    headers = {**TUS, "Upload-Length": str(len(content))}
+    where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
+    assert append(service, where, 0, content[:middle]).status_code == 204
+    wrong = base64.b64encode(hashlib.sha256(b"another").digest()).decode()
+    assert append(service, where, middle, bytes(100), f"sha256 {wrong}").status_code == 460
+    if killed:  # the digest so far is lost
+        service.stop(signal.SIGKILL)
+        service.start()
+    assert append(service, where, middle, content[middle:-1]).status_code == 204
+    assert append(service, where, len(content) - 1, content[-1:]).status_code == 204
+    shown = httpx.get(f"{service.url}{where}").json()
+    assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())
