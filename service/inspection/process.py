@@ -43,6 +43,7 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.decision import warnings_of
 from sgsst_core.errors import CameraError, InvalidInputError, MaskError, SettingsError, SgsstError, WeightsError
+from sgsst_core.features import pooling_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
 from sgsst_core.files.blending import blend_scenes, encode_blend
 from sgsst_core.files.cache_folder import cache_folder
@@ -58,6 +59,7 @@ from sgsst_core.planning.survey import PlanningProgress, ShowPlanning
 from sgsst_core.quality.compression import measure_compression
 from sgsst_core.regions.definition import Regions
 from sgsst_core.report.document import plan_json
+from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
@@ -486,6 +488,9 @@ def _close_descriptors(retained: int = 2) -> None:
 
 def _confine(request: dict[str, Any]) -> list[None]:
     """Restrict this child to reading its job's files and the installation, and to writing the derived file.
+
+    Numba looks for a writable cache folder when a module with kernels is imported. This process therefore imports all
+    such modules before it forks; a confined child that imported one would compile its kernels for each request.
 
     Returns:
         List to which an entry is appended for each kernel that has to be compiled.

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+import sgsst_core
 from service.errors import RefusedInputError
 from service.files.blobs import BlobFolder
 from service.inspection import inspector, sandbox
@@ -187,6 +188,23 @@ def test_flood_of_progress_is_bounded(inspect_shared: Inspect, tmp_path: Path, f
     shown: list[dict[str, Any]] = []
     assert inspect_shared({**files, "scene": scene}, shown.append) == {}
     assert shown == [progress] * MAX_REPORTS
+
+
+def test_modules_with_kernels_are_imported_before_confinement(
+    inspect_shared: Inspect, tmp_path: Path, files: dict[str, Path]
+) -> None:
+    package = Path(sgsst_core.__file__).parent
+    with_kernels = {
+        ".".join(path.relative_to(package.parent).with_suffix("").parts)
+        for path in package.rglob("*.py")
+        if "@compiled(" in path.read_text(encoding="utf-8")
+    }
+    scene = tmp_path / "attack.ply"
+    scene.write_text("# attack\nimport sys\nreached = sorted(sys.modules)\n")
+    with pytest.raises(RefusedInputError) as caught:
+        inspect_shared({**files, "scene": scene})
+    assert with_kernels
+    assert with_kernels - set(json.loads(str(caught.value))) == set()
 
 
 def test_missing_kernel_features_are_logged(
