@@ -46,7 +46,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
     limits = {
         "SGSST_MAX_REQUEST_BYTES": str(500 * MB),
         "SGSST_MAX_UPLOAD_BYTES": str(400 * MB),

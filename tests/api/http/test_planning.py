@@ -7,6 +7,7 @@ import io
 import json
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -24,7 +25,7 @@ PARAMETERS = {"preset": "preview", "backbone": "vgg16", "resolution": 128}
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
     with Service(tmp_path_factory.mktemp("planning") / "data", alone=True) as running:
         yield running
 
@@ -160,7 +161,7 @@ def test_disconnect_cancels_planning_with_events(service: Service, files: dict[s
     with service.client() as client:
         events(client, files)
         both = len(service.processes("service.inspection.process"))
-        begin_and_leave(service, client, files, both, resolution=1024, seed=1)
+        begin_and_leave(service, client, with_many_views(files), both, seed=1)
         assert events(client, files, resolution=96)[-1].event == "plan"
 
 
@@ -168,11 +169,12 @@ def test_disconnect_cancels_planning_without_events(service: Service, files: dic
     with service.client() as client:
         events(client, files)
         both = len(service.processes("service.inspection.process"))
-        begin_and_leave(service, client, files, both, resolution=1024, seed=2)  # validated by now, and not planned
+        many = with_many_views(files)
+        begin_and_leave(service, client, many, both, seed=2)  # validated by now, and not planned
 
     async def leave() -> None:
         async with httpx.AsyncClient(base_url=service.url, headers=client.headers, timeout=PATIENCE) as waiting:
-            answer = asyncio.create_task(waiting.post("/v1/jobs", **request(files, resolution=1024, seed=2)))
+            answer = asyncio.create_task(waiting.post("/v1/jobs", **request(many, resolution=1024, seed=2)))
             await asyncio.to_thread(
                 wait_for, lambda: len(service.processes("service.inspection.process")) >= both, "the planning to begin"
             )
@@ -185,10 +187,15 @@ def test_disconnect_cancels_planning_without_events(service: Service, files: dic
         assert client.post("/v1/jobs", **request(files, resolution=96)).status_code == 200
 
 
-def begin_and_leave(
-    service: Service, client: httpx.Client, files: dict[str, bytes], both: int, **parameters: Any
-) -> None:
+def with_many_views(files: dict[str, bytes]) -> dict[str, bytes]:
+    """Return the files with 1,000 views, which take several times as long to plan as a client takes to disconnect."""
+    views = json.loads(files["cameras"])
+    many = [{**views[index % len(views)], "img_name": f"view_{index}"} for index in range(1000)]
+    return {**files, "cameras": json.dumps(many).encode()}
+
+
+def begin_and_leave(service: Service, client: httpx.Client, files: dict[str, bytes], both: int, seed: int) -> None:
     """Start a dry run, disconnect at the first event, and wait until fewer than `both` inspecting processes run."""
-    with connect_sse(client, "POST", "/v1/jobs", **request(files, **parameters)) as source:
+    with connect_sse(client, "POST", "/v1/jobs", **request(files, resolution=1024, seed=seed)) as source:
         next(source.iter_sse())
     wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
