@@ -121,7 +121,7 @@ def parsed_without_figures(report: dict[str, Any]) -> Page:
     return parsed({**report, "history": []})
 
 
-def losses_alone(coarse: int = 6, sos: int = 12, scales: int = 2, *, also: str = "") -> dict[str, Any]:
+def losses_alone(coarse: int = 6, sos: int = 12, scales: int = 1, *, also: str = "") -> dict[str, Any]:
     """Return a report whose only data for charts are losses and, if requested, those of one other field."""
     report = sample_report(coarse, sos, scales)
     for record in report["history"]:
@@ -208,7 +208,7 @@ def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
 
 
 def test_lines_are_named_and_phases_marked() -> None:
-    loss = draw_figures(losses_alone(also="novel_views"))[0].svg["steps"]
+    loss = draw_figures(losses_alone(scales=2, also="novel_views"))[0].svg["steps"]
     words = Page(loss).text
     for name in ("scale 0 (full size)", "scale 1 (1/2)", "mean", "Gram distance, novel views", "steps"):
         assert name in words
@@ -486,7 +486,7 @@ def test_report_without_steps_has_no_figures() -> None:
     ("wrong", "where"), [(math.nan, "one"), (0.0, "all"), (math.nan, "all"), (math.inf, "all"), (-1.0, "all")]
 )
 def test_losses_outside_of_logarithmic_axes_are_counted(wrong: float, where: str) -> None:
-    report = losses_alone()
+    report = losses_alone(scales=2)
     for record in report["history"][:1] if where == "one" else report["history"]:
         record.update(loss=wrong, relative=wrong)
         for terms in record["scales"].values():
