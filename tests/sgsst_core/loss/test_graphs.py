@@ -81,7 +81,7 @@ def test_graph_is_bit_identical_to_eager_mode_for_every_view(
     loss = make_loss(tiny_weights)
     style, views = style_of(loss), [view_of(loss, seed, weighted=weighted) for seed in (2, 3)]
     graphs, results = LossGraphs(loss), []
-    for step in range(4):
+    for step in range(FIRST_VISITS + 1):  # replayed for another view than the captured one
         pixels, view = image(step), views[step % 2]
         expected = loss.evaluate(pixels, style, view, SCALES)
         counts.clear()
