@@ -318,7 +318,7 @@ def spz(count: int, data: bytes, *, version: int = 3, degree: int = 0) -> bytes:
 
 def spz_bomb() -> bytes:
     """Return an SPZ of one Gaussian, followed by a gigabyte of zeros."""
-    deflate = zlib.compressobj(9, wbits=31)
+    deflate = zlib.compressobj(1, wbits=31)
     data = deflate.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20))
     for _ in range(64):
         data += deflate.compress(bytes(16 * MB))
@@ -364,7 +364,7 @@ def glb(document: bytes) -> bytes:
 
 def zipped(name: str, data: bytes) -> bytes:
     file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr(name, data)
     return file.getvalue()
 
