@@ -49,26 +49,17 @@ def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
         [N, 3] float64.
     """
     start = colors.clamp(-_FARTHEST, _FARTHEST)
-    drawn, copies = _drawn(weights).unique_consecutive(return_counts=True)
-    rounds = _rounds(start[drawn], copies, wanted)
+    rounds = _rounds(start[_drawn(weights)], wanted)
     return _through(start, rounds) if start.is_cuda else _through_compiled(start, rounds)
 
 
-def _rounds(source: Tensor, copies: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
-    """Return the axes [3, 3] of each round and the maps along them.
-
-    Args:
-        source: Samples [n, 3] of the colors. A small scene has few, each of which is moved once.
-        copies: How often each of them was drawn, [n] int64.
-        wanted: Samples [m, 3] of the wanted colors.
-    """
-    once = torch.ones(len(wanted), dtype=torch.long, device=wanted.device)
+def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
+    """Return the axes [3, 3] of each round and the maps along them, given samples [n, 3] of both distributions."""
     rounds: list[tuple[Tensor, list[_Map]]] = []
     for axes in _round_axes():
         axes = axes.to(source.device)
         along = zip((source @ axes).unbind(1), (wanted @ axes).unbind(1), strict=True)
-        maps = [_along(_quantiles(values, copies), _quantiles(others, once)) for values, others in along]
-        rounds.append((axes, maps))
+        rounds.append((axes, [_along(values, others) for values, others in along]))
         source = _through(source, rounds[-1:])
     return rounds
 
@@ -118,11 +109,12 @@ def _round_axes() -> Iterator[Tensor]:
         yield unit_rotations(torch.tensor(quat, dtype=torch.float64))
 
 
-def _along(knots: Tensor, targets: Tensor) -> _Map:
-    """Return the transport along one axis that maps quantiles to those of the wanted values.
+def _along(values: Tensor, wanted: Tensor) -> _Map:
+    """Return the transport along one axis that maps values [n] to the distribution of `wanted` values [m].
 
     Equal values map to the mean of all their targets.
     """
+    knots, targets = _quantiles(values), _quantiles(wanted)
     apart = torch.diff(knots, prepend=knots[:1] - 1) > _APART
     group = apart.cumsum(0) - 1
     counts = torch.bincount(group).to(knots)
@@ -130,12 +122,11 @@ def _along(knots: Tensor, targets: Tensor) -> _Map:
     return next(sums) / counts, next(sums) / counts
 
 
-def _quantiles(values: Tensor, copies: Tensor) -> Tensor:
-    """Return [_KNOTS] quantiles of values [n] that occur `copies` times, from the minimum to the maximum."""
-    ordered, order = values.sort()
-    ends = copies[order].cumsum(0)
-    positions = torch.linspace(0, int(ends[-1]) - 1, _KNOTS, dtype=torch.float64, device=values.device)
-    return ordered[torch.searchsorted(ends, positions.round().long(), right=True)]
+def _quantiles(values: Tensor) -> Tensor:
+    """Return [_KNOTS] quantiles of values [n], from the minimum to the maximum."""
+    ordered = values.sort().values
+    positions = torch.linspace(0, len(ordered) - 1, _KNOTS, dtype=torch.float64, device=values.device)
+    return ordered[positions.round().long()]
 
 
 def _mapped(values: Tensor, knots: Tensor, targets: Tensor) -> Tensor:
