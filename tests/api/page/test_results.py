@@ -95,7 +95,7 @@ def test_no_remaining_time_is_shown_while_views_are_analyzed(visit: Visit, finis
     watched = visit("/#/jobs")
     page = watched.page
     page.route(f"**/v1/jobs/{finished}", planning)
-    page.route(f"**/v1/jobs/{finished}/events", lambda route: None)  # never answered: its events tell of the real job
+    page.route(f"**/v1/jobs/{finished}/events", lambda route: None)  # its events are those of the real job
     page.goto(f"{watched.url}/#/jobs/{finished}")
     page.get_by_text("Analyzing views · view 9 of 9").wait_for()
     assert page.locator(".state .left").inner_text() == ""
