@@ -140,7 +140,7 @@ def test_coverage_that_weights_statistics_takes_memory_and_a_render() -> None:
     taken = sum(height * width for height, width in measurements.sizes) * 16 / 3
     assert on.prediction.peak_bytes - off.prediction.peak_bytes == pytest.approx(taken, abs=2)
     assert on.prediction.first_visit - off.prediction.first_visit == pytest.approx(0.5 * 2.0)
-    huge = replace(measurements, sizes=tuple((height * 40, width * 40) for height, width in measurements.sizes))
+    huge = replace(measurements, sizes=tuple((height * 10, width * 10) for height, width in measurements.sizes))
     off, on = (
         plan_of(huge, position_weights=weights, steps_coarse=0, keep=("uncovered",)) for weights in ("off", "on")
     )
