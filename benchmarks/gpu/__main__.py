@@ -35,17 +35,17 @@ from benchmarks.machine import RESULTS, write_result
 #: Time limit of each part in seconds, 535 in total, the most telling parts first. The first parts load the libraries
 #: from disk and compile the kernels and the CPU rasterizer.
 BUDGETS = {
-    "identity": 20,
-    "poison": 55,
-    "parity": 55,
-    "kernels": 30,
-    "convolutions": 20,
-    "step": 125,
-    "network": 15,
-    "raster": 20,
+    "identity": 15,
+    "poison": 50,
+    "parity": 45,
+    "kernels": 60,
+    "convolutions": 15,
+    "step": 90,
+    "network": 20,
+    "raster": 25,
     "ranks": 45,
-    "curve": 50,
-    "tests": 100,
+    "curve": 90,
+    "tests": 80,
 }
 #: Factor on the time limits without a GPU, where the CPU may be busy and times mean nothing.
 _PATIENCE = 10

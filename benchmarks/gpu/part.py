@@ -34,7 +34,7 @@ class Sizes:
     parity: tuple[int, int, int] = (20_000, 320, 200)
     network: int = 1024
     bits: int = 100
-    curve: tuple[int, int] = (120, 128)
+    curve: tuple[int, int] = (60, 128)
     repeats: int = 20
 
 

@@ -96,7 +96,7 @@ def test_synthetic_images_are_as_large_as_the_device_needs(tiny_weights: Backbon
     on_gpu = replace(planning_context, machine=replace(planning_context.machine, device="cuda"))
     network = planning_context.network
     a_pixel = network.held_bytes_per_pixel() + network.working_bytes_per_pixel()
-    for memory, on_cpu, with_gpu in ((1 << 40, 384, 1024), (int(500.5**2 * a_pixel), 384, 500), (1, 384, ALIGNMENT)):
+    for memory, on_cpu, with_gpu in ((1 << 40, 384, 2048), (int(500.5**2 * a_pixel), 384, 500), (1, 384, ALIGNMENT)):
         loss = SosLoss(network, memory=memory)
         assert (_side(planning_context, loss), _side(on_gpu, loss)) == (on_cpu, with_gpu)
 
