@@ -28,7 +28,7 @@ from sgsst_core.features import vgg
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
-from sgsst_core.features.statistics import TILE, matrix_precision, span_positions
+from sgsst_core.features.statistics import TILE, span_positions
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.content import ContentDifference
 from sgsst_core.loss.sos import SosLoss
@@ -41,7 +41,7 @@ from sgsst_core.settings import make_settings
 PRECISIONS = ("float32", "tf32", "bfloat16")
 #: Kernel launches of a step with a fully cached view of 980x545 in bfloat16, and those of its loss at three scales, as
 #: counted by `device_counts`.
-LAUNCHES, LOSS_LAUNCHES = 500, 471
+LAUNCHES, LOSS_LAUNCHES = 485, 456
 #: Launches to compute a view's tile intersections: two multi-pass sorts, a multi-pass sum, kernels and copies.
 LIST_LAUNCHES = 40
 #: Instructions per pixel for a pair of Gaussian and raster tile in render and gradient (compute capability 9.0), as
@@ -63,13 +63,11 @@ class Device:
         peaks: Operations per second by precision, without sparsity.
         bandwidth: Memory bandwidth in bytes per second.
         memory: Memory size in bytes.
-        cache: Size of the L2 cache in bytes.
     """
 
     peaks: Mapping[str, float]
     bandwidth: float
     memory: float
-    cache: float
 
     @property
     def memory_limit(self) -> int:
@@ -82,10 +80,10 @@ def _device(bfloat16: float, tf32: float, float32: float, float64: float, *rest:
 
 
 DEVICES = {
-    "H200": _device(989e12, 495e12, 67e12, 34e12, 4.8e12, 141e9, 50e6),
-    "H100": _device(989e12, 495e12, 67e12, 34e12, 3.35e12, 80e9, 50e6),
-    "A100": _device(312e12, 156e12, 19.5e12, 9.7e12, 2.04e12, 80e9, 40e6),
-    "RTX 4090": _device(165e12, 82.6e12, 82.6e12, 1.29e12, 1.01e12, 24e9, 72e6),
+    "H200": _device(989e12, 495e12, 67e12, 34e12, 4.8e12, 141e9),
+    "H100": _device(989e12, 495e12, 67e12, 34e12, 3.35e12, 80e9),
+    "A100": _device(312e12, 156e12, 19.5e12, 9.7e12, 2.04e12, 80e9),
+    "RTX 4090": _device(165e12, 82.6e12, 82.6e12, 1.29e12, 1.01e12, 24e9),
 }
 
 
@@ -95,7 +93,8 @@ class Shares:
 
     Attributes:
         convolution: Fraction of `Device.peaks` for convolutions, by precision.
-        matrix: Fraction of `Device.peaks` for Triton's feature products, in TF32 or float32 ("ieee").
+        matrix: Fraction of `Device.peaks` for Triton's products of features and matrices, in bfloat16 or float32.
+        moments: The same for products of features with each other.
         bandwidth: Fraction of the memory bandwidth.
         lanes: Fraction of the thread instructions per second for the rasterizer, whose loop has no memory accesses. A
             data sheet counts a fused multiply-add as two float32 operations.
@@ -106,6 +105,7 @@ class Shares:
 
     convolution: Mapping[str, float]
     matrix: Mapping[str, float]
+    moments: Mapping[str, float]
     bandwidth: float
     lanes: float
     blended: float
@@ -114,26 +114,31 @@ class Shares:
 
     def rates(self, device: Device, precision: str) -> dict[str, float]:
         """Return the operations and bytes per second that `Work.seconds` expects."""
-        product = matrix_precision(torch.bfloat16 if precision == "bfloat16" else torch.float32)
+        product = "bfloat16" if precision == "bfloat16" else "float32"
         return {
             "convolution": device.peaks[precision] * self.convolution[precision],
-            "matrix": device.peaks["tf32" if product == "tf32" else "float32"] * self.matrix[product],
+            "matrix": device.peaks[product] * self.matrix[product],
+            "moments": device.peaks[product] * self.moments[product],
             "lanes": device.peaks["float32"] / 2 * self.lanes / self.blended,
             "float64": device.peaks["float64"] / 2 * self.lanes / self.blended,
             "bytes": device.bandwidth * self.bandwidth,
         }
 
 
-def _shares(float32: float, tf32: float, bfloat16: float, ieee: float, product: float, *rest: float) -> Shares:
-    convolution = {"float32": float32, "tf32": tf32, "bfloat16": bfloat16}
-    return Shares(convolution, {"ieee": ieee, "tf32": product}, *rest)
+def _shares(
+    convolution: tuple[float, float, float], matrix: tuple[float, float], moments: tuple[float, float], *rest: float
+) -> Shares:
+    """Return fractions for convolutions in float32, TF32 and bfloat16, and for products in float32 and bfloat16."""
+    kinds = ("float32", "bfloat16")
+    convolutions = dict(zip(("float32", "tf32", "bfloat16"), convolution, strict=True))
+    return Shares(convolutions, dict(zip(kinds, matrix, strict=True)), dict(zip(kinds, moments, strict=True)), *rest)
 
 
-#: The likely fractions of convolutions in bfloat16, products and bandwidth are those of a step at 5187x3361 on an H100.
+#: The likely fractions of convolutions, products and bandwidth are those of a step at 5187x3361 on an H100.
 SHARES = {
-    "optimistic": _shares(0.85, 0.65, 0.7, 0.6, 0.4, 0.9, 0.7, 0.5, 15e-6, 1e-6),
-    "likely": _shares(0.7, 0.5, 0.65, 0.4, 0.2, 0.85, 0.5, 0.7, 25e-6, 1.5e-6),
-    "pessimistic": _shares(0.5, 0.35, 0.4, 0.25, 0.1, 0.6, 0.35, 1.0, 40e-6, 2.5e-6),
+    "optimistic": _shares((0.7, 0.75, 0.7), (0.6, 0.4), (0.6, 0.2), 0.9, 0.7, 0.5, 15e-6, 1e-6),
+    "likely": _shares((0.46, 0.62, 0.65), (0.5, 0.3), (0.45, 0.12), 0.85, 0.5, 0.7, 25e-6, 1.5e-6),
+    "pessimistic": _shares((0.35, 0.35, 0.4), (0.3, 0.15), (0.25, 0.08), 0.6, 0.35, 1.0, 40e-6, 2.5e-6),
 }
 
 
@@ -200,10 +205,10 @@ def make_loss(device: Device, precision: str) -> SosLoss:
 
 
 class Passes:
-    """Work of the parts of a view's loss at the given scales; `cache` is the size of the GPU's L2 cache in bytes."""
+    """Work of the parts of a view's loss at the given scales."""
 
-    def __init__(self, loss: SosLoss, size: Size, scales: Sequence[int], cache: float) -> None:
-        self.loss, self.size, self.cache = loss, size, cache
+    def __init__(self, loss: SosLoss, size: Size, scales: Sequence[int]) -> None:
+        self.loss, self.size = loss, size
         self.sizes = {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
         tiles = {scale: loss.divider.tiles(scaled) for scale, scaled in self.sizes.items()}
         self.tiles = [(tile, self.sizes[scale]) for scale, own in tiles.items() for tile in own]
@@ -231,8 +236,8 @@ class Passes:
             for layer in STYLE_LAYERS
         ]
         return (
-            [statistics(*piece, size, self.cache) for piece in pieces],
-            [style_gradient(*piece, size, self.cache) for piece in pieces],
+            [statistics(*piece, size) for piece in pieces],
+            [style_gradient(*piece, size) for piece in pieces],
         )
 
     def content(self) -> list[Work]:
@@ -283,33 +288,30 @@ def _cells(layer: str, tile: PartitionTile, size: Size) -> int:
     return tile.owned_cells(layer, size)[1].pixels
 
 
-def statistics(channels: int, positions: int, size: int, cache: float) -> Work:
+def statistics(channels: int, positions: int, size: int) -> Work:
     """Return the work of `statistics_kernels.shifted_moments` and its subsequent kernels.
+
+    Programs that read the same features run at the same time, so that features are read from memory once.
 
     Args:
         channels: Number of channels of the layer.
         positions: Number of feature cells.
         size: Bytes per feature value.
-        cache: Size of the L2 cache in bytes.
     """
     tiles = -(-channels // TILE)
     pairs = tiles * (tiles + 1) // 2
-    # Each pair of channel tiles reads both tiles, or one on the diagonal. Spans are the outer loop, so a layer larger
-    # than the L2 cache is read from memory each time.
-    reads = tiles if channels * positions * size > cache else 1
     spans = -(-positions // span_positions(positions, channels))
-    moved = reads * channels * positions * size + 2 * spans * channels**2 * 4
-    return Work(2.0 * min(TILE, channels) ** 2 * pairs * positions, moved, "matrix")
+    moved = channels * positions * size + 2 * spans * channels**2 * 4
+    return Work(2.0 * min(TILE, channels) ** 2 * pairs * positions, moved, "moments")
 
 
-def style_gradient(channels: int, positions: int, size: int, cache: float) -> Work:
+def style_gradient(channels: int, positions: int, size: int) -> Work:
     """Return the work of `statistics_terms_kernels.add_style_gradient`.
 
-    Each channel tile reads all features, and reads and writes its own part of the gradient.
+    It reads the features, and reads and writes the gradient. Bfloat16 features are multiplied by two matrices.
     """
-    tiles = -(-channels // TILE)
-    reads = tiles if channels * positions * size > cache else 1
-    return Work(2.0 * channels**2 * positions, (reads + 2.0) * channels * positions * size, "matrix")
+    products = 2 if size == 2 else 1
+    return Work(2.0 * products * channels**2 * positions, 3.0 * channels * positions * size, "matrix")
 
 
 def render(job: Job) -> list[Work]:
@@ -377,7 +379,7 @@ def step_parts(
     """
     loss = make_loss(device, precision)
     count = loss.tiling.scale_count(job.size)
-    passes = Passes(loss, job.size, [count - 1] if coarse else range(count), device.cache)
+    passes = Passes(loss, job.size, [count - 1] if coarse else range(count))
     forward, backward = passes.network()
     moments, style = passes.style()
     cached = (

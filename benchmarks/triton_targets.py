@@ -35,7 +35,6 @@ from sgsst_core.features.statistics import (
     TILE,
     block_of_channels,
     block_of_entries,
-    matrix_precision,
     positions_of_block,
 )
 from sgsst_core.loss import statistics_terms
@@ -64,6 +63,8 @@ _TYPES = {
     **dict.fromkeys(("piece_gaussians", "piece_slots"), "*i32"),
     **dict.fromkeys(("weights", "shift", "firsts", "seconds", "matrix", "mean", "own_mean", "offset"), "*fp32"),
     **dict.fromkeys(("count", "centered", "target_gram", "target_mean", "target_std", "terms"), "*fp64"),
+    **dict.fromkeys(("high", "low"), "*bf16"),
+    "constant": "*fp32",
     **dict.fromkeys(
         ("positions", "row_cells", "out_row_cells", "weight_row_step", "weight_column_step", "span"), "i32"
     ),
@@ -97,21 +98,28 @@ def _of_cached_weights(form: str) -> dict[str, Target]:
 def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
     """Return the kernels that read features and position weights."""
     features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
-    matrix = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True, "PRECISION": matrix_precision(_DTYPES[form])}
-    block = positions_of_block(_DTYPES[form])
-    moments = {**matrix, "P": block, "PARTS": FLUSH // block}
+    matrix: dict[str, Any] = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True}
+    dtype = _DTYPES[form]
+    block, step = positions_of_block(dtype), statistics_terms.STEPS[dtype.itemsize]
+    moments = {**matrix, "P": block, "PARTS": FLUSH[dtype.itemsize] // block}
+    gradient = {**matrix, "K": block_of_channels(channels, step), "P": statistics_terms.POSITIONS}
+    types = {"features": features, "gradient": features}
+    if dtype == torch.bfloat16:
+        moments, gradient, types = {**moments, "shift": None}, {**gradient, "mean": None}, {**types, "matrix": features}
+    else:
+        gradient = {**gradient, "low": None}
     return {
         f"shifted_moments_{of}": Target(
             statistics_kernels.shifted_moments,
             moments,
             4,
-            {"features": features, "shift": features, "sums": "*fp32"},
+            {"features": features, "sums": "*fp32"},
         ),
         f"add_style_gradient_{of}": Target(
             loss_kernels.add_style_gradient,
-            {**matrix, "K": block_of_channels(channels, statistics_terms.STEP), "P": statistics_terms.POSITIONS},
+            gradient,
             4,
-            {"features": features, "gradient": features},
+            types,
         ),
     }
 

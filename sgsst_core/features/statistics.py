@@ -35,9 +35,9 @@ _FAR = 8.0
 _GPU_SPANS = 256, 4096
 #: Programs that occupy a GPU. Spans are as long as this number permits, because the sums of spans take time to add.
 _GPU_PROGRAMS = 1024
-#: Positions after which a program starts a new accumulator of second moments. Longer float32 chains round too much:
-#: one over 3,500 positions is off by 1e-5.
-FLUSH = 128
+#: Positions after which a program starts a new accumulator of second moments, by bytes per feature. Longer float32
+#: chains round too much: one over 3,500 positions of float32 features is off by 1e-5.
+FLUSH = {2: 256, 4: 128}
 #: Minimum number of feature rows averaged for the shift.
 _SHIFT_ROWS = 64
 #: Channels per block of a program.
@@ -263,14 +263,6 @@ def layer_statistics_reference(features: Tensor, position_weights: Tensor | None
 # --- on a GPU ---
 
 
-def matrix_precision(dtype: torch.dtype) -> str:
-    """Return Triton's input precision for matrix products with features of a dtype.
-
-    TF32 suffices for bfloat16: its 11-bit significand holds the 8 bits of bfloat16. Most AMD GPUs have no TF32.
-    """
-    return "tf32" if dtype == torch.bfloat16 and torch.version.hip is None else "ieee"
-
-
 def positions_of_block(dtype: torch.dtype) -> int:
     """Return the number of positions per block of a program."""
     return 64 if dtype == torch.bfloat16 else 32
@@ -313,7 +305,9 @@ def _is_interpreted() -> bool:
 def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
     """Compute `layer_statistics` on a GPU in four launches, without a temporary tensor as large as the features.
 
-    Moments are summed in float32 about a shift, the mean of some rows, which only has to be close to the true mean.
+    Moments are summed in float32 about a shift, the mean of some rows, which only has to be close to the true mean. In
+    bfloat16, they are summed about 0, and position weights are rounded to bfloat16 (see `shifted_moments`).
+
     Features are float32 or bfloat16 with contiguous channels, and c is below 16 or a power of two.
     """
     from sgsst_core.features import statistics_kernels as kernels
@@ -322,16 +316,17 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     device, positions = features.device, height * width
     span, tile = span_positions(positions, channels), block_of_channels(channels, TILE)
     block = block_of_positions(positions_of_block(features.dtype))
-    # In bfloat16, the shift is rounded like the features, so that TF32 holds most differences.
-    shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1))
+    shift = None
+    if features.dtype != torch.bfloat16:
+        shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1))
     sums = torch.empty((-(-positions // span), channels**2 + channels + 1), device=device)
     weights = features if position_weights is None else position_weights
     with on_device(device):
-        kernels.shifted_moments[(len(sums), (-(-channels // tile)) ** 2)](
+        kernels.shifted_moments[((-(-channels // tile)) ** 2, len(sums))](
             features, weights, shift, sums,
             positions, width, row_cells(features), *weights.stride()[:2], span,
-            CHANNELS=channels, TILE=tile, P=block, PARTS=max(1, FLUSH // block),
-            WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
+            CHANNELS=channels, TILE=tile, P=block, PARTS=max(1, FLUSH[features.element_size()] // block),
+            WEIGHTED=position_weights is not None,
         )  # fmt: skip
     count = torch.empty((), dtype=torch.float64, device=device)
     mean = torch.empty(channels, dtype=torch.float64, device=device)

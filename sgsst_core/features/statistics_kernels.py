@@ -29,78 +29,84 @@ def cells_of(position, width, row_cells):
 
 
 @triton.jit
-def load_centered(features, shift, cell, channel, there, CHANNELS: tl.constexpr):
-    """Load features minus shift [P, C] as float32 from cells; features of invalid cells and channels count as 0."""
-    inside = channel < CHANNELS
-    values = tl.load(
-        features + cell[:, None] * CHANNELS + channel[None, :], mask=mask_of(there, channel, CHANNELS), other=0.0
-    )
-    return values.to(tl.float32) - tl.load(shift + channel, mask=inside, other=0.0).to(tl.float32)[None, :]
+def load_features(features, cell, channel, there, CHANNELS: tl.constexpr, TILE: tl.constexpr):
+    """Load features [P, TILE] from cells; those of invalid cells and channels count as 0."""
+    at = features + cell[:, None] * CHANNELS + channel[None, :]
+    if CHANNELS % TILE == 0:
+        return tl.load(at, mask=there[:, None], other=0.0)
+    return tl.load(at, mask=mask_of(there, channel, CHANNELS), other=0.0)
 
 
 @triton.jit
-def load_weights(weights, row_step, column_step, width, position, there, WEIGHTED: tl.constexpr):
-    """Load position weights [P] as float32, 0 at invalid positions."""
+def load_weights(weights, row_step, column_step, width, position, there, dtype: tl.constexpr, WEIGHTED: tl.constexpr):
+    """Load position weights [P] as float32, rounded to the features' dtype; those of invalid positions are 0."""
     if WEIGHTED:
         offset = (position // width).to(tl.int64) * row_step + (position % width).to(tl.int64) * column_step
-        return tl.load(weights + offset, mask=there, other=0.0).to(tl.float32)
+        return tl.load(weights + offset, mask=there, other=0.0).to(dtype).to(tl.float32)
     return there.to(tl.float32)
 
 
 @triton.jit
-def rounded(x, PRECISION: tl.constexpr):
-    """Round float32 inputs of a matrix product in TF32 to nearest, because GPUs truncate them."""
-    if PRECISION == "tf32":
-        bits = (x.to(tl.int32, bitcast=True) + 0x1000) & -0x2000
-        return tl.where(x == x, bits.to(tl.float32, bitcast=True), x)
-    return x
-
-
-@triton.jit
-def product(left, right, sums, PRECISION: tl.constexpr):
-    """Return sums + left @ right."""
-    return tl.dot(rounded(left, PRECISION), rounded(right, PRECISION), sums, input_precision=PRECISION)
+def halves(x):
+    """Return the two bfloat16 numbers whose sum is closest to a float32 number. Together they have 16 bits."""
+    high = x.to(tl.bfloat16)
+    return high, (x - high.to(tl.float32)).to(tl.bfloat16)
 
 
 @triton.jit
 def add_block(
     features, weights, shift, start, end, width, row_cells, weight_row_step, weight_column_step,
     own, other, second, first, count,
-    CHANNELS: tl.constexpr, TILE: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr, PRECISION: tl.constexpr,
+    CHANNELS: tl.constexpr, TILE: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
 ):  # fmt: skip
     """Add the moments of P positions to `second` [TILE, TILE], `first` [TILE] and `count` [P], and return the sums."""
     position = start + tl.arange(0, P)
     there = position < end
     cell = cells_of(position, width, row_cells)
-    a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
-    left = load_centered(features, shift, cell, own, there, CHANNELS)
-    right = left if CHANNELS <= TILE else load_centered(features, shift, cell, other, there, CHANNELS)
-    left = left * a[:, None]
-    return product(tl.trans(left), right, second, PRECISION), first + tl.sum(left, 0), count + a
+    a = load_weights(
+        weights, weight_row_step, weight_column_step, width, position, there, features.dtype.element_ty, WEIGHTED
+    )
+    left = load_features(features, cell, own, there, CHANNELS, TILE)
+    right = left if CHANNELS <= TILE else load_features(features, cell, other, there, CHANNELS, TILE)
+    if features.dtype.element_ty == tl.bfloat16:
+        scaled = left.to(tl.float32)
+        if WEIGHTED:
+            scaled *= a[:, None]
+            high, low = halves(scaled)
+            second = tl.dot(tl.trans(high), right, tl.dot(tl.trans(low), right, second))
+        else:
+            second = tl.dot(tl.trans(left), right, second)
+    else:
+        scaled = (left - tl.load(shift + own, mask=own < CHANNELS, other=0.0)[None, :]) * a[:, None]
+        right -= tl.load(shift + other, mask=other < CHANNELS, other=0.0)[None, :]
+        second = tl.dot(tl.trans(scaled), right, second, input_precision="ieee")
+    return second, first + tl.sum(scaled, 0), count + a
 
 
 @triton.jit(do_not_specialize=["positions", "width", "row_cells", "weight_row_step", "weight_column_step", "span"])
 def shifted_moments(
     features, weights, shift, sums, positions, width, row_cells, weight_row_step, weight_column_step, span,
     CHANNELS: tl.constexpr, TILE: tl.constexpr, P: tl.constexpr, PARTS: tl.constexpr, WEIGHTED: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Compute moments about the shift over `span` positions, for one TILE x TILE block of channel pairs.
 
     Only blocks on and above the diagonal are computed. Second moments are accumulated over PARTS * P positions at a
     time, so that no float32 chain is long. Below, a_p is a position weight and x_p = F_p - shift.
 
+    In bfloat16 there is no shift: a product of two features, or of a feature and a rounded weight, has 16 bits, so that
+    sums of products are nearly exact in float32. Cancellation enlarges their error less than the features' own.
+
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
         weights: Position weights [h, width]; ignored if WEIGHTED is false.
-        shift: [CHANNELS] in the dtype of the features.
+        shift: [CHANNELS] float32; None if the features are bfloat16.
         sums: Output [spans, CHANNELS^2 + CHANNELS + 1] float32: the sum of a_p x_p x_p^T, of a_p x_p, and of a_p.
             Entries of lower blocks are not written.
         positions: Number of positions, h * width.
         row_cells: Distance of two rows in cells of CHANNELS values.
     """
     tiles: tl.constexpr = (CHANNELS + TILE - 1) // TILE
-    number, pair = tl.program_id(0), tl.program_id(1)
+    pair, number = tl.program_id(0), tl.program_id(1)  # programs that read the same features are neighbors
     down, across = pair // tiles, pair % tiles
     if down <= across:
         own, other = down * TILE + tl.arange(0, TILE), across * TILE + tl.arange(0, TILE)
@@ -108,20 +114,13 @@ def shifted_moments(
         first = tl.zeros([TILE], tl.float32)
         count = tl.zeros([P], tl.float32)
         end = tl.minimum((number + 1) * span, positions)
-        for start in tl.range(number * span, end, P * PARTS, num_stages=2):
+        for start in tl.range(number * span, end, P * PARTS, num_stages=1):
             some = tl.zeros([TILE, TILE], tl.float32)
-            if PRECISION == "tf32":
-                for part in tl.static_range(PARTS):  # unrolled, so that loads overlap with products
-                    some, first, count = add_block(
-                        features, weights, shift, start + part * P, end, width, row_cells, weight_row_step,
-                        weight_column_step, own, other, some, first, count, CHANNELS, TILE, P, WEIGHTED, PRECISION,
-                    )  # fmt: skip
-            else:
-                for part in tl.range(PARTS, num_stages=1):  # unrolled, it would take too many registers
-                    some, first, count = add_block(
-                        features, weights, shift, start + part * P, end, width, row_cells, weight_row_step,
-                        weight_column_step, own, other, some, first, count, CHANNELS, TILE, P, WEIGHTED, PRECISION,
-                    )  # fmt: skip
+            for part in tl.range(PARTS, num_stages=1):
+                some, first, count = add_block(
+                    features, weights, shift, start + part * P, end, width, row_cells, weight_row_step,
+                    weight_column_step, own, other, some, first, count, CHANNELS, TILE, P, WEIGHTED,
+                )  # fmt: skip
             second += some
         row = sums + number.to(tl.int64) * (CHANNELS * CHANNELS + CHANNELS + 1)
         entry = own[:, None] * CHANNELS + other[None, :]
@@ -144,7 +143,7 @@ def combine_moments(
     Args:
         sums: [CHANNELS^2 + CHANNELS + 1] float64, the sum of the outputs of `shifted_moments` over all spans; with a
             single span its output, float32.
-        shift: [CHANNELS], shift of these moments.
+        shift: [CHANNELS], shift of these moments; None for 0.
         count: Output [] float64. All outputs are 0 if no position has weight.
         mean: Output [CHANNELS] float64.
         centered: Output [CHANNELS, CHANNELS] float64.
@@ -161,6 +160,8 @@ def combine_moments(
     second = tl.load(sums + upper, mask=inside, other=0.0).to(tl.float64)
     down, across = tl.load(firsts + i).to(tl.float64), tl.load(firsts + j).to(tl.float64)
     tl.store(centered + entry, second - (down / divisor) * (across / divisor) * total, mask=inside)
-    own = tl.where(some, tl.load(shift + j).to(tl.float64) + across / divisor, 0.0)
+    own = across / divisor
+    if shift is not None:
+        own = tl.where(some, tl.load(shift + j).to(tl.float64) + own, 0.0)
     tl.store(mean + j, own, mask=inside & (i == 0))
     tl.store(count, total, mask=tl.program_id(0) == 0)

@@ -30,7 +30,6 @@ from sgsst_core.features.statistics import (
     center,
     has_kernels,
     layer_statistics,
-    matrix_precision,
     row_cells,
 )
 from sgsst_core.features.vgg import PIXELS, STYLE_LAYERS, FeatureNetwork
@@ -47,8 +46,10 @@ GRAM_WEIGHT = 1e3
 MEAN_WEIGHT = 1e4
 #: w_s.
 STD_WEIGHT = 1e4
-#: Positions per program of the gradient kernel, and channels per step. Larger values would cause register spilling.
-POSITIONS, STEP = 64, 32
+#: Positions per program of the gradient kernel.
+POSITIONS = 64
+#: Channels per step of that kernel, by bytes per feature. More would cause register spilling.
+STEPS = {2: 64, 4: 32}
 
 
 class TermWeights(NamedTuple):
@@ -86,18 +87,31 @@ def term_weights(layer: str, pixel_weight: float) -> TermWeights:
     return TermWeights(0.0, MEAN_WEIGHT * pixel_weight, STD_WEIGHT * pixel_weight)
 
 
+class SplitGradient(NamedTuple):
+    """`StyleGradient` for bfloat16 features on a GPU: dE/dF_p = a_p ((high + low) F_p + constant).
+
+    Two matrices of 8-bit numbers hold 16 bits of each entry. Cancellation with the constant enlarges the error of their
+    product less than the rounding of features.
+    """
+
+    high: Tensor  # [c, c] bfloat16
+    low: Tensor  # [c, c] bfloat16
+    constant: Tensor  # [c] float32
+
+
 @dataclass(frozen=True)
 class StyleGradient:
     """dE/dF of one layer as an affine map of centered features: dE/dF_p = a_p (matrix (F_p - mean) + offset).
 
     The map acts on centered features because at mean-to-sigma ratios of 1e4, matrix @ F and a separate offset would
     cancel down to their last digits in float32. Tensors are float64, or float32 if GPU kernels computed them; float32
-    features are multiplied in float32 in either case.
+    features are multiplied in float32 in either case. GPU kernels also compute the map as a `SplitGradient`.
     """
 
     matrix: Tensor  # [c, c]
     mean: Tensor  # [c]
     offset: Tensor  # [c]
+    split: SplitGradient | None = None
 
     def times(self, factor: float) -> StyleGradient:
         """Return the gradient of the loss times a factor."""
@@ -112,6 +126,13 @@ class StyleGradient:
         mean = self.mean.float().double()
         return StyleGradient(self.matrix, mean, self.offset + self.matrix @ (mean - self.mean))
 
+    def about_zero(self) -> SplitGradient:
+        """Return the same map for bfloat16 features."""
+        high = self.matrix.bfloat16()
+        low = (self.matrix - high).bfloat16()
+        constant = self.offset - (high.double() + low.double()) @ self.mean.double()
+        return SplitGradient(high, low, constant.float())
+
     def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
         """Return dE/dfeatures [h, w, c] for features [h, w, c] and position weights [h, w]."""
         result = torch.zeros(features.shape, dtype=features.dtype, device=features.device)
@@ -124,7 +145,7 @@ class StyleGradient:
         The computation runs in blocks, so no tensor as large as the features is allocated.
         """
         if can_be_fused(features) and can_be_fused(gradient) and self.matrix.dtype == torch.float32:
-            fused_add_style_gradient(gradient, features, self.matrix, self.mean, self.offset, position_weights)
+            fused_add_style_gradient(gradient, features, self, position_weights)
             return
         precision = torch.promote_types(features.dtype, torch.float32)
         matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
@@ -164,8 +185,7 @@ def style_loss(
     """
     channels = statistics.mean.shape[0]
     if has_kernels(statistics.mean.device, channels) and feature_eps > torch.finfo(torch.float64).eps:
-        fused = fused_style_loss(statistics, (target.gram, target.mean, target.std), weights, feature_eps)
-        return fused[0], StyleGradient(*fused[1:])
+        return fused_style_loss(statistics, (target.gram, target.mean, target.std), weights, feature_eps)
     some = statistics.count > 0
     gram_error = statistics.gram() - target.gram
     mean_error = statistics.mean - target.mean
@@ -275,7 +295,7 @@ def fused_style_loss(
     target: tuple[Tensor, Tensor, Tensor],
     weights: tuple[float, float, float],
     feature_eps: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, StyleGradient]:
     """Compute `style_loss` on a GPU.
 
     Args:
@@ -285,42 +305,37 @@ def fused_style_loss(
         feature_eps: Relative rounding error of the features, as in `style_loss`.
 
     Returns:
-        Terms [3] float64, and the gradient's matrix [c, c], mean [c] and offset [c] in float32.
+        Terms [3] float64, and the gradient in float32.
     """
     from sgsst_core.loss import statistics_terms_kernels as kernels
 
     device, channels = statistics.mean.device, len(statistics.mean)
     terms = torch.empty((channels, 3), dtype=torch.float64, device=device)
     matrix = torch.empty((channels, channels), device=device)
-    mean, offset = torch.empty(channels, device=device), torch.empty(channels, device=device)
+    mean, offset, constant = torch.empty((3, channels), device=device)
+    high, low = torch.empty((2, channels, channels), dtype=torch.bfloat16, device=device)
     gram_weight, mean_weight, std_weight = weights
     columns = block_of_channels(channels)
     rows = block_of_entries(channels) // columns
     with on_device(device):
         kernels.compare[(-(-channels // rows),)](
             statistics.count, statistics.mean, statistics.centered, *target, terms, matrix, mean, offset,
+            high, low, constant,
             GRAM=gram_weight, MEAN=mean_weight, STD=std_weight, EPS=feature_eps, CHANNELS=channels, ROWS=rows,
             COLUMNS=columns,
         )  # fmt: skip
-    return terms.sum(dim=0), matrix, mean, offset
+    return terms.sum(dim=0), StyleGradient(matrix, mean, offset, SplitGradient(high, low, constant))
 
 
 def fused_add_style_gradient(
-    gradient: Tensor,
-    features: Tensor,
-    matrix: Tensor,
-    mean: Tensor,
-    offset: Tensor,
-    position_weights: Tensor | None = None,
+    gradient: Tensor, features: Tensor, style: StyleGradient, position_weights: Tensor | None = None
 ) -> None:
-    """Add a_p (matrix (F_p - mean) + offset) to a gradient in place.
+    """Add the gradient of the style loss in place.
 
     Args:
         gradient: [h, w, c].
         features: [h, w, c], same dtype as the gradient.
-        matrix: [c, c] from `fused_style_loss`.
-        mean: [c] from `fused_style_loss`.
-        offset: [c] from `fused_style_loss`.
+        style: Gradient in float32.
         position_weights: [h, w]; None for equal weights.
     """
     from sgsst_core.loss import statistics_terms_kernels as kernels
@@ -328,10 +343,15 @@ def fused_add_style_gradient(
     height, width, channels = features.shape
     positions, tile, block = height * width, block_of_channels(channels, TILE), block_of_positions(POSITIONS)
     weights = features if position_weights is None else position_weights
+    if features.dtype == torch.bfloat16:
+        matrix, low, offset = style.split or style.about_zero()
+        mean = None
+    else:
+        matrix, low, mean, offset = style.matrix, None, style.mean, style.offset
     with on_device(features.device):
-        kernels.add_style_gradient[(-(-positions // block), -(-channels // tile))](
-            features, weights, gradient, matrix, mean, offset,
+        kernels.add_style_gradient[(-(-positions // block) * -(-channels // tile),)](
+            features, weights, gradient, matrix, low, mean, offset,
             positions, width, row_cells(features), *weights.stride()[:2], row_cells(gradient),
-            CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEP), P=block,
-            WEIGHTED=position_weights is not None, PRECISION=matrix_precision(features.dtype),
+            CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEPS[features.element_size()]), P=block,
+            WEIGHTED=position_weights is not None,
         )  # fmt: skip

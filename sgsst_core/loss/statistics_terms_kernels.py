@@ -11,12 +11,12 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sgsst_core.features.statistics_kernels import cells_of, load_centered, load_weights, mask_of, product
+from sgsst_core.features.statistics_kernels import cells_of, halves, load_features, load_weights, mask_of
 
 
 @triton.jit
 def compare(
-    count, mean, centered, target_gram, target_mean, target_std, terms, matrix, own_mean, offset,
+    count, mean, centered, target_gram, target_mean, target_std, terms, matrix, own_mean, offset, high, low, constant,
     GRAM: tl.constexpr, MEAN: tl.constexpr, STD: tl.constexpr, EPS: tl.constexpr, CHANNELS: tl.constexpr,
     ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
@@ -30,6 +30,8 @@ def compare(
         terms: Output [CHANNELS, 3] float64, contribution of each channel to each term.
         matrix, own_mean, offset: Outputs [CHANNELS, CHANNELS], [CHANNELS] and [CHANNELS] float32, the fields of
             `statistics_terms.StyleGradient`.
+        high, low, constant: Outputs [CHANNELS, CHANNELS] bfloat16 (two) and [CHANNELS] float32, the fields of
+            `statistics_terms.SplitGradient`.
     """
     i = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     j = tl.arange(0, COLUMNS)
@@ -51,9 +53,15 @@ def compare(
     line = (4 * weight / (CHANNELS * CHANNELS)) * gram_error
     drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * fraction
     line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
+    rounded = (line * fraction).to(tl.float32)
+    first, second = halves(rounded)
+    stored = first.to(tl.float32).to(tl.float64) + second.to(tl.float32).to(tl.float64)
+    tl.store(constant + i, (drawn - tl.sum(stored * means[None, :], 1)).to(tl.float32), mask=row)
     # `add_style_gradient` centers features about the float32 mean; the offset compensates for its rounding error.
     drawn += tl.sum(line * (means.to(tl.float32).to(tl.float64) - means)[None, :], 1) * fraction
-    tl.store(matrix + entry, (line * fraction).to(tl.float32), mask=both)
+    tl.store(matrix + entry, rounded, mask=both)
+    tl.store(high + entry, first, mask=both)
+    tl.store(low + entry, second, mask=both)
     tl.store(own_mean + i, own.to(tl.float32), mask=row)
     tl.store(offset + i, drawn.to(tl.float32), mask=row)
     present = tl.where(some, 1.0, 0.0).to(tl.float64)
@@ -67,35 +75,48 @@ def compare(
     do_not_specialize=["positions", "width", "row_cells", "weight_row_step", "weight_column_step", "out_row_cells"]
 )
 def add_style_gradient(
-    features, weights, gradient, matrix, mean, offset,
+    features, weights, gradient, matrix, low, mean, offset,
     positions, width, row_cells, weight_row_step, weight_column_step, out_row_cells,
     CHANNELS: tl.constexpr, TILE: tl.constexpr, K: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Compute gradient_p += a_p (matrix (F_p - mean) + offset).
 
-    Each program handles P positions and TILE output channels; it sums over the input channels in steps of K.
+    Each program handles P positions and TILE output channels; it sums over the input channels in steps of K. In
+    bfloat16, features are multiplied as they are: products of 8-bit factors are exact.
 
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.
         weights: Position weights [h, width]; ignored if WEIGHTED is false.
         gradient: [h, width, CHANNELS] in the dtype of the features, updated in place.
-        matrix, mean, offset: Outputs of `compare`; the matrix is symmetric.
+        matrix, mean, offset: Outputs of `compare` for float32; the matrix is symmetric. For bfloat16 features, `matrix`
+            and `offset` are the outputs `high` and `constant`, and `mean` is None.
+        low: Output of `compare` for bfloat16 features; otherwise None.
         positions: Number of positions, h * width.
         row_cells, out_row_cells: Distances of two rows of features and gradient in cells of CHANNELS values.
     """
-    position = tl.program_id(0) * P + tl.arange(0, P)
+    tiles: tl.constexpr = (CHANNELS + TILE - 1) // TILE
+    stages: tl.constexpr = 3 if low is not None and CHANNELS > K else 1
+    number = tl.program_id(0)  # programs that read the same features are neighbors
+    position = number // tiles * P + tl.arange(0, P)
     there = position < positions
-    own = tl.program_id(1) * TILE + tl.arange(0, TILE)
+    own = number % tiles * TILE + tl.arange(0, TILE)
     cell = cells_of(position, width, row_cells)
     sums = tl.zeros([P, TILE], tl.float32)
-    for k in tl.range(0, CHANNELS, K, num_stages=1):
+    for k in tl.range(0, CHANNELS, K, num_stages=stages):
         channel = k + tl.arange(0, K)
-        centered = load_centered(features, mean, cell, channel, there, CHANNELS)
+        x = load_features(features, cell, channel, there, CHANNELS, K)
+        entry = channel[:, None] * CHANNELS + own[None, :]
         part_of = mask_of(channel < CHANNELS, own, CHANNELS)
-        part = tl.load(matrix + channel[:, None] * CHANNELS + own[None, :], mask=part_of, other=0.0)
-        sums = product(centered, part, sums, PRECISION)
-    a = load_weights(weights, weight_row_step, weight_column_step, width, position, there, WEIGHTED)
+        part = tl.load(matrix + entry, mask=part_of, other=0.0)
+        if low is not None:
+            sums = tl.dot(x, part, sums)
+            sums = tl.dot(x, tl.load(low + entry, mask=part_of, other=0.0), sums)
+        else:
+            x -= tl.load(mean + channel, mask=channel < CHANNELS, other=0.0)[None, :]
+            sums = tl.dot(x, part, sums, input_precision="ieee")
+    a = load_weights(
+        weights, weight_row_step, weight_column_step, width, position, there, features.dtype.element_ty, WEIGHTED
+    )
     sums = (sums + tl.load(offset + own, mask=own < CHANNELS, other=0.0)[None, :]) * a[:, None]
     target = gradient + cells_of(position, width, out_row_cells)[:, None] * CHANNELS + own[None, :]
     mask = mask_of(there, own, CHANNELS)

@@ -9,7 +9,18 @@ import torch
 import torch.nn.functional as F
 
 from benchmarks import forecast
-from benchmarks.forecast import DEVICES, JOBS, SHARES, Job, Part, Passes, make_loss, statistics, step_seconds
+from benchmarks.forecast import (
+    DEVICES,
+    JOBS,
+    SHARES,
+    Job,
+    Part,
+    Passes,
+    make_loss,
+    statistics,
+    step_seconds,
+    style_gradient,
+)
 from benchmarks.machine import RESULTS
 from benchmarks.work import Counted, Work, meta
 
@@ -28,7 +39,7 @@ FLOP = 2 * 9 * (
 
 
 def test_vgg19_takes_0_72_million_operations_per_pixel_and_pass() -> None:
-    forward, backward = Passes(make_loss(H200, "float32"), SMALL.size, [0], H200.cache).network()
+    forward, backward = Passes(make_loss(H200, "float32"), SMALL.size, [0]).network()
     assert FLOP == 722_304
     for works in (forward, backward):
         assert sum(work.operations for work in works) / (96 * 128) == FLOP
@@ -36,7 +47,7 @@ def test_vgg19_takes_0_72_million_operations_per_pixel_and_pass() -> None:
 
 def test_activations_beyond_memory_are_recomputed(monkeypatch: pytest.MonkeyPatch) -> None:
     loss = make_loss(H200, "float32")
-    passes = Passes(loss, SMALL.size, [0], H200.cache)
+    passes = Passes(loss, SMALL.size, [0])
     passes.cached = [False]
     forward, backward = passes.network()
     assert sum(work.operations for work in backward) == 2 * sum(work.operations for work in forward)
@@ -71,16 +82,22 @@ def test_slower_of_compute_and_memory_determines_time() -> None:
 
 
 def test_statistics_use_upper_triangle_of_channel_pairs() -> None:
-    assert statistics(64, 1000, 4, H200.cache).operations == 2 * 64**2 * 1000
-    assert statistics(512, 1000, 4, H200.cache).operations == 2 * 512**2 * 1000 * 36 / 64
-    large = statistics(512, 10**6, 2, H200.cache)
-    assert large.bytes > 8 * 512 * 10**6 * 2  # eight passes, since it does not fit into the cache
+    assert statistics(64, 1000, 4).operations == 2 * 64**2 * 1000
+    assert statistics(512, 1000, 4).operations == 2 * 512**2 * 1000 * 36 / 64
+
+
+def test_style_gradient_multiplies_bfloat16_by_two_matrices() -> None:
+    exact, half = style_gradient(64, 1000, 4), style_gradient(64, 1000, 2)
+    assert half.operations == 2 * exact.operations == 4 * 64**2 * 1000
+    assert exact.bytes == 2 * half.bytes == 3 * 64 * 1000 * 4
 
 
 def test_feature_precision_determines_matrix_product_rate() -> None:
-    rates = {name: SHARES["likely"].rates(H200, name)["matrix"] for name in forecast.PRECISIONS}
-    assert rates["tf32"] == rates["float32"] == H200.peaks["float32"] * SHARES["likely"].matrix["ieee"]
-    assert rates["bfloat16"] == H200.peaks["tf32"] * SHARES["likely"].matrix["tf32"]
+    likely = SHARES["likely"]
+    rates = {name: likely.rates(H200, name) for name in forecast.PRECISIONS}
+    for kind, shares in (("matrix", likely.matrix), ("moments", likely.moments)):
+        assert rates["tf32"][kind] == rates["float32"][kind] == H200.peaks["float32"] * shares["float32"]
+        assert rates["bfloat16"][kind] == H200.peaks["bfloat16"] * shares["bfloat16"]
 
 
 def test_device_and_host_times_overlap() -> None:
@@ -99,7 +116,7 @@ def test_device_and_host_times_overlap() -> None:
 
 def test_backward_pass_of_pooling_reads_and_writes_each_value_once() -> None:
     """Its gradient is a quarter as large as its input, which is that of the convolution before it."""
-    _, backward = Passes(make_loss(H200, "bfloat16"), SMALL.size, [0], H200.cache).network()
+    _, backward = Passes(make_loss(H200, "bfloat16"), SMALL.size, [0]).network()
     pooled = 96 * 128 * (64 + 128 / 4 + 256 / 16 + 512 / 64) * 2
     moved = [work.bytes for work in backward if not work.operations]
     assert sum(moved[index] for index in range(len(moved)) if moved[index] == 96 * 128 * 64 * 2 * 9 / 4) > 0

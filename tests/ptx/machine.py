@@ -373,11 +373,17 @@ def _store_matrix(instruction: Instruction) -> Execute:
 
 
 def _mma(instruction: Instruction) -> Execute:
-    """Return the execution of `mma.m16n8k8` in TF32 (PTX ISA, "Matrix Fragments for mma.m16n8k8").
+    """Return the execution of `mma.m16n8k8` in TF32 and `mma.m16n8k16` in bfloat16 (PTX ISA, "Matrix Fragments").
 
-    Inputs are truncated to TF32; products are summed in float64 and rounded once.
+    A register of a factor holds a row's part of 32 bits: one value of TF32, to which it is truncated, or two of
+    bfloat16. Products are summed in float64 and rounded once.
     """
-    if "m16n8k8" not in instruction.opcode or "tf32" not in instruction.opcode:
+    opcode = instruction.opcode
+    if {"m16n8k8", "tf32"} <= set(opcode):
+        packed, significant = 1, np.uint32(0xFFFFE000)
+    elif {"m16n8k16", "bf16"} <= set(opcode):
+        packed, significant = 2, np.uint32(0xFFFF0000)
+    else:
         raise UnsupportedError(str(instruction))
     targets = _vector(instruction.operands[0])
     a, b, c = (
@@ -393,14 +399,20 @@ def _mma(instruction: Instruction) -> Execute:
         def fragments(reads: list[Read]) -> list[np.ndarray]:
             return [read(state).reshape(warps, WARP) for read in reads]
 
-        def truncated(reads: list[Read]) -> list[np.ndarray]:
-            return [(bits & np.uint32(0xFFFFE000)).view(np.float32) for bits in fragments(reads)]
+        def factors(reads: list[Read]) -> list[tuple[int, int, np.ndarray]]:
+            """Return the values of each register, with its number and the place of the value in it."""
+            shifts = (0,) if packed == 1 else (16, 0)
+            return [
+                (number, place, ((bits << np.uint32(shift)) & significant).view(np.float32))
+                for number, bits in enumerate(fragments(reads))
+                for place, shift in enumerate(shifts)
+            ]
 
-        left, right = np.zeros((warps, 16, 8)), np.zeros((warps, 8, 8))
-        for number, values in enumerate(truncated(a)):
-            left[:, group + 8 * (number % 2), thread + 4 * (number // 2)] = values
-        for number, values in enumerate(truncated(b)):
-            right[:, thread + 4 * number, group] = values
+        left, right = np.zeros((warps, 16, 8 * packed)), np.zeros((warps, 8 * packed, 8))
+        for number, place, values in factors(a):
+            left[:, group + 8 * (number % 2), packed * (thread + 4 * (number // 2)) + place] = values
+        for number, place, values in factors(b):
+            right[:, packed * (thread + 4 * number) + place, group] = values
         product = left @ right
         for number, (target, before) in enumerate(zip(targets, fragments(c), strict=True)):
             values = product[:, group + 8 * (number // 2), 2 * thread + number % 2] + before

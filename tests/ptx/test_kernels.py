@@ -14,7 +14,7 @@ from torch import Tensor
 from sgsst_core.constants import ALPHA_MIN
 from sgsst_core.features.pooling import fused_max_pool, fused_max_pool_backward, max_pool_backward_reference
 from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
-from sgsst_core.loss.statistics_terms import fused_add_style_gradient
+from sgsst_core.loss.statistics_terms import StyleGradient, fused_add_style_gradient
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
@@ -129,8 +129,24 @@ def test_offsets_beyond_32_bits_are_correct(dtype: torch.dtype) -> None:
     tolerance = 1e-6 if dtype == torch.float32 else 4e-3
     with compiled_kernels(80):
         assert relative_error(fused_statistics(features).centered, exact.centered) < tolerance
-        fused_add_style_gradient(gradient, features, matrix, mean, offset)
+        fused_add_style_gradient(gradient, features, StyleGradient(matrix, mean, offset))
     assert relative_error(gradient.double(), expected) < tolerance
+
+
+@pytest.mark.parametrize("channels", [64, 128])
+def test_products_of_bfloat16_features_are_not_rounded(channels: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn((13, 29, channels), generator=generator).relu().bfloat16()
+    weights = torch.rand((13, 29), generator=generator)
+    exact = layer_statistics_reference(features, weights.bfloat16())
+    matrix, mean, offset = (torch.randn(shape, generator=generator) for shape in (2 * (channels,), channels, channels))
+    matrix = matrix + matrix.T
+    expected = ((features.double() - mean.double()) @ matrix.double() + offset.double()) * weights[..., None]
+    gradient = torch.zeros_like(features)
+    with compiled_kernels(80):
+        assert relative_error(fused_statistics(features, weights).centered, exact.centered) < 1e-6
+        fused_add_style_gradient(gradient, features, StyleGradient(matrix, mean, offset), weights)
+    assert relative_error(gradient.double(), expected) < 4e-3
 
 
 # --- mutations: a defect in a kernel must be reported ---------------------------------------------------------------
