@@ -40,8 +40,8 @@ def waited_seconds(action: Callable[[], object], device: torch.device) -> float:
     return time.perf_counter() - started
 
 
-def kernel_times(action: Callable[[], object], most: int = 20) -> dict[str, dict[str, float]]:
-    """Return milliseconds and launches of the kernels of a call on the GPU that take the longest, by name."""
+def kernel_times(action: Callable[[], object], most: int = 20) -> tuple[float, dict[str, dict[str, float]]]:
+    """Return the milliseconds of all kernels of a call on the GPU, and milliseconds and launches of the slowest."""
     from torch.profiler import ProfilerActivity, profile
 
     with profile(activities=[ProfilerActivity.CUDA]) as profiled:
@@ -49,7 +49,7 @@ def kernel_times(action: Callable[[], object], most: int = 20) -> dict[str, dict
         torch.cuda.synchronize()
     events = [event for event in profiled.key_averages() if event.self_device_time_total]
     events.sort(key=lambda event: -event.self_device_time_total)
-    return {
+    return sum(event.self_device_time_total for event in events) / 1e3, {
         event.key[:100]: {"milliseconds": event.self_device_time_total / 1e3, "launches": event.count}
         for event in events[:most]
     }

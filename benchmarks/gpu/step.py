@@ -58,7 +58,9 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     findings.add(f"{place}/seconds", statistics.median(taken))
     findings.add(f"{place}/seconds_by_part", parts)
     if device().type == "cuda":
-        findings.add(f"{place}/kernels", kernel_times(stylizer.run_step))
+        milliseconds, kernels = kernel_times(stylizer.run_step)
+        findings.add(f"{place}/milliseconds_of_kernels", milliseconds)
+        findings.add(f"{place}/kernels", kernels)
     findings.add(f"{place}/planned_seconds", prediction.seconds if prediction else None)
     findings.add(f"{place}/device_allocated_bytes", peak_bytes(device()))
     findings.add(f"{place}/device_reserved_bytes", reserved_bytes(device()))
