@@ -13,6 +13,7 @@ from typing import Any
 import numba
 import numba.core.caching
 import torch
+from numba.core.event import Listener, install_listener
 
 #: Lock that is held while a kernel runs. Numba's `workqueue` threading layer, the only one that is always available,
 #: aborts the process if two Python threads run parallel kernels at once. Little is lost by running kernels one at a
@@ -40,6 +41,27 @@ def cache_in_memory(report: Callable[[], None]) -> None:
         report: Callback, called for each kernel that is compiled because the cache folders do not contain it.
     """
     numba.core.caching.Cache.save_overload = lambda self, sig, data: report()  # type: ignore[method-assign]
+
+
+class _Compilations(Listener):
+    """Listener that calls a function at the start of each compilation."""
+
+    def __init__(self, report: Callable[[], None]) -> None:
+        self._report = report
+
+    def on_start(self, *_: object) -> None:
+        """Call the function."""
+        self._report()
+
+    def on_end(self, *_: object) -> None:
+        """Do nothing."""
+
+
+@contextmanager
+def compilations_reported(report: Callable[[], None]) -> Iterator[None]:
+    """Call a function whenever a `with` block compiles a kernel because the cache folders do not contain it."""
+    with install_listener("numba:compile", _Compilations(report)):
+        yield
 
 
 @functools.cache

@@ -53,6 +53,10 @@ class JobBar:
         self._show(stage, progress.step, progress.total, f"{loss} {left}")
         self._print_now_and_then(f"{stage}: step {progress.step} of {progress.total}", loss, left)
 
+    def show_compiling(self) -> None:
+        """Show that kernels are being compiled, which takes half a minute in the first job on a machine."""
+        self._bar.update(self._task, description="Compiling kernels, once on this machine")
+
     def _show(self, description: str, done: int, total: int, note: str) -> None:
         self._bar.update(self._task, description=description, completed=done, total=total, note=note)
 
@@ -71,8 +75,12 @@ def job_bar(console: Console) -> Iterator[JobBar]:
         MofNCompleteColumn(),
         TextColumn("{task.fields[note]}"),
     )
-    with live_bar(console, *columns) as bar:
-        yield JobBar(bar)
+    with live_bar(console, *columns) as live:
+        from sgsst_core.compiled import compilations_reported  # takes seconds to import
+
+        bar = JobBar(live)
+        with compilations_reported(bar.show_compiling):
+            yield bar
 
 
 def clock(seconds: float) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
+import numba
 import pytest
 from rich.console import Console
 
@@ -32,6 +34,19 @@ def test_terminal_shows_views_then_steps() -> None:
     output = shown(terminal=True)
     for text in ("Surveying the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123 1:01 left"):
         assert text in output
+
+
+def test_terminal_shows_compilation_of_kernels() -> None:
+    add: Any = numba.njit(lambda a, b: a + b)  # type: ignore[call-arg]
+    console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
+    with job_bar(console) as bar:
+        for _ in range(2):
+            bar.show_planning(PlanningProgress(0, 8, None))
+            add(1, 2)
+            bar._bar.refresh()
+    assert isinstance(console.file, io.StringIO)
+    output = console.file.getvalue()
+    assert output.index("Compiling kernels") < output.rindex("Surveying the views"), "the second call compiles nothing"
 
 
 def test_log_prints_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
