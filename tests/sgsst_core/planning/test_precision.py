@@ -80,6 +80,12 @@ def test_tf32_needs_every_rank_to_have_it(monkeypatch: pytest.MonkeyPatch) -> No
     assert precision_ratio("tf32", "cuda", Others()) is None
 
 
+def test_interrupted_measurements_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter([2.0, 2.0, 9.0, 2.0, 2.0, 9.0, 1.0, 1.0, 9.0, 1.0])
+    monkeypatch.setattr(module, "seconds_of", lambda run, least: next(seconds))
+    assert convolution_ratio("bfloat16", "cpu") == 2.0
+
+
 @pytest.mark.parametrize(("least", "runs"), [(0.0, [1, 1]), (1.0, [1, 1]), (5.0, [1, 1, 2, 4, 8])])
 def test_repetitions_take_long_enough(least: float, runs: list[int]) -> None:
     """Each simulated run takes a second; the first one takes ten seconds, because it prepares."""
