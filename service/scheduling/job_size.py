@@ -21,7 +21,7 @@ _PHOTO_BYTES = 0.35
 _LONGER_SIDE, _ASPECT = 1600, 0.625
 #: Seconds per step: network forward and backward per pixel, by precision; rasterization per Gaussian; and a fixed time
 #: for kernel launches.
-_PIXEL_SECONDS = {"float32": 5.5e-8, "tf32": 1.6e-8, "bfloat16": 7e-9}
+_PIXEL_SECONDS = {"float32": 7e-8, "tf32": 1.6e-8, "bfloat16": 7e-9}
 _GAUSSIAN_SECONDS, _FIXED_SECONDS = 1e-9, 1e-3
 #: Network time of a step in phase 1, which optimizes only the coarsest scale, as a fraction of that in phase 2.
 _COARSE_FRACTION = 0.1
