@@ -189,6 +189,8 @@ def _silence_ray() -> None:
 NODE_LABEL = "ray.io/node-id"
 #: Seconds to wait for resources in use. Those of lost ranks are soon free again.
 PLACE_SECONDS = 5.0
+#: Minimum time in seconds for each attempt, because Ray frees resources late on a busy machine.
+_LEAST_SECONDS = 3.0
 
 
 class NoCapacityError(Exception):
@@ -316,13 +318,13 @@ def _places(ranks: int, bundle: dict[str, int], deadline: float) -> tuple[Any, .
     from ray.util import placement_group, placement_group_table
 
     together = placement_group([bundle] * ranks, strategy="PACK" if "GPU" in bundle else "SPREAD")
-    ready = together.wait(max(deadline - time.monotonic(), 1.0))
+    ready = together.wait(max(deadline - time.monotonic(), _LEAST_SECONDS))
     nodes = dict(placement_group_table(together)["bundles_to_node_id"]) if ready else {}
     give_back(together)
     alone = [placement_group([bundle], bundle_label_selector=[{NODE_LABEL: nodes[index]}]) for index in sorted(nodes)]
     there = []
     for group in alone:
-        if group.wait(max(deadline - time.monotonic(), 1.0)):
+        if group.wait(max(deadline - time.monotonic(), _LEAST_SECONDS)):
             there.append(group)
         else:
             give_back(group)
