@@ -94,7 +94,8 @@ def shifted_moments(
     time, so that no float32 chain is long. Below, a_p is a position weight and x_p = F_p - shift.
 
     In bfloat16 there is no shift: a product of two features, or of a feature and a rounded weight, has 16 bits, so that
-    sums of products are nearly exact in float32. Cancellation enlarges their error less than the features' own.
+    sums of products are nearly exact in float32. After cancellation, their error is less than that of rounded
+    features.
 
     Args:
         features: [h, width, CHANNELS], float32 or bfloat16.

@@ -90,8 +90,8 @@ def term_weights(layer: str, pixel_weight: float) -> TermWeights:
 class SplitGradient(NamedTuple):
     """`StyleGradient` for bfloat16 features on a GPU: dE/dF_p = a_p ((high + low) F_p + constant).
 
-    Two matrices of 8-bit numbers hold 16 bits of each entry. Cancellation with the constant enlarges the error of their
-    product less than the rounding of features.
+    The two matrices together hold 16 bits of each entry. After cancellation with the constant, the error of the
+    product is less than that of rounded features.
     """
 
     high: Tensor  # [c, c] bfloat16
