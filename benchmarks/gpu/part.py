@@ -20,6 +20,7 @@ class Sizes:
         view: (width, height) of their views.
         steps: (width, height, Gaussians) for timed SOS steps.
         step_repeats: Number of timed steps.
+        rank_steps: Number of steps after which two ranks are compared with one.
         parity: (Gaussians, width, height) for the comparison with `reference`.
         network: Side in pixels of the square image for the feature network.
         bits: Repetitions that must be bit-identical.
@@ -31,6 +32,7 @@ class Sizes:
     view: tuple[int, int] = (980, 545)
     steps: tuple[tuple[int, int, int], ...] = ((980, 545, 2_500_000), (5187, 3361, 5_800_000))
     step_repeats: int = 5
+    rank_steps: int = 3
     parity: tuple[int, int, int] = (20_000, 320, 200)
     network: int = 1024
     bits: int = 100
@@ -42,12 +44,13 @@ class Sizes:
 QUICK = Sizes(
     gaussians=(60, 120),
     view=(48, 32),
-    steps=((32, 32, 60), (48, 32, 60)),
+    steps=((32, 32, 60),),
     step_repeats=1,
+    rank_steps=1,
     parity=(120, 40, 33),
     network=48,
     bits=2,
-    curve=(4, 48),
+    curve=(2, 48),
     repeats=1,
 )
 

@@ -23,7 +23,7 @@ from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.ranks.process_group import ProcessGroupCollectives
 
-RANKS, STEPS = 2, 3
+RANKS = 2
 #: Bound on the relative error of the first step's gradient, in the Euclidean norm. It allows for near-ties in max
 #: pooling, which may be resolved differently.
 GRADIENT_BOUND = 1e-4
@@ -51,8 +51,8 @@ def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
     """Return the gradient of a view before the first step, and the colors [N, 3] after the last step."""
     quick = sizes == QUICK
     settings = make_settings(
-        "standard", steps_coarse=0, steps_sos=STEPS, early_stop=False, keep=("ranks", "unseen"), rebalance=False,
-        cached_weights="none", coarsest_side=24 if quick else None,
+        "standard", steps_coarse=0, steps_sos=sizes.rank_steps, early_stop=False, keep=("ranks", "unseen"),
+        rebalance=False, cached_weights="none", coarsest_side=24 if quick else None,
     )  # fmt: skip
     width, height = sizes.view
     stylizer = Stylizer.planned(
@@ -65,7 +65,7 @@ def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
         collectives=collectives,
     )
     gradient = stylizer.gradient(0, range(stylizer.job.scale_count(0)))[0].cpu()
-    for _ in range(STEPS):
+    for _ in range(sizes.rank_steps):
         stylizer.run_step()
     return gradient, stylizer.sh_dc.detach().cpu()
 

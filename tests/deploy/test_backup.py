@@ -54,10 +54,10 @@ def backup(environment: dict[str, str], *words: str | Path) -> subprocess.Comple
     return subprocess.run(command, env=own, capture_output=True, text=True)
 
 
-def submit(client: httpx.Client, folder: Path) -> str:
+def submit(client: httpx.Client, folder: Path, **parameters: Any) -> str:
     files = zip(("scene", "cameras", "style"), write_files(folder, wall()), strict=True)
     body = {role: (path.name, path.read_bytes()) for role, path in files}
-    answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(PARAMETERS)})
+    answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(PARAMETERS | parameters)})
     assert answer.status_code == 202, answer.text
     return str(answer.json()["id"])
 
@@ -94,7 +94,7 @@ def test_jobs_continue_after_a_restore(kind: str, tmp_path: Path, tiny_installed
         wait_for(lambda: job(client, done)["status"] == "succeeded", "the first job", service.said)
         expected = client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content
         running = submit(client, tmp_path)
-        waiting = submit(client, tmp_path)
+        waiting = submit(client, tmp_path, steps_sos=20)
         wait_for(lambda: (job(client, running)["progress"] or {}).get("step", 0) > 60, "steps", service.said)
         for _ in range(2):  # the second backup adds to the first
             ended = backup({"SGSST_DATA": str(service.data), **before}, "save", saved)
@@ -113,7 +113,7 @@ def test_jobs_continue_after_a_restore(kind: str, tmp_path: Path, tiny_installed
         for job_id in (running, waiting):
             wait_for(partial(has_ended, client, job_id), "its end", service.said)
             assert job(client, job_id)["status"] == "succeeded", job(client, job_id)
-            assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content == expected
+        assert client.get(f"/v1/jobs/{running}/artifacts/stylized.ply").content == expected
         assert job(client, running)["attempt"] > 1
         log = client.get(f"/v1/jobs/{running}/artifacts/log.txt").text
         assert "resum" in log.lower() or "goes on" in log.lower(), log

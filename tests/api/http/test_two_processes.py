@@ -175,9 +175,4 @@ def test_upload_is_locked_across_processes(pair: Pair) -> None:
 
 @pytest.mark.slow
 def test_interleaved_patches_from_two_processes(pair: Pair) -> None:
-    run(pair, 300, seed=1)
-
-
-@pytest.mark.slow
-def test_ten_thousand_interleaved_patches_from_two_processes(pair: Pair) -> None:
-    run(pair, 10_000, seed=2)
+    run(pair, 1000, seed=1)
