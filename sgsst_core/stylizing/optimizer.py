@@ -31,8 +31,8 @@ class ColorOptimizer:
         colors: [n, 3] float32, updated in place.
         unit: Unit of the features behind the gradients (`FeatureNetwork.unit`). Adam's steps do not depend on it, but
             gradients grow with its square and would overflow earlier.
-        chroma_of: [n, 3], colors whose chroma is preserved: the optimized quantity is then each color's difference from
-            them in luminance. None to let colors change freely.
+        chroma_of: [n, 3] or [1, 3], colors whose chroma is preserved: the optimized quantity is then each color's
+            difference from them in luminance. None to let colors change freely.
         bounded: Whether to project colors to 0..1 after each step (`scene.screen`).
         frozen: [n, 1] bool, frozen colors, whose gradients are 0; None if there are none.
     """
@@ -131,7 +131,7 @@ def constrained(colors: Tensor, chroma_of: Tensor | None, *, bounded: bool) -> T
 
     Args:
         colors: [n, 3].
-        chroma_of: [n, 3], colors whose chroma is preserved; None if chroma may change.
+        chroma_of: [n, 3] or [1, 3], colors whose chroma is preserved; None if chroma may change.
         bounded: Whether colors must be in 0..1.
     """
     if chroma_of is None:

@@ -52,7 +52,7 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
         change = neighbors_change_by_region(job.scene.means, change, weights, regions)[unseen]
     change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
     original = job.scene.sh_dc[unseen]
-    chroma_of = original if job.preserves_chroma else None
+    chroma_of = job.styles.chroma_of(original, job.settings)
     colors[unseen] = constrained(original + change, chroma_of, bounded=job.settings.bounded)
     return colors
 

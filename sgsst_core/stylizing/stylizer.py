@@ -83,7 +83,7 @@ class Stylizer:
         self._optimizer = ColorOptimizer(
             self.sh_dc,
             job.network.unit,
-            views.scene.sh_dc.to(device) if job.preserves_chroma else None,
+            job.styles.chroma_of(views.scene.sh_dc.to(device), settings),
             bounded=settings.bounded,
             frozen=self._frozen,
         )

@@ -13,8 +13,11 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import saturated
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.luminance import gray
 from sgsst_core.scene.screen import LARGEST
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.optimizer import LARGEST_GRADIENT, ColorOptimizer
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -23,10 +26,17 @@ from tests.small_scenes import ball, cameras, style, wall
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def make(weights: BackboneWeights, scene: Scene, regions: Regions | None = None, **values: Any) -> Stylizer:
+def make(
+    weights: BackboneWeights,
+    scene: Scene,
+    regions: Regions | None = None,
+    style_image: Tensor | None = None,
+    **values: Any,
+) -> Stylizer:
     chosen: dict[str, Any] = {"coarsest_side": 24, "steps_coarse": 2, "steps_sos": 8, "learning_rate": 1.0} | values
     settings = make_settings(early_stop=False, **chosen)
-    return Stylizer.planned(scene, cameras(), style(), settings, weights=weights, regions=regions)
+    image = style() if style_image is None else style_image
+    return Stylizer.planned(scene, cameras(), image, settings, weights=weights, regions=regions)
 
 
 def bright_wall() -> Scene:
@@ -76,6 +86,42 @@ def test_luminance_mode_preserves_chroma_within_the_bounds(tiny_weights: Backbon
     assert bool(fits.any())
     assert saturated(stylized[fits]) == 0
     assert bool((~fits).any()), "a color that no luminance brings into the bounds belongs to this test"
+
+
+def spread_of(colors: Tensor) -> float:
+    """Return the largest difference between the channels of a color."""
+    return float((colors.amax(dim=1) - colors.amin(dim=1)).max())
+
+
+@pytest.mark.parametrize("values", [{}, {"warm_start": False}, {"style_loss": "nnfm"}, {"views_per_step": 2}], ids=str)
+@pytest.mark.parametrize("make_scene", [bright_wall, ball])
+def test_black_and_white_style_leaves_no_color(
+    tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any]
+) -> None:
+    """Seen and unseen Gaussians become gray; without bounds, the loss gives them other hues."""
+    scene = make_scene()
+    stylizer, free = (
+        make(tiny_weights, scene, style_image=gray(style()), bounded=bounded, **values) for bounded in (True, False)
+    )
+    run(stylizer)
+    run(free)
+    assert "remain gray" in " ".join(line.decision for line in stylizer.job.plan.decisions)
+    assert "remain gray" not in " ".join(line.decision for line in free.job.plan.decisions)
+    assert spread_of(stylizer.stylized()) < 1e-6
+    assert saturated(stylizer.stylized()) == 0
+    assert spread_of(free.stylized()) > 0.1
+    views = stylizer.job.evaluation_views
+    assert mean_loss(stylizer.evaluate(views)) < 0.9 * mean_loss(stylizer.start())
+
+
+def test_colored_style_of_a_region_frees_colors(tiny_weights: BackboneWeights) -> None:
+    scene = wall()
+    right = (scene.means[:, 0] > 0).to(torch.uint8)
+    for own, remains_gray in ((gray(style()), True), (style(), False)):
+        regions = Regions((Region("rest"), Region("right", style=Style.of(own))), right)
+        stylizer = make(tiny_weights, scene, regions, style_image=gray(style()), bounded=True)
+        run(stylizer)
+        assert (spread_of(stylizer.stylized()) < 1e-6) == remains_gray
 
 
 def test_frozen_gaussians_may_be_out_of_range(tiny_weights: BackboneWeights) -> None:
