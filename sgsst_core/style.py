@@ -8,7 +8,7 @@ The mean mu and covariance S of a style of several images, with weights w_i, are
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,14 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.errors import ImageError, SettingsError
-from sgsst_core.settings import Settings
 
 #: Accepted dtypes of images.
 _DTYPES = (torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 #: Numbers of channels of gray, RGB and RGBA images.
 _CHANNELS = (1, 3, 4)
-#: Mean difference of a gray image's channels, which JPEG and scanners leave: two of 255 levels.
-_GRAY = 2 / 255
 
 
 @dataclass(frozen=True)
@@ -77,12 +74,6 @@ class Style:
         return replace(self, images=images)
 
     @property
-    def is_gray(self) -> bool:
-        """Whether all images are black and white: on average, their channels differ by at most `_GRAY`."""
-        spreads = (image.amax(dim=-1) - image.amin(dim=-1) for image in self.images)
-        return all(float(spread.mean(dtype=torch.float64)) <= _GRAY for spread in spreads)
-
-    @property
     def text(self) -> str:
         """Display text: the names, with percentages if there are several images."""
         names = self.names or [f"image {number}" for number in range(1, len(self.images) + 1)]
@@ -90,16 +81,6 @@ class Style:
             return names[0]
         shares = zip(names, self.weights, strict=True)
         return ", ".join(f"{name} {share:.0%}" for name, share in shares)
-
-
-def remain_gray(styles: Iterable[Style], settings: Settings) -> bool:
-    """Return whether the colors of a job remain gray.
-
-    The loss compares features that respond to colors of all hues alike, and each channel's mean and deviation, so it
-    does not keep a black and white style from patches of color.
-    """
-    bounded = settings.bounded and settings.preserve_colors == "no"
-    return bounded and all(style.is_gray for style in styles)
 
 
 def image_of(values: Tensor | NDArray[Any], name: str = "style image") -> Tensor:

@@ -33,7 +33,7 @@ def gray_gradient(gradient: Tensor) -> Tensor:
 
 
 def with_chroma_of(colors: Tensor, original: Tensor) -> Tensor:
-    """Return colors [n, 3] with the chroma of `original`, [n, 3] or [1, 3].
+    """Remove rounding errors from the chroma of colors [n, 3] that differ from `original` only in luminance.
 
     The difference from the original, averaged over the three channels, is added to each original channel and rounded
     once, so errors of many steps do not accumulate. DC coefficients work too, because colors are linear in them.

@@ -19,9 +19,10 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.regions.maps import ContentMaps, DepthBands, RegionMaps, ViewMaps
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.palette import Palette, palette_of
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
-from sgsst_core.style import Style, remain_gray
+from sgsst_core.style import Style
 from sgsst_core.stylizing.warm_start import in_colors_of, in_luminance_of, luminance_start, warm_start
 
 
@@ -79,16 +80,9 @@ class JobStyles:
         """Largest content weight of a Gaussian; None for that of the settings."""
         return None if self.content_weights is None else float(self.content_weights.max())
 
-    def chroma_of(self, sh_dc: Tensor, settings: Settings) -> Tensor | None:
-        """Return the colors, [n, 3] or [1, 3], whose chroma a job's colors have; None if their chroma is free.
-
-        Args:
-            sh_dc: [n, 3], colors before the job.
-            settings: Settings of the job.
-        """
-        if settings.preserve_colors == "luminance":
-            return sh_dc
-        return sh_dc.new_zeros(1, 3) if remain_gray(self.all, settings) else None
+    def palette(self, settings: Settings) -> Palette | None:
+        """Return the palette that the job keeps the colors in; None if they are free."""
+        return palette_of(self.all, settings)
 
     @property
     def all(self) -> list[Style]:

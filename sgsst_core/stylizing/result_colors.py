@@ -52,14 +52,16 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
         change = neighbors_change_by_region(job.scene.means, change, weights, regions)[unseen]
     change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
     original = job.scene.sh_dc[unseen]
-    chroma_of = job.styles.chroma_of(original, job.settings)
-    colors[unseen] = constrained(original + change, chroma_of, bounded=job.settings.bounded)
+    chroma_of = original if job.preserves_chroma else None
+    palette = job.styles.palette(job.settings)
+    colors[unseen] = constrained(original + change, chroma_of, palette, bounded=job.settings.bounded)
     return colors
 
 
 def _transferred_last(job: StylizationJob, optimized: Tensor) -> Tensor:
-    transferred = transferred_colors(job, optimized)
-    if not job.preserves_chroma:
+    transferred, palette = transferred_colors(job, optimized), job.styles.palette(job.settings)
+    if not job.preserves_chroma and palette is None:
         return transferred
-    bounded = constrained(transferred, job.scene.sh_dc[job.plan.seen], bounded=job.settings.bounded)
+    chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
+    bounded = constrained(transferred, chroma_of, palette, bounded=job.settings.bounded)
     return torch.where(transferred != optimized, bounded, optimized)  # frozen colors remain bit-identical

@@ -80,10 +80,12 @@ class Stylizer:
         frozen = job.regions.frozen[seen] if job.regions else torch.zeros(0, dtype=torch.bool)
         #: Mask [n, 1] of frozen Gaussians; None if there are none.
         self._frozen = frozen.to(device)[:, None] if frozen.any() else None
+        palette = job.collectives.broadcast(lambda: job.styles.palette(settings))
         self._optimizer = ColorOptimizer(
             self.sh_dc,
             job.network.unit,
-            job.styles.chroma_of(views.scene.sh_dc.to(device), settings),
+            views.scene.sh_dc.to(device) if job.preserves_chroma else None,
+            palette and palette.to(device),
             bounded=settings.bounded,
             frozen=self._frozen,
         )

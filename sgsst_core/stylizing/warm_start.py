@@ -18,10 +18,10 @@ from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.loss.nearest import chosen_positions
+from sgsst_core.scene.color_moments import color_moments, square_root, style_moments
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
 from sgsst_core.style import Style, mixed_moments
-from sgsst_core.stylizing.color_moments import color_moments, square_root, style_moments
 from sgsst_core.stylizing.color_transport import transported
 
 #: A direction counts as flat if the variance of the colors along it is less than this fraction of their largest

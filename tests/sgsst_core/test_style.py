@@ -1,6 +1,5 @@
 """Tests of mixing several style images into one style, and of images that callers pass as arrays."""
 
-import io
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,6 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.regions.definition import Region, Regions
-from sgsst_core.scene.luminance import gray
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style, image_of, mixed_moments, normalized
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -204,21 +202,3 @@ def test_styles_of_jobs_and_regions_are_checked(tiny_weights):
         for given, where in ((BYTES.numpy(), None), (FLOATS, None), (FLOATS, regions))
     ]
     assert all(torch.equal(job.style.images[0], FLOATS) for job in jobs)
-
-
-def jpeg_of(image: torch.Tensor) -> torch.Tensor:
-    """Return an image as a color JPEG of low quality stores it."""
-    stored = io.BytesIO()
-    Image.fromarray((255 * image).byte().numpy()).save(stored, "JPEG", quality=30)
-    return torch.from_numpy(np.array(Image.open(stored))) / 255
-
-
-def test_black_and_white_images_are_recognized():
-    colored = synthetic_image(64, 48, seed=1).float()
-    lines = jpeg_of(gray(colored))
-    sepia = lines * torch.tensor([1.0, 0.95, 0.82])
-    assert Style.of(lines).is_gray
-    assert Style.weighted([lines, torch.zeros(8, 8, 3)], [1, 1]).is_gray
-    assert not Style.of(colored).is_gray
-    assert not Style.of(sepia).is_gray
-    assert not Style.weighted([lines, colored], [9, 1]).is_gray

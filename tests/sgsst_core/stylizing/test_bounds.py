@@ -14,10 +14,10 @@ from sgsst_core.quality.judge import saturated
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.luminance import gray
+from sgsst_core.scene.palette import Palette
 from sgsst_core.scene.screen import LARGEST
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.optimizer import LARGEST_GRADIENT, ColorOptimizer
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -88,40 +88,52 @@ def test_luminance_mode_preserves_chroma_within_the_bounds(tiny_weights: Backbon
     assert bool((~fits).any()), "a color that no luminance brings into the bounds belongs to this test"
 
 
-def spread_of(colors: Tensor) -> float:
-    """Return the largest difference between the channels of a color."""
-    return float((colors.amax(dim=1) - colors.amin(dim=1)).max())
+def few_hues(image: Tensor) -> Tensor:
+    """Return an image [h, w, 3] in mixtures of brown and yellow, and their shades."""
+    brown, yellow = torch.tensor([0.6, 0.5, 0.3]), torch.tensor([0.2, 0.2, 0.0])
+    return 0.2 + brown * image[..., :1] + yellow * image[..., 1:2]
+
+
+def distance_from(style_image: Tensor, sh_dc: Tensor, axes: int) -> float:
+    """Return the largest distance of colors from the principal line or plane of an image's, in 0..1, in float64."""
+    pixels = style_image.reshape(-1, 3).double()
+    others = torch.linalg.svd(pixels - pixels.mean(dim=0), full_matrices=False).Vh[axes:]
+    return float(((0.5 + SH_C0 * sh_dc.double() - pixels.mean(dim=0)) @ others.T).norm(dim=1).max())
 
 
 @pytest.mark.parametrize("values", [{}, {"warm_start": False}, {"style_loss": "nnfm"}, {"views_per_step": 2}], ids=str)
 @pytest.mark.parametrize("make_scene", [bright_wall, ball])
-def test_black_and_white_style_leaves_no_color(
-    tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any]
+@pytest.mark.parametrize(("of", "axes", "form"), [(gray, 1, "a line"), (few_hues, 2, "a plane")])
+def test_colors_stay_in_the_palette(
+    tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any], of: Any, axes: int, form: str
 ) -> None:
-    """Seen and unseen Gaussians become gray; without bounds, the loss gives them other hues."""
+    """Seen and unseen Gaussians get colors of the style's line or plane; without bounds, the loss gives them others."""
+    image = of(style())
     scene = make_scene()
     stylizer, free = (
-        make(tiny_weights, scene, style_image=gray(style()), bounded=bounded, **values) for bounded in (True, False)
+        make(tiny_weights, scene, style_image=image, bounded=bounded, **values) for bounded in (True, False)
     )
     run(stylizer)
     run(free)
-    assert "remain gray" in " ".join(line.decision for line in stylizer.job.plan.decisions)
-    assert "remain gray" not in " ".join(line.decision for line in free.job.plan.decisions)
-    assert spread_of(stylizer.stylized()) < 1e-6
-    assert saturated(stylizer.stylized()) == 0
-    assert spread_of(free.stylized()) > 0.1
-    views = stylizer.job.evaluation_views
-    assert mean_loss(stylizer.evaluate(views)) < 0.9 * mean_loss(stylizer.start())
+    lines, free_lines = (
+        [line.decision for line in own.job.plan.decisions if line.item == "palette"] for own in (stylizer, free)
+    )
+    assert lines == [f"colors stay on {form} in RGB"]
+    assert free_lines == []
+    stylized = stylizer.stylized()
+    inside = (stylized.abs() < LARGEST).all(dim=1)
+    assert distance_from(image, stylized[inside], axes) < 1e-5
+    assert saturated(stylized) == 0
+    assert distance_from(image, free.stylized(), axes) > 0.02
 
 
-def test_colored_style_of_a_region_frees_colors(tiny_weights: BackboneWeights) -> None:
-    scene = wall()
+def test_several_styles_free_the_colors(tiny_weights: BackboneWeights) -> None:
+    scene, image = wall(), gray(style())
     right = (scene.means[:, 0] > 0).to(torch.uint8)
-    for own, remains_gray in ((gray(style()), True), (style(), False)):
-        regions = Regions((Region("rest"), Region("right", style=Style.of(own))), right)
-        stylizer = make(tiny_weights, scene, regions, style_image=gray(style()), bounded=True)
+    for second, stays in ((Region("right", freeze=True), True), (Region("right", style=Style.of(style())), False)):
+        stylizer = make(tiny_weights, scene, Regions((Region("rest"), second), right), style_image=image, bounded=True)
         run(stylizer)
-        assert (spread_of(stylizer.stylized()) < 1e-6) == remains_gray
+        assert (distance_from(image, stylizer.stylized()[right == 0], 1) < 1e-5) == stays
 
 
 def test_frozen_gaussians_may_be_out_of_range(tiny_weights: BackboneWeights) -> None:
@@ -169,6 +181,24 @@ def test_steps_match_projected_adam() -> None:
     expected = adam(start, gradients, 0.3)
     assert float((expected.abs() > LARGEST - 1e-6).double().mean()) > 0.1
     torch.testing.assert_close(colors.detach().double(), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("of", [gray, few_hues])
+def test_steps_within_a_palette_reach_its_nearest_color(of: Any) -> None:
+    """Minimize a quadratic with a large curvature in one channel, against its minimum on the palette in closed form."""
+    palette = Palette.of(Style.of(of(style())))
+    assert palette is not None
+    colors, target = torch.zeros((50, 3)), 0.8 * torch.randn((50, 3), generator=torch.Generator().manual_seed(4))
+    curvature = torch.tensor([1.0, 1.0, 20.0])
+    optimizer = ColorOptimizer(colors, palette=palette, bounded=True)
+    for step in range(600):
+        optimizer.update(curvature * (colors.detach() - target), 0.1 * 0.99**step)
+    axes = torch.linalg.eigh(palette.matrix.double()).eigenvectors[:, 3 - palette.dimensions :]
+    weighted, start = axes.T * curvature.double(), palette.offset.double()
+    expected = start + (axes @ torch.linalg.solve(weighted @ axes, weighted @ (target.double() - start).T)).T
+    inside = (expected.abs() < LARGEST).all(dim=1)
+    assert float(inside.double().mean()) > 0.5
+    torch.testing.assert_close(colors.detach().double()[inside], expected[inside], rtol=0, atol=1e-3)
 
 
 def test_rejected_step_clamps_no_colors() -> None:
