@@ -9,8 +9,9 @@ import torch
 
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.luminance import gray
 from tests.sgsst_core.synthetic_images import relative_error
-from tests.small_scenes import ball, wall
+from tests.small_scenes import ball, style, wall
 from tests.worker.ranks.spawn import on_ranks
 from tests.worker.ranks.test_exact_ranks import stylize
 
@@ -38,3 +39,12 @@ def test_several_ranks_match_one_rank(scene: Scene, values: dict[str, Any]) -> N
             assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
             assert relative_error(result["colors"], expected["colors"]) < 1e-3
             assert torch.equal(result["colors"], actual[0]["colors"])
+
+
+def test_ranks_stay_in_the_same_palette() -> None:
+    values = {"steps_coarse": 2, "steps_sos": 4, "learning_rate": 0.01}
+    expected = stylize(ALONE, wall(), 3, values, gray(style()))
+    first, second = on_ranks(2, stylize, wall(), 3, values, gray(style()))
+    assert "palette" in expected["plan"]
+    assert relative_error(first["colors"], expected["colors"]) < 1e-3
+    assert torch.equal(first["colors"], second["colors"])

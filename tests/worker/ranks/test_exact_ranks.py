@@ -194,12 +194,13 @@ def test_gradient_of_matched_features_matches_one_rank(style_loss: StyleLossName
         assert actual_loss == pytest.approx(loss, rel=1e-9)
 
 
-def stylize(collectives: Collectives, scene: Scene, views: int, values: dict[str, Any]) -> dict[str, Any]:
-    """Run a whole job."""
+def stylize(
+    collectives: Collectives, scene: Scene, views: int, values: dict[str, Any], image: Tensor | None = None
+) -> dict[str, Any]:
+    """Run a whole job, by default in `style()`."""
     settings = make_settings("standard", keep=("ranks",), coarsest_side=40, **values)
-    stylizer = Stylizer.planned(
-        scene, cameras(views), style(), settings, weights=tiny_weights(), collectives=collectives
-    )
+    image = style() if image is None else image
+    stylizer = Stylizer.planned(scene, cameras(views), image, settings, weights=tiny_weights(), collectives=collectives)
     stopped = run(stylizer)
     return {
         "stopped": stopped,
