@@ -23,6 +23,10 @@ from sgsst_core.errors import ImageError, SettingsError
 _DTYPES = (torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 #: Numbers of channels of gray, RGB and RGBA images.
 _CHANNELS = (1, 3, 4)
+#: Maximum number of pixels that represent a style.
+_PIXELS = 1 << 16
+#: Fractional part of the golden ratio; its multiples modulo 1 fill the unit interval evenly.
+_GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,31 @@ class Style:
             return names[0]
         shares = zip(names, self.weights, strict=True)
         return ", ".join(f"{name} {share:.0%}" for name, share in shares)
+
+
+def chosen_positions(count: int, most: int) -> Tensor:
+    """Return at most `most` of `count` indices, evenly spread, int64 in ascending order.
+
+    If `count` is at most `most`, all indices are returned. Otherwise the range is divided into `most` equal intervals,
+    and one index is taken from each, at a varying offset. With a constant offset, a style with a regular pattern, such
+    as stripes, would be sampled at the same phase everywhere. An index may appear twice.
+    """
+    if count <= most:
+        return torch.arange(count)
+    part = torch.arange(most, dtype=torch.float64)
+    return ((part + (part * _GOLDEN).frac()) * (count / most)).long().clamp_max(count - 1)
+
+
+def some_pixels(style: Style) -> Tensor:
+    """Return evenly spread pixels [n, 3] of a style, in proportion to the weights of its images."""
+    parts = []
+    for image, weight in zip(style.images, style.weights, strict=True):
+        pixels, count = image.reshape(-1, 3), max(1, round(_PIXELS * weight))
+        positions = chosen_positions(len(pixels), count)
+        if len(style.images) > 1 and len(positions) < count:  # repeat the pixels of a small image
+            positions = torch.arange(count) * len(pixels) // count
+        parts.append(pixels[positions])
+    return torch.cat(parts)
 
 
 def image_of(values: Tensor | NDArray[Any], name: str = "style image") -> Tensor:

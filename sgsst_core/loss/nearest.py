@@ -47,8 +47,6 @@ MOST_VECTORS = 1 << 13
 _BLOCK = {"cpu": (1 << 10, 1 << 10), "cuda": (1 << 13, 1 << 13)}
 #: Bytes stored per matched position.
 MATCH_BYTES = 8 + 4 + 4
-#: Fractional part of the golden ratio; its multiples modulo 1 fill the unit interval evenly.
-_GOLDEN = 0.6180339887498949
 #: Factor from features of ImageNet-normalized input, for which ARF's weights are meant, to features of a 0-255 input.
 _FEATURE_UNITS = 255 * 0.226
 #: w_n for `nnfm`. With content_weight 1, the nearest-neighbor and content terms are balanced as in ARF for 360-degree
@@ -81,19 +79,6 @@ def nearest_layers(style_loss: StyleLossName, network: str) -> tuple[str, ...]:
     """
     count = BLOCKS[network][2] if NEAREST_WEIGHTS[style_loss] else 0
     return tuple(f"relu3_{index}" for index in range(1, count + 1))
-
-
-def chosen_positions(count: int, most: int = MOST_VECTORS) -> Tensor:
-    """Return at most `most` of `count` indices, evenly spread, int64 in ascending order.
-
-    If `count` is at most `most`, all indices are returned. Otherwise the range is divided into `most` equal intervals,
-    and one index is taken from each, at a varying offset. With a constant offset, a style with a regular pattern, such
-    as stripes, would be sampled at the same phase everywhere. An index may appear twice.
-    """
-    if count <= most:
-        return torch.arange(count)
-    part = torch.arange(most, dtype=torch.float64)
-    return ((part + (part * _GOLDEN).frac()) * (count / most)).long().clamp_max(count - 1)
 
 
 def positions_per_image(counts: Sequence[int], weights: Sequence[float], most: int) -> list[int]:

@@ -11,7 +11,7 @@ from sgsst_core.errors import ImageError
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork, layer_stride
-from sgsst_core.loss.nearest import MOST_VECTORS, chosen_positions, nearest_layers, positions_in, positions_per_image
+from sgsst_core.loss.nearest import MOST_VECTORS, nearest_layers, positions_in, positions_per_image
 from sgsst_core.loss.position_term import ScaledView
 from sgsst_core.loss.statistics_terms import compared_layers
 from sgsst_core.loss.targets import ContentFeatures, LayerTarget, StyleTarget, StyleTargets, StyleVectors, ViewTarget
@@ -20,7 +20,7 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, Size, rounds
 from sgsst_core.scene.pyramid import coverage_pyramid, downscale, resize_area, style_size
 from sgsst_core.settings import StyleLossName
-from sgsst_core.style import Style
+from sgsst_core.style import Style, chosen_positions
 from sgsst_core.timing import Timer
 
 

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
-from sgsst_core.scene.color_moments import style_moments
+from sgsst_core.scene.color_moments import color_moments
 from sgsst_core.settings import Settings
-from sgsst_core.style import Style
+from sgsst_core.style import Style, some_pixels
 
 #: Standard deviation along a principal axis of a style's colors, in 0..1, up to which the axis is left out: three of
 #: 255 levels, which are hardly visible.
@@ -42,7 +42,7 @@ class Palette:
     @staticmethod
     def of(style: Style) -> Palette | None:
         """Return the palette of a style; None if its colors vary in all directions, or in none."""
-        mean, covariance = style_moments(style)
+        mean, covariance = color_moments(some_pixels(style))
         variances, axes = torch.linalg.eigh(covariance.cpu())
         deviations = variances.clamp_min(0).sqrt()
         varies = deviations > NEGLIGIBLE

@@ -17,18 +17,15 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
-from sgsst_core.loss.nearest import chosen_positions
 from sgsst_core.scene.color_moments import color_moments, square_root, style_moments
 from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.screen import on_screen
-from sgsst_core.style import Style, mixed_moments
+from sgsst_core.style import Style, mixed_moments, some_pixels
 from sgsst_core.stylizing.color_transport import transported
 
 #: A direction counts as flat if the variance of the colors along it is less than this fraction of their largest
 #: variance. It is not stretched to the style's spread, which would amplify rounding errors.
 _FLAT = 1e-9
-#: Maximum number of pixels that represent a style.
-_PIXELS = 1 << 16
 
 
 def warm_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
@@ -43,21 +40,9 @@ def warm_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
         [N, 3] float32.
     """
     colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
-    wanted = _some_pixels(style).to(colors)
+    wanted = some_pixels(style).to(colors)
     moved = transported(colors, weights.double() / weights.double().amax(), wanted)
     return on_screen(((moved.clamp(0, 1) - COLOR_OFFSET) / SH_C0).to(sh_dc.dtype))
-
-
-def _some_pixels(style: Style) -> Tensor:
-    """Return evenly spread pixels [n, 3] of a style, in proportion to the weights of its images."""
-    parts = []
-    for image, weight in zip(style.images, style.weights, strict=True):
-        pixels, count = image.reshape(-1, 3), max(1, round(_PIXELS * weight))
-        positions = chosen_positions(len(pixels), count)
-        if len(style.images) > 1 and len(positions) < count:  # repeat the pixels of a small image
-            positions = torch.arange(count) * len(pixels) // count
-        parts.append(pixels[positions])
-    return torch.cat(parts)
 
 
 def with_moments(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:

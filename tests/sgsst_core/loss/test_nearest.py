@@ -14,7 +14,6 @@ from sgsst_core.loss.nearest import (
     MOST_VECTORS,
     NEAREST_WEIGHTS,
     Matches,
-    chosen_positions,
     nearest_layers,
     nearest_reference,
     search,
@@ -25,7 +24,7 @@ from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.loss.targets import StyleVectors
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.settings import StyleLossName
-from sgsst_core.style import Style
+from sgsst_core.style import Style, chosen_positions
 from tests.networks import comparing_pixels
 from tests.networks import tiny_weights as make_tiny_weights
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
@@ -259,7 +258,7 @@ def test_style_without_vectors_is_refused(tiny_weights: BackboneWeights) -> None
 
 
 def test_large_styles_are_thinned_evenly() -> None:
-    assert chosen_positions(MOST_VECTORS).tolist() == list(range(MOST_VECTORS))
+    assert chosen_positions(MOST_VECTORS, MOST_VECTORS).tolist() == list(range(MOST_VECTORS))
     places = chosen_positions(1000 * 700, 5000)
     assert len(places) == 5000
     assert (places.diff() >= 0).all()
