@@ -268,8 +268,8 @@ class Settings(BaseModel):
     clamp_aware_gradient: bool = Field(False, description="Apply gradients that would raise clamped (negative) colors.")
     bounded: bool = Field(
         False,
-        description="Keep colors within 0..1, the displayable range, and on the line or plane in RGB that the style's "
-        "colors lie on, if they do (black and white, few hues), by projecting them back after each step.",
+        description="Project colors to 0..1, the displayable range, after each step, and to the line or plane in RGB "
+        "that contains the style's colors, if there is one (black and white, few hues).",
     )
     early_stop: bool = Field(False, description="Stop when the smoothed loss of all scales no longer falls.")
     target_loss: Annotated[float | None, Option(unit="fraction of the initial loss", metavar="R", default="never")] = (

@@ -1,8 +1,8 @@
 """Line or plane in RGB that the colors of a style lie on.
 
-The loss compares features that respond to several hues alike, and each channel's mean and standard deviation. It does
-not keep a style of few hues from others: patches of yellow and cyan match a woodcut in black and white. Projecting
-colors to the line or plane after each step is projected gradient descent on it.
+The loss cannot tell some hues apart: it compares features that respond to several hues alike, and each channel's mean
+and standard deviation. Patches of yellow and cyan match a black and white woodcut. Projecting colors to the line or
+plane after each step, as in projected gradient descent, excludes such patches.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.settings import make_settings
-from sgsst_core.style import Style, image_of, mixed_moments, normalized
+from sgsst_core.style import Style, image_of, mixed_moments, normalized, some_pixels
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import cameras, wall
@@ -159,6 +159,14 @@ def test_arrays_are_converted_as_by_load_image(tmp_path, mode):
     read = load_image(tmp_path / "style.png")
     tolerance = 1 / 255 if mode == "RGBA" else 0  # files are composited in 8 bits
     torch.testing.assert_close(image_of(np.asarray(image)), read, rtol=0, atol=tolerance + 1e-7)
+
+
+def test_number_of_pixels_is_limited():
+    large, small = torch.zeros(600, 600, 3), torch.ones(20, 30, 3)
+    assert len(some_pixels(Style.of(large))) == 1 << 16
+    pixels = some_pixels(Style.weighted([large, small], [3, 1]))
+    assert len(pixels) == 1 << 16
+    assert float(pixels.mean()) == 0.25
 
 
 def test_valid_images_are_not_copied():
