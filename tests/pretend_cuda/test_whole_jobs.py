@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from PIL import Image
 
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
@@ -40,12 +41,20 @@ def counts() -> Iterator[Counts]:
         yield counts
 
 
-def request_(folder: Path, *, scan: bool = False, size: tuple[int, int] = (32, 32), **settings: Any) -> StylizeRequest:
-    """Write the inputs of a job with two tiny views, at least two scales and a few steps; return the request."""
+def request_(
+    folder: Path, *, scan: bool = False, gray: bool = False, size: tuple[int, int] = (32, 32), **settings: Any
+) -> StylizeRequest:
+    """Write the inputs of a job with two tiny views, at least two scales and a few steps; return the request.
+
+    The job of a gray style keeps its colors in a palette.
+    """
     inputs = folder / "inputs"
     inputs.mkdir(parents=True)
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
     ply, file, style = write_files(inputs, scene, cameras(2, *size))
+    if gray:
+        with Image.open(style) as image:
+            image.convert("L").save(style)
     options = {"steps_coarse": 2, "steps_sos": 2, "coarsest_side": 16, "early_stop": False, **settings}
     source = SceneRequest(scene=ply, cameras=file)
     return StylizeRequest(
@@ -65,21 +74,24 @@ def run_job(job: Job, steps: int | None = None) -> Result:
 
 
 @pytest.mark.parametrize(
-    ("preset", "scan", "settings"),
+    ("preset", "scan", "gray", "settings"),
     [
-        pytest.param("preview", False, {"position_weights": "off"}, marks=pytest.mark.slow),
-        pytest.param("standard", True, {"precision": "bfloat16", "views_per_step": 2}, marks=pytest.mark.slow),
-        pytest.param("paper", False, {"position_weights": "off", "cached_weights": "half"}, marks=pytest.mark.slow),
+        pytest.param("preview", False, True, {"position_weights": "off"}, marks=pytest.mark.slow),
+        pytest.param("standard", True, False, {"precision": "bfloat16", "views_per_step": 2}, marks=pytest.mark.slow),
+        pytest.param(
+            "paper", False, False, {"position_weights": "off", "cached_weights": "half"}, marks=pytest.mark.slow
+        ),
     ],
 )
 def test_job_runs_resumes_and_reports(
-    counts: Counts, tmp_path: Path, preset: str, scan: bool, settings: dict[str, Any]
+    counts: Counts, tmp_path: Path, preset: str, scan: bool, gray: bool, settings: dict[str, Any]
 ) -> None:
     """Run survey, plan, both phases, measurements, a checkpoint, a resumed job and the report."""
-    asked = request_(tmp_path, scan=scan, preset=preset, **settings)
+    asked = request_(tmp_path, scan=scan, gray=gray, preset=preset, **settings)
     first = prepare(asked)
     plan = first.stylizer.job.plan
     assert (plan.device, plan.uncached, plan.weighted) == ("cuda", "triton", scan)
+    assert (first.stylizer.job.styles.palette(first.stylizer.job.settings) is not None) == gray
     assert run_job(first, steps=1).stopped == "interrupted"
     second = prepare(asked, resume=Resume(True))
     assert second.stylizer.job.plan.rasterizer == plan.rasterizer
@@ -93,11 +105,13 @@ def test_job_runs_resumes_and_reports(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scan", [False, True])
-def test_steady_step_synchronizes_once_and_copies_scalars(counts: Counts, tmp_path: Path, scan: bool) -> None:
+@pytest.mark.parametrize(("scan", "gray"), [(False, False), (True, True)])
+def test_steady_step_synchronizes_once_and_copies_scalars(
+    counts: Counts, tmp_path: Path, scan: bool, gray: bool
+) -> None:
     """The first step of a view has one more wait, because it builds the tile intersections."""
     settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}
-    stylizer = prepare(request_(tmp_path, scan=scan, size=(64, 48), **settings)).stylizer
+    stylizer = prepare(request_(tmp_path, scan=scan, gray=gray, size=(64, 48), **settings)).stylizer
     assert stylizer.job.scale_count(0) == 3
     assert stylizer.job.plan.weighted == scan
     seen: set[int] = set()
