@@ -8,7 +8,19 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from benchmarks.cross_validation import DEFAULT, SCORED, Rows, Task, choose, left_out, run, score, stored, tables
+from benchmarks.cross_validation import (
+    DEFAULT,
+    SCORED,
+    SECOND_SEED,
+    Rows,
+    Task,
+    choose,
+    left_out,
+    run,
+    score,
+    stored,
+    tables,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,6 +41,13 @@ def test_default_is_chosen_unless_a_candidate_is_better_on_average() -> None:
     assert choose(worse) == DEFAULT
     assert choose(worse | {"broche, c": pair(cold=0.5)}) == "cold"
     assert choose({"biker, a": pair(cold=0.1)}) == DEFAULT, "one pair is too few"
+
+
+def test_second_seed_is_shown_but_never_chosen() -> None:
+    pairs = {"biker, a": pair(**{SECOND_SEED: 0.5}), "playbot, b": pair(**{SECOND_SEED: 0.5})}
+    assert choose(pairs) == DEFAULT
+    assert not list(left_out(pairs))
+    assert "| second-seed (score -0.693, better on 2), mean | 2 |" in tables(pairs)
 
 
 def test_choice_sees_neither_the_scene_nor_the_painting_left_out() -> None:
