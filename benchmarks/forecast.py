@@ -33,7 +33,7 @@ from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.content import ContentDifference
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.cost import content_bytes
+from sgsst_core.planning.work import content_bytes
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings

@@ -25,9 +25,11 @@ from sgsst_core import Stylizer, make_settings
 from sgsst_core.features.partition import Rectangle, computed_twice
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide, loads
-from sgsst_core.planning.cost import IterationWork, pieces_of, proportional
 from sgsst_core.planning.facts import Link
 from sgsst_core.planning.probe import probe_link
+from sgsst_core.planning.ranks import IterationWork
+from sgsst_core.planning.view_costs import proportional
+from sgsst_core.planning.work import pieces_of
 from sgsst_core.report.machine import peak_memory
 from sgsst_core.scene.camera import Camera
 from worker.ranks.process_group import process_group

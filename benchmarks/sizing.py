@@ -24,9 +24,9 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.context import equip
-from sgsst_core.planning.cost import gaussian_bytes
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import Probe, RasterCost
+from sgsst_core.planning.memory import gaussian_bytes
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.planning.probe import measure, probe_link
 from sgsst_core.planning.survey import Survey, survey_views

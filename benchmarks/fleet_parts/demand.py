@@ -14,7 +14,7 @@ from functools import cache
 from typing import Any
 
 from service.scheduling.job_size import JobSize, estimated_size
-from sgsst_core.planning.cost import LEAST_GAIN
+from sgsst_core.planning.ranks import LEAST_GAIN
 
 #: Bytes of a Gaussian with SH of degree 3 in a PLY file.
 GAUSSIAN_BYTES = 248

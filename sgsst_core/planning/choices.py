@@ -20,9 +20,12 @@ from sgsst_core.loss.nearest import MOST_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.cost import OPTIMIZER_BYTES, CostModel, RanksChoice, ViewData
+from sgsst_core.planning.cost import CostModel
 from sgsst_core.planning.facts import LEAST_VISITS, LaunchCost, Link, Probe, RasterCost
+from sgsst_core.planning.memory import OPTIMIZER_BYTES
+from sgsst_core.planning.ranks import RanksChoice
 from sgsst_core.planning.survey import Survey
+from sgsst_core.planning.view_costs import ViewData
 from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import CachedWeights, PlannedBackground, Precision, Settings

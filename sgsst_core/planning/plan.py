@@ -108,6 +108,11 @@ class Plan:
     decisions: tuple[Decision, ...] = ()
     prediction: Prediction | None = None
 
+    @property
+    def is_approximated(self) -> bool:
+        """Whether measurements compare the gradient of a step with the float32 reference."""
+        return self.precision != "float32" or self.cached_weights == "half"
+
     def as_dict(self) -> dict[str, Any]:
         """Return decisions and prediction as JSON-serializable values."""
         return {

@@ -15,11 +15,11 @@ from sgsst_core.orbit.choice import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.choices import ANOTHER_LOSS
 from sgsst_core.planning.context import PlanningContext, equip
-from sgsst_core.planning.cost import MAP_BYTES, MAPS_OF_A_RENDER
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import measure, probe_link
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
+from sgsst_core.planning.view_costs import MAP_BYTES, MAPS_OF_A_RENDER
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions

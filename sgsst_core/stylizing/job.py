@@ -23,10 +23,10 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import ends_with_transfer
 from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
-from sgsst_core.planning.cost import view_memory
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import ShowPlanning
+from sgsst_core.planning.view_costs import view_memory
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions

@@ -14,7 +14,9 @@ from sgsst_core.decision import Decision
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.difference import Difference
 from sgsst_core.loss.nearest import MOST_VECTORS
-from sgsst_core.planning.cost import (
+from sgsst_core.planning.decide import decide
+from sgsst_core.planning.facts import LaunchCost, Link, Machine, NetworkFacts, Probe, RasterCost, Rate, SceneFacts
+from sgsst_core.planning.memory import (
     CUDNN_BYTES,
     MEASURING_BYTES,
     NCCL_BYTES,
@@ -22,8 +24,6 @@ from sgsst_core.planning.cost import (
     SHAPE_BYTES,
     gaussian_bytes,
 )
-from sgsst_core.planning.decide import decide
-from sgsst_core.planning.facts import LaunchCost, Link, Machine, NetworkFacts, Probe, RasterCost, Rate, SceneFacts
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import rasterizer_for

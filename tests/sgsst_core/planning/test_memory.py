@@ -8,18 +8,18 @@ from typing import Any
 import pytest
 
 from sgsst_core.budget import content_fraction, least_intersection_memory, measuring_memory, memory_for
-from sgsst_core.planning.cost import (
+from sgsst_core.planning.decide import decide
+from sgsst_core.planning.facts import RasterCost
+from sgsst_core.planning.measuring import LEVELS
+from sgsst_core.planning.memory import (
     BUILDING_BYTES,
     MEASURING_BYTES,
     OPTIMIZER_BYTES,
     SEARCH_BYTES,
     SHAPE_BYTES,
     gaussian_bytes,
-    view_memory,
 )
-from sgsst_core.planning.decide import decide
-from sgsst_core.planning.facts import RasterCost
-from sgsst_core.planning.measuring import LEVELS
+from sgsst_core.planning.view_costs import view_memory
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import GIGABYTE, HEIGHT, VIEWS, WIDTH, plan_of, probe
 from tests.sgsst_core.planning.test_view_costs import HUGE, LARGE, expected

@@ -9,8 +9,9 @@ import pytest
 
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.parallel.division import Piece
-from sgsst_core.planning.cost import IterationWork, choose_ranks, proportional
 from sgsst_core.planning.facts import Link
+from sgsst_core.planning.ranks import IterationWork, choose_ranks
+from sgsst_core.planning.view_costs import proportional
 
 FREE = Link(math.inf, 0.0)
 SLOW = Link(1e6, 1e-3)

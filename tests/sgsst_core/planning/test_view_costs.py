@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 import torch
 
-from sgsst_core.planning.cost import CostModel, RankPart, ViewData
+from sgsst_core.planning.cost import CostModel
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import RasterCost
 from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.planning.view_costs import RankPart, ViewData
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import GIGABYTE, probe
 

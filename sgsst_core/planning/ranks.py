@@ -1,0 +1,222 @@
+"""Time of an iteration on several ranks: each rank's portion of the work, and the messages between ranks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from sgsst_core.features.partition import cached_tiles, choose_tile_size, computed_twice, partition
+from sgsst_core.parallel.collectives import TRAFFIC, Traffic
+from sgsst_core.parallel.division import Piece, Shares, divide, rounds
+from sgsst_core.parallel.shown import gaussians_sent
+from sgsst_core.planning.facts import Link
+from sgsst_core.planning.view_costs import RankPart
+
+#: Channels of the style layers. Ranks exchange their statistics in float64: first the pixel count and the mean, then
+#: one half of the symmetric covariance.
+_STYLE_CHANNELS = (64, 128, 256, 512, 512)
+_FIRST_BYTES = 8 * sum(c + 1 for c in _STYLE_CHANNELS)
+_SECOND_BYTES = 8 * sum(c * (c + 1) // 2 for c in _STYLE_CHANNELS)
+#: Minimum fraction of an iteration that additional ranks must save.
+LEAST_GAIN = 0.03
+
+
+@dataclass(frozen=True)
+class IterationWork:
+    """Work of an iteration on one view, divided among ranks by `division`.
+
+    Communication is counted in bytes and messages, assuming ring algorithms for sums.
+
+    Attributes:
+        pieces: One piece for each computed scale.
+        halo: Pixels around a partition tile.
+        pixel: Seconds per pixel through the network: both passes and statistics.
+        raster: Function that returns the time in seconds of render, gradient and uncached data of the view for a part.
+        fixed: Seconds that every rank needs regardless of their number, such as those of the optimizer.
+        gaussians: Number of optimized Gaussians.
+        forward: Seconds per pixel of a forward pass alone, for pixels whose activations are not cached.
+        held: Number of pixels whose activations a single rank can hold (see `choose_tile_size`).
+        working: Memory of a pass in addition to the activations, as a fraction of them.
+        sharing: Number of ranks that divide the memory for activations.
+        shown: Number of Gaussians that the view shows, whose gradients are sent; None for all.
+        matching: Time in seconds of the nearest-neighbor search on one rank.
+        largest_tile: Maximum pixels of a partition tile; None for no limit.
+        rendered: One piece for each scale of the job, whose division determines what each rank renders; empty if these
+            are `pieces`.
+        rendering: Cost of rendering a pixel that the division assumes; see `Tiling`.
+        launch: Seconds to launch the kernels of a partition tile, during which a GPU works on; 0 on a CPU.
+        graphs: Whether a single rank launches all kernels of the loss as one CUDA graph, in almost no time.
+    """
+
+    pieces: tuple[Piece, ...]
+    halo: int
+    pixel: float
+    raster: Callable[[RankPart], float]
+    fixed: float
+    gaussians: int
+    forward: float = 0.0
+    held: float = math.inf
+    working: float = 0.0
+    sharing: int = 1
+    shown: float | None = None
+    matching: float = 0.0
+    largest_tile: int | None = None
+    rendered: tuple[Piece, ...] = ()
+    rendering: float = 0.0
+    launch: float = 0.0
+    graphs: bool = False
+
+    def computing(self, ranks: int, groups: int = 1) -> float:
+        """Return the computing time in seconds of the rank with most work.
+
+        Args:
+            ranks: Number of ranks per group.
+            groups: Number of groups, each of which takes a view.
+        """
+        held = self.held / min(ranks * groups, self.sharing)
+        own = (
+            self._network(shard, ranks, held) + self.raster(part)
+            for shard, part in zip(self.shards(ranks), self.parts(ranks, groups), strict=True)
+        )
+        return max(own) + self.matching / ranks + self.fixed
+
+    def parts(self, ranks: int, groups: int = 1) -> list[RankPart]:
+        """Return the part of the view that each rank of a group renders; see `computing`."""
+        memory = self.sharing / min(ranks * groups, self.sharing)
+        whole = max(self._shares(1).windows[0].pixels, 1)
+        return [RankPart(ranks, window.pixels / whole, memory) for window in self._shares(ranks).windows]
+
+    def _network(self, shard: Sequence[Piece], ranks: int, held: float) -> float:
+        """Return the time in seconds of a rank's pieces, split into partition tiles as its memory requires."""
+        areas = {piece.scale: self._areas(piece, held) for piece in shard if piece.region.pixels}
+        launching = 0.0 if self.graphs and ranks == 1 else self.launch * sum(map(len, areas.values()))
+        seconds = 0.0
+        for scales in rounds(list(areas), ranks):
+            together = [area for scale in scales for area in areas[scale]]
+            twice = computed_twice(together, cached_tiles(together, held, self.working))
+            seconds += sum(together) * self.pixel + twice * self.forward
+        return max(seconds, launching)
+
+    def _areas(self, piece: Piece, held: float) -> list[int]:
+        size = choose_tile_size(
+            *piece.size, self.halo, held=held, working=self.working, region=piece.region, largest=self.largest_tile
+        )
+        return [tile.outer.pixels for tile in partition(*piece.size, size, self.halo, piece.region)]
+
+    def communication(self, ranks: int, link: Link) -> float:
+        """Return the time in seconds that ranks wait for data."""
+        return sum(self.waiting(ranks, link).values())
+
+    def waiting(self, ranks: int, link: Link) -> dict[Traffic, float]:
+        """Return the time in seconds that ranks wait for data, by purpose."""
+        if ranks == 1:
+            return dict.fromkeys(TRAFFIC, 0.0)
+        busiest = max(max(sent, received) for sent, received in self._image_bytes(ranks))
+        scales = len(self.pieces)
+        return {
+            "image": 2 * (link.all_gather(0, ranks) + busiest / link.bandwidth),
+            "statistics": sum(link.all_reduce(scales * size, ranks) for size in (_FIRST_BYTES, _SECOND_BYTES)),
+            "gradient": link.all_reduce(self._gradient_bytes, ranks),
+        }
+
+    def sent(self, ranks: int) -> dict[Traffic, int]:
+        """Return the bytes that a rank sends for each purpose, at all scales, as counted by `Collectives.sent`.
+
+        Ranks send different parts of the image; the value is that of the rank that sends most.
+        """
+        twice = 2 * (ranks - 1) / ranks  # once to reduce, once to distribute
+        statistics = len(self.pieces) * (_FIRST_BYTES + _SECOND_BYTES)
+        return {
+            "image": max(sent + received for sent, received in self._image_bytes(ranks)),
+            "statistics": int(twice * statistics),
+            "gradient": int(twice * self._gradient_bytes),
+        }
+
+    def _shares(self, ranks: int) -> Shares:
+        pieces = self.rendered or self.pieces
+        height, width = max((piece.size[0] << piece.scale, piece.size[1] << piece.scale) for piece in pieces)
+        by_rank = divide(pieces, self.halo, (1.0,) * ranks, self.rendering)
+        return Shares.of((height, width), by_rank, self.halo)
+
+    def shards(self, ranks: int) -> tuple[tuple[Piece, ...], ...]:
+        """Return the pieces that each rank of a group passes through the network."""
+        rendering = self.rendering if self.rendered in ((), self.pieces) else 0.0
+        return divide(self.pieces, self.halo, (1.0,) * ranks, rendering)
+
+    def _image_bytes(self, ranks: int) -> list[tuple[int, int]]:
+        """Return the bytes of the image that each rank sends and receives; those of its gradient go the other way."""
+        exchanges = self._shares(ranks).exchanges(self.shards(ranks), self.halo).values()
+        moved = [[exchange.moved(rank) for exchange in exchanges] for rank in range(ranks)]
+        return [(12 * sum(sent for sent, _ in each), 12 * sum(received for _, received in each)) for each in moved]
+
+    @property
+    def _gradient_bytes(self) -> int:
+        return int(12 * (self.gaussians if self.shown is None else gaussians_sent(self.shown, self.gaussians)))
+
+    def seconds(self, ranks: int, link: Link, groups: int = 1) -> float:
+        """Return the time in seconds of an iteration of one view, including communication.
+
+        Args:
+            ranks: Number of ranks per group.
+            link: Connection between the ranks.
+            groups: Number of groups, each of which takes a view.
+        """
+        return self.computing(ranks, groups) + self.communication(ranks, link)
+
+
+@dataclass(frozen=True)
+class RanksChoice:
+    """Chosen number of ranks.
+
+    Attributes:
+        ranks: Number of ranks that take part.
+        seconds: Time in seconds of the whole schedule for each number of ranks considered.
+    """
+
+    ranks: int
+    seconds: dict[int, float]
+
+    @property
+    def speed_up(self) -> float:
+        """Speed-up over one rank."""
+        return self.seconds[1] / self.seconds[self.ranks]
+
+
+def choose_ranks(
+    phases: Sequence[tuple[int, Sequence[IterationWork]]], views_per_step: int, available: int, link: Link
+) -> RanksChoice:
+    """Choose the smallest number of ranks whose time is within `LEAST_GAIN` of the best.
+
+    Args:
+        phases: Number of steps of each phase, and the work of iterations on a sample of views.
+        views_per_step: Views per step, which groups of ranks process in parallel.
+        available: Number of available ranks.
+        link: Connection between the ranks.
+    """
+    seconds = {ranks: _schedule_seconds(phases, views_per_step, ranks, link) for ranks in _candidates(available)}
+    best = min(seconds.values())
+    enough = min(ranks for ranks, time_ in seconds.items() if time_ <= best * (1 + LEAST_GAIN))
+    return RanksChoice(enough, seconds)
+
+
+def _candidates(available: int) -> list[int]:
+    """Return the numbers of ranks to consider: all up to eight, then increasing by a quarter."""
+    candidates, ranks = [], 1
+    while ranks < available:
+        candidates.append(ranks)
+        ranks += max(ranks // 4, 1) if ranks >= 8 else 1
+    return [*candidates, available]
+
+
+def _schedule_seconds(
+    phases: Sequence[tuple[int, Sequence[IterationWork]]], views_per_step: int, ranks: int, link: Link
+) -> float:
+    groups = math.gcd(views_per_step, ranks)
+    each = ranks // groups
+    total = 0.0
+    for steps, works in phases:
+        mean = sum(work.seconds(each, link, groups) for work in works) / len(works)
+        across = link.all_reduce(works[0].gaussians * 12, ranks) if groups > 1 else 0.0
+        total += steps * (mean * views_per_step / groups + across)
+    return total
