@@ -79,6 +79,7 @@ CANDIDATES: dict[str, dict[str, Any]] = {
     "cold": {"warm_start": False},
     "lr-half": {"learning_rate": 0.1, "learning_rate_end": 0.01},
     "lr-slow-end": {"learning_rate": 0.2, "learning_rate_end": 0.005},
+    "lr-high-end": {"learning_rate": 0.2, "learning_rate_end": 0.1},
     "lr-fast": {"learning_rate": 0.3, "learning_rate_end": 0.03},
     "two-scales": {"coarsest_side": 160},
     "unbounded": {"bounded": False},

@@ -24,8 +24,8 @@ from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.color_subspace import color_subspace_of
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.palette import palette_of
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.timing import Timer
@@ -122,13 +122,13 @@ def _style_count(style: Style | None, regions: Regions | None) -> int:
 
 
 def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> list[Decision]:
-    """Return the lines about unused parts of style images, about the palette, and the mixture of several images."""
+    """Return the lines about unused parts of style images, the color subspace, and the mixture of several images."""
     own = [region.style for region in regions.every if region.style] if regions else []
     lines = [Decision("style", "warning", note) for each in (style, *own) for note in each.notes]
-    if palette := palette_of((style, *own), settings):
-        form = "a plane" if palette.dimensions == 2 else "a line"
-        reason = f"the style's colors differ from it by {255 * palette.deviation:.1f} of 255 levels"
-        lines.append(Decision("palette", f"colors stay on {form} in RGB", reason, error=ANOTHER_LOSS))
+    if subspace := color_subspace_of((style, *own), settings):
+        form = "a plane" if subspace.dimensions == 2 else "a line"
+        reason = f"the style's colors differ from it by {255 * subspace.deviation:.1f} of 255 levels"
+        lines.append(Decision("color subspace", f"colors stay on {form} in RGB", reason, error=ANOTHER_LOSS))
     if len(style.images) == 1:
         return lines
     reason = f"{len(style.images)} images were given"

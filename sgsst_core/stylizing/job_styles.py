@@ -19,7 +19,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.regions.maps import ContentMaps, DepthBands, RegionMaps, ViewMaps
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.palette import Palette, palette_of
+from sgsst_core.scene.color_subspace import ColorSubspace, color_subspace_of
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
 from sgsst_core.style import Style
@@ -80,9 +80,9 @@ class JobStyles:
         """Largest content weight of a Gaussian; None for that of the settings."""
         return None if self.content_weights is None else float(self.content_weights.max())
 
-    def palette(self, settings: Settings) -> Palette | None:
-        """Return the palette that the job keeps the colors in; None if they are free."""
-        return palette_of(self.all, settings)
+    def color_subspace(self, settings: Settings) -> ColorSubspace | None:
+        """Return the color subspace of the job; None if colors are free."""
+        return color_subspace_of(self.all, settings)
 
     @property
     def all(self) -> list[Style]:

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
+from sgsst_core.scene.color_subspace import ColorSubspace
 from sgsst_core.scene.luminance import with_chroma_of
-from sgsst_core.scene.palette import Palette
 from sgsst_core.scene.screen import on_screen, on_screen_by_luminance
 
 #: Adam's epsilon: practically zero, so that Gaussians of any blend weight move at the learning rate (SGSST).
@@ -34,7 +34,7 @@ class ColorOptimizer:
             gradients grow with its square and would overflow earlier.
         chroma_of: [n, 3], colors whose chroma is preserved: the optimized quantity is then each color's difference from
             them in luminance. None to let colors change freely.
-        palette: Palette that colors stay in; None to let them change freely.
+        subspace: Color subspace that colors stay in; None to let them change freely.
         bounded: Whether to project colors to 0..1 after each step (`scene.screen`).
         frozen: [n, 1] bool, frozen colors, whose gradients are 0; None if there are none.
     """
@@ -44,12 +44,12 @@ class ColorOptimizer:
         colors: Tensor,
         unit: float = 1.0,
         chroma_of: Tensor | None = None,
-        palette: Palette | None = None,
+        subspace: ColorSubspace | None = None,
         *,
         bounded: bool = False,
         frozen: Tensor | None = None,
     ) -> None:
-        self._chroma_of, self._palette = chroma_of, palette
+        self._chroma_of, self._subspace = chroma_of, subspace
         self._bounded, self._frozen = bounded, frozen
         self._colors = colors.requires_grad_()
         self._unit = unit
@@ -70,9 +70,9 @@ class ColorOptimizer:
             # The derivative with respect to a value added to all three channels. Adam's steps are then the same in each
             # channel.
             gradient = gradient.sum(dim=1, keepdim=True).expand(-1, 3).contiguous()
-        if self._palette is not None:
-            # Adam scales each channel separately. Without the projection, its steps could ascend along the palette.
-            gradient = self._palette.along(gradient)
+        if self._subspace is not None:
+            # Adam scales each channel separately. Without the projection, its steps could ascend within the subspace.
+            gradient = self._subspace.along(gradient)
         largest = gradient.abs().amax()
         self._colors.grad = gradient.to(self._colors.dtype)
         if self._fused:
@@ -109,13 +109,13 @@ class ColorOptimizer:
 
     @torch.no_grad()
     def _constrain(self, largest: Tensor) -> None:
-        """Project colors onto their constraints: range, and chroma or palette.
+        """Project colors onto their constraints: range, and chroma or subspace.
 
         Frozen colors do not change. If the step was skipped, no color changes.
         """
-        if not self._bounded and self._chroma_of is None and self._palette is None:
+        if not self._bounded and self._chroma_of is None and self._subspace is None:
             return
-        constrained_colors = constrained(self._colors, self._chroma_of, self._palette, bounded=self._bounded)
+        constrained_colors = constrained(self._colors, self._chroma_of, self._subspace, bounded=self._bounded)
         unchanged = ~(largest <= LARGEST_GRADIENT)
         if self._frozen is not None:
             unchanged = unchanged | self._frozen
@@ -132,16 +132,19 @@ class ColorOptimizer:
         self._second.copy_(second)
 
 
-def constrained(colors: Tensor, chroma_of: Tensor | None, palette: Palette | None = None, *, bounded: bool) -> Tensor:
+def constrained(
+    colors: Tensor, chroma_of: Tensor | None, subspace: ColorSubspace | None = None, *, bounded: bool
+) -> Tensor:
     """Project DC coefficients [n, 3] to their constraints, without accumulating rounding errors in their chroma.
 
     Args:
         colors: [n, 3].
         chroma_of: [n, 3], colors whose chroma is preserved; None if chroma may change.
-        palette: Palette that colors are projected to; they leave it where it leaves the range. None for any color.
+        subspace: Color subspace that colors are projected to; they leave it where it leaves the range. None for any
+            color.
         bounded: Whether colors must be in 0..1.
     """
-    colors = colors if palette is None else palette.projected(colors)
+    colors = colors if subspace is None else subspace.projected(colors)
     if chroma_of is None:
         return on_screen(colors) if bounded else colors
     return with_chroma_of(on_screen_by_luminance(colors) if bounded else colors, chroma_of)

@@ -53,15 +53,15 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
     original = job.scene.sh_dc[unseen]
     chroma_of = original if job.preserves_chroma else None
-    palette = job.styles.palette(job.settings)
-    colors[unseen] = constrained(original + change, chroma_of, palette, bounded=job.settings.bounded)
+    subspace = job.styles.color_subspace(job.settings)
+    colors[unseen] = constrained(original + change, chroma_of, subspace, bounded=job.settings.bounded)
     return colors
 
 
 def _transferred_last(job: StylizationJob, optimized: Tensor) -> Tensor:
-    transferred, palette = transferred_colors(job, optimized), job.styles.palette(job.settings)
-    if not job.preserves_chroma and palette is None:
+    transferred, subspace = transferred_colors(job, optimized), job.styles.color_subspace(job.settings)
+    if not job.preserves_chroma and subspace is None:
         return transferred
     chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
-    bounded = constrained(transferred, chroma_of, palette, bounded=job.settings.bounded)
+    bounded = constrained(transferred, chroma_of, subspace, bounded=job.settings.bounded)
     return torch.where(transferred != optimized, bounded, optimized)  # frozen colors remain bit-identical

@@ -80,12 +80,12 @@ class Stylizer:
         frozen = job.regions.frozen[seen] if job.regions else torch.zeros(0, dtype=torch.bool)
         #: Mask [n, 1] of frozen Gaussians; None if there are none.
         self._frozen = frozen.to(device)[:, None] if frozen.any() else None
-        palette = job.collectives.broadcast(lambda: job.styles.palette(settings))
+        subspace = job.collectives.broadcast(lambda: job.styles.color_subspace(settings))
         self._optimizer = ColorOptimizer(
             self.sh_dc,
             job.network.unit,
             views.scene.sh_dc.to(device) if job.preserves_chroma else None,
-            palette and palette.to(device),
+            subspace and subspace.to(device),
             bounded=settings.bounded,
             frozen=self._frozen,
         )

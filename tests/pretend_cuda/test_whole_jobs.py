@@ -46,7 +46,7 @@ def request_(
 ) -> StylizeRequest:
     """Write the inputs of a job with two tiny views, at least two scales and a few steps; return the request.
 
-    The job of a gray style keeps its colors in a palette.
+    With a gray style, colors stay in a subspace.
     """
     inputs = folder / "inputs"
     inputs.mkdir(parents=True)
@@ -91,7 +91,7 @@ def test_job_runs_resumes_and_reports(
     first = prepare(asked)
     plan = first.stylizer.job.plan
     assert (plan.device, plan.uncached, plan.weighted) == ("cuda", "triton", scan)
-    assert (first.stylizer.job.styles.palette(first.stylizer.job.settings) is not None) == gray
+    assert (first.stylizer.job.styles.color_subspace(first.stylizer.job.settings) is not None) == gray
     assert run_job(first, steps=1).stopped == "interrupted"
     second = prepare(asked, resume=Resume(True))
     assert second.stylizer.job.plan.rasterizer == plan.rasterizer

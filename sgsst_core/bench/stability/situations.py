@@ -174,8 +174,8 @@ def _moved(job: Stylizer, start: Tensor) -> float:
     """Return the largest change of a coefficient, ignoring the clamping of initial colors to their bounds."""
     sh_dc = job.sh_dc.detach()
     chroma_of = start if job.job.settings.preserve_colors == "luminance" else None
-    palette = job.job.styles.palette(job.job.settings)
-    within = constrained(start, chroma_of, palette, bounded=job.job.settings.bounded)
+    subspace = job.job.styles.color_subspace(job.job.settings)
+    within = constrained(start, chroma_of, subspace, bounded=job.job.settings.bounded)
     return float(torch.minimum((sh_dc - start).abs(), (sh_dc - within).abs()).max())
 
 

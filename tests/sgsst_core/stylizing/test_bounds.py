@@ -12,9 +12,9 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import saturated
 from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.scene.color_subspace import ColorSubspace
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.luminance import gray
-from sgsst_core.scene.palette import Palette
 from sgsst_core.scene.screen import LARGEST
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
@@ -104,7 +104,7 @@ def distance_from(style_image: Tensor, sh_dc: Tensor, axes: int) -> float:
 @pytest.mark.parametrize("values", [{}, {"warm_start": False}, {"style_loss": "nnfm"}, {"views_per_step": 2}], ids=str)
 @pytest.mark.parametrize("make_scene", [bright_wall, ball])
 @pytest.mark.parametrize(("of", "axes", "form"), [(gray, 1, "a line"), (few_hues, 2, "a plane")])
-def test_colors_stay_in_the_palette(
+def test_colors_stay_in_the_subspace(
     tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any], of: Any, axes: int, form: str
 ) -> None:
     """Seen and unseen Gaussians get colors of the style's line or plane; without bounds, the loss gives them others."""
@@ -116,7 +116,7 @@ def test_colors_stay_in_the_palette(
     run(stylizer)
     run(free)
     lines, free_lines = (
-        [line.decision for line in own.job.plan.decisions if line.item == "palette"] for own in (stylizer, free)
+        [line.decision for line in own.job.plan.decisions if line.item == "color subspace"] for own in (stylizer, free)
     )
     assert lines == [f"colors stay on {form} in RGB"]
     assert free_lines == []
@@ -184,17 +184,17 @@ def test_steps_match_projected_adam() -> None:
 
 
 @pytest.mark.parametrize("of", [gray, few_hues])
-def test_steps_within_a_palette_reach_its_nearest_color(of: Any) -> None:
-    """Minimize a quadratic with a large curvature in one channel, against its minimum on the palette in closed form."""
-    palette = Palette.of(Style.of(of(style())))
-    assert palette is not None
+def test_steps_within_a_subspace_reach_its_nearest_color(of: Any) -> None:
+    """Compare with the closed form of the minimum, for a quadratic with a large curvature in one channel."""
+    subspace = ColorSubspace.of(Style.of(of(style())))
+    assert subspace is not None
     colors, target = torch.zeros((50, 3)), 0.8 * torch.randn((50, 3), generator=torch.Generator().manual_seed(4))
     curvature = torch.tensor([1.0, 1.0, 20.0])
-    optimizer = ColorOptimizer(colors, palette=palette, bounded=True)
+    optimizer = ColorOptimizer(colors, subspace=subspace, bounded=True)
     for step in range(600):
         optimizer.update(curvature * (colors.detach() - target), 0.1 * 0.99**step)
-    axes = torch.linalg.eigh(palette.matrix.double()).eigenvectors[:, 3 - palette.dimensions :]
-    weighted, start = axes.T * curvature.double(), palette.offset.double()
+    axes = torch.linalg.eigh(subspace.matrix.double()).eigenvectors[:, 3 - subspace.dimensions :]
+    weighted, start = axes.T * curvature.double(), subspace.offset.double()
     expected = start + (axes @ torch.linalg.solve(weighted @ axes, weighted @ (target.double() - start).T)).T
     inside = (expected.abs() < LARGEST).all(dim=1)
     assert float(inside.double().mean()) > 0.5

@@ -41,10 +41,10 @@ def test_several_ranks_match_one_rank(scene: Scene, values: dict[str, Any]) -> N
             assert torch.equal(result["colors"], actual[0]["colors"])
 
 
-def test_ranks_stay_in_the_same_palette() -> None:
+def test_ranks_stay_in_the_same_color_subspace() -> None:
     values = {"steps_coarse": 2, "steps_sos": 4, "learning_rate": 0.01}
     expected = stylize(ALONE, wall(), 3, values, gray(style()))
     first, second = on_ranks(2, stylize, wall(), 3, values, gray(style()))
-    assert "palette" in expected["plan"]
+    assert "color subspace" in expected["plan"]
     assert relative_error(first["colors"], expected["colors"]) < 1e-3
     assert torch.equal(first["colors"], second["colors"])

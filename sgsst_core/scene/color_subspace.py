@@ -24,7 +24,7 @@ NEGLIGIBLE = 3 / 255
 
 
 @dataclass(frozen=True)
-class Palette:
+class ColorSubspace:
     """Line or plane of colors, as an affine map of DC coefficients to it: c -> c @ matrix + offset.
 
     Attributes:
@@ -40,8 +40,8 @@ class Palette:
     deviation: float
 
     @staticmethod
-    def of(style: Style) -> Palette | None:
-        """Return the palette of a style; None if its colors vary in all directions, or in none."""
+    def of(style: Style) -> ColorSubspace | None:
+        """Return the color subspace of a style; None if its colors vary in all directions, or in none."""
         mean, covariance = color_moments(some_pixels(style))
         variances, axes = torch.linalg.eigh(covariance.cpu())
         deviations = variances.clamp_min(0).sqrt()
@@ -51,10 +51,10 @@ class Palette:
         matrix = axes[:, varies] @ axes[:, varies].T
         center = (mean.cpu() - COLOR_OFFSET) / SH_C0
         offset = center - center @ matrix
-        return Palette(matrix.float(), offset.float(), int(varies.sum()), float(deviations[~varies].max()))
+        return ColorSubspace(matrix.float(), offset.float(), int(varies.sum()), float(deviations[~varies].max()))
 
-    def to(self, device: torch.device) -> Palette:
-        """Return the palette on a device."""
+    def to(self, device: torch.device) -> ColorSubspace:
+        """Return the subspace with its tensors on a device."""
         return replace(self, matrix=self.matrix.to(device), offset=self.offset.to(device))
 
     def projected(self, sh_dc: Tensor) -> Tensor:
@@ -72,8 +72,8 @@ class Palette:
         return projected
 
 
-def palette_of(styles: Sequence[Style], settings: Settings) -> Palette | None:
-    """Return the palette that a job keeps the colors in; None if they are free, or if there are several styles."""
+def color_subspace_of(styles: Sequence[Style], settings: Settings) -> ColorSubspace | None:
+    """Return the color subspace of a job; None if colors are free, or if there are several styles."""
     if len(styles) != 1 or not settings.bounded or settings.preserve_colors != "no":
         return None
-    return Palette.of(styles[0])
+    return ColorSubspace.of(styles[0])

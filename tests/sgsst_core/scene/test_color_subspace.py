@@ -11,8 +11,8 @@ from PIL import Image
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
+from sgsst_core.scene.color_subspace import ColorSubspace, color_subspace_of
 from sgsst_core.scene.luminance import gray
-from sgsst_core.scene.palette import Palette, palette_of
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from tests.sgsst_core.synthetic_images import synthetic_image
@@ -47,31 +47,31 @@ FEW_HUES = COLORED[..., :1] * torch.tensor([0.5, 0.4, 0.25]) + COLORED[..., 1:2]
     ids=["gray", "sepia", "few hues", "gray and black", "colored", "gray and colored", "one color", "one pixel"],
 )
 def test_dimensions_are_those_of_the_colors(style: Style, dimensions: int | None) -> None:
-    palette = Palette.of(style)
-    assert (palette and palette.dimensions) == dimensions
+    subspace = ColorSubspace.of(style)
+    assert (subspace and subspace.dimensions) == dimensions
 
 
 @pytest.mark.parametrize("image", [LINES, SEPIA, FEW_HUES], ids=["gray", "sepia", "few hues"])
 def test_projection_is_the_nearest_color(image: Tensor) -> None:
     """It agrees with least squares in float64, and repeating it changes nothing."""
-    palette = Palette.of(Style.of(image))
-    assert palette is not None
+    subspace = ColorSubspace.of(Style.of(image))
+    assert subspace is not None
     sh_dc = 2 * torch.randn((200, 3), generator=torch.Generator().manual_seed(2))
-    projected = palette.projected(sh_dc)
+    projected = subspace.projected(sh_dc)
     pixels = image.reshape(-1, 3).double()
-    axes = torch.linalg.svd(pixels - pixels.mean(dim=0), full_matrices=False).Vh[: palette.dimensions].T
+    axes = torch.linalg.svd(pixels - pixels.mean(dim=0), full_matrices=False).Vh[: subspace.dimensions].T
     colors = COLOR_OFFSET + SH_C0 * sh_dc.double() - pixels.mean(dim=0)
     expected = axes @ torch.linalg.lstsq(axes, colors.T).solution
     actual = COLOR_OFFSET + SH_C0 * projected.double() - pixels.mean(dim=0)
     torch.testing.assert_close(actual, expected.T, rtol=0, atol=1e-6)
-    torch.testing.assert_close(palette.projected(projected), projected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(subspace.projected(projected), projected, rtol=0, atol=1e-6)
 
 
 def test_colors_are_free_where_the_settings_say_so() -> None:
     line, colored = Style.of(LINES), Style.of(COLORED)
     standard = make_settings("standard")
-    assert palette_of([line], standard) is not None
-    assert palette_of([line, colored], standard) is None
-    assert palette_of([line], make_settings("paper")) is None
-    assert palette_of([line], make_settings("standard", bounded=False)) is None
-    assert palette_of([line], make_settings("standard", preserve_colors="luminance")) is None
+    assert color_subspace_of([line], standard) is not None
+    assert color_subspace_of([line, colored], standard) is None
+    assert color_subspace_of([line], make_settings("paper")) is None
+    assert color_subspace_of([line], make_settings("standard", bounded=False)) is None
+    assert color_subspace_of([line], make_settings("standard", preserve_colors="luminance")) is None
