@@ -1,6 +1,7 @@
 """Error against run time: variants of one job with the same time budget, evaluated by the same exact loss.
 
-Every variant optimizes for the same number of seconds. At fixed times, its colors are evaluated on some views by the
+Every variant runs its own schedule for the same number of seconds, as a job with `max_seconds` does, so that each point
+is the result of a job with that time limit. At fixed times, its colors are evaluated on some views by the
 float32 loss of all scales (`exact.Float32Reference`). This is the paper's loss, regardless of the loss that the variant
 optimizes. At the same times, they are judged on novel views by a network that no variant optimizes (`Judge`). Run time
 excludes evaluations and judgments. It also excludes the one-time preparation of each view, which would dominate a short
@@ -43,7 +44,6 @@ from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, Settings, make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
-from sgsst_core.stylizing.schedule import Phase
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Number of slices of the time budget. Variants take turns slice by slice, so that a temporary slowdown of the machine
@@ -51,31 +51,6 @@ from sgsst_core.stylizing.stylizer import Stylizer
 SLICES = 32
 #: Numbers of slices after which the variants are evaluated.
 MOMENTS = (1, 2, 4, 8, 16, 32)
-#: Fraction of the time for phase 1, if a variant has one: about as much as in the standard preset.
-PHASE_1 = 0.15
-#: Function that returns the phases of a variant, given the number of scales. A phase is (name, scale counted from the
-#: coarsest or None for all scales, fraction of the time).
-Fractions = Callable[[int], list[tuple[str, int | None, float]]]
-
-
-def _two_phases(scales: int) -> list[tuple[str, int | None, float]]:
-    return [("coarse", 0, PHASE_1), ("sos", None, 1 - PHASE_1)] if scales > 1 else _sos(scales)
-
-
-def _sos(_scales: int) -> list[tuple[str, int | None, float]]:
-    return [("sos", None, 1.0)]
-
-
-def _coarse_only(_scales: int) -> list[tuple[str, int | None, float]]:
-    return [("coarse", 0, 1.0)]
-
-
-def _full_size_only(scales: int) -> list[tuple[str, int | None, float]]:
-    return [("one scale", scales - 1, 1.0)]
-
-
-def _coarse_to_fine(scales: int) -> list[tuple[str, int | None, float]]:
-    return [(f"scale {scales - 1 - scale}", scale, 1 / scales) for scale in range(scales)]
 
 
 @dataclass(frozen=True)
@@ -85,13 +60,11 @@ class Variant:
     Attributes:
         name: Name for `--variants`.
         what: Human-readable description.
-        fractions: Function that returns the phases of the variant.
         settings: Settings that override the standard preset.
     """
 
     name: str
     what: str
-    fractions: Fractions = _two_phases
     settings: dict[str, Any] = field(default_factory=dict)
 
 
@@ -107,14 +80,13 @@ VARIANTS = {
     variant.name: variant
     for variant in (
         Variant("standard", "coarsest scale first, then all scales (SOS); the standard preset"),
-        Variant("preview", "the preview preset: views of at most 640 pixels", settings=_of_preset("preview")),
-        Variant("paper", "the paper preset: published schedule, rate and start", settings=_of_preset("paper")),
-        Variant("paper-rate", "the same with the paper's constant learning rate and clamp", settings=PAPER_RATE),
-        Variant("no-phase-1", "all scales from the beginning", _sos),
-        Variant("coarse-only", "the coarsest scale alone", _coarse_only),
-        Variant("one-scale", "the paper's loss at full size alone", _full_size_only),
-        Variant("coarse-to-fine", "one scale after another, from the coarsest to full size", _coarse_to_fine),
-        Variant("cold-start", "standard, from the scene's own colors", settings={"warm_start": False}),
+        Variant("preview", "the preview preset: views of at most 640 pixels", _of_preset("preview")),
+        Variant("paper", "the paper preset: published schedule, rate and start", _of_preset("paper")),
+        Variant("paper-rate", "the same with the paper's constant learning rate and clamp", PAPER_RATE),
+        Variant("no-phase-1", "all scales from the beginning", {"steps_coarse": 0}),
+        Variant("coarse-only", "the coarsest scale alone", {"steps_coarse": 300, "steps_sos": 0}),
+        Variant("one-scale", "the paper's loss at full size alone", {"scales": (1.0,), "steps_coarse": 0}),
+        Variant("cold-start", "standard, from the scene's own colors", {"warm_start": False}),
         Variant(
             "fixed-background",
             "standard, with the background behind every step",
@@ -130,13 +102,13 @@ VARIANTS = {
             "standard; colors that fall below 0 stay there",
             settings={"clamp_aware_gradient": False},
         ),
-        Variant("bfloat16", "standard with features in bfloat16", settings={"precision": "bfloat16"}),
-        Variant("tf32", "standard with TF32 convolutions", settings={"precision": "tf32"}),
-        Variant("half-weights", "standard with blend weights in half precision", settings={"cached_weights": "half"}),
-        Variant("no-cached-weights", "standard, with recomputed blend weights", settings={"cached_weights": "none"}),
-        Variant("two-views", "standard with two views in each step", settings={"views_per_step": 2}),
-        Variant("nnfm", "standard with ARF's nearest-neighbor style loss", settings={"style_loss": "nnfm"}),
-        Variant("mixed", "standard with nearest neighbors beside the statistics", settings={"style_loss": "mixed"}),
+        Variant("bfloat16", "standard with features in bfloat16", {"precision": "bfloat16"}),
+        Variant("tf32", "standard with TF32 convolutions", {"precision": "tf32"}),
+        Variant("half-weights", "standard with blend weights in half precision", {"cached_weights": "half"}),
+        Variant("no-cached-weights", "standard, with recomputed blend weights", {"cached_weights": "none"}),
+        Variant("two-views", "standard with two views in each step", {"views_per_step": 2}),
+        Variant("nnfm", "standard with ARF's nearest-neighbor style loss", {"style_loss": "nnfm"}),
+        Variant("mixed", "standard with nearest neighbors beside the statistics", {"style_loss": "mixed"}),
     )
 }
 
@@ -171,28 +143,6 @@ class Curve:
     sh_dc: Tensor | None = None  # final colors [N, 3]
 
 
-class _TimedStylizer(Stylizer):
-    """Stylizer whose phases and learning rate follow the clock instead of the step count."""
-
-    budget: float
-    fractions: list[tuple[str, int | None, float]]
-
-    @property
-    def phase(self) -> Phase:
-        """Phase at the elapsed optimization time."""
-        end = 0.0
-        for stage, scale, fraction in self.fractions[:-1]:
-            end += fraction * self.budget
-            if self.seconds < end:
-                return Phase(stage, 1, scale)
-        stage, scale, _ = self.fractions[-1]
-        return Phase(stage, 1, scale)
-
-    def fraction_done(self) -> float:
-        """Return the elapsed fraction of the time budget."""
-        return min(self.seconds / self.budget, 1.0)
-
-
 def choose_variants(names: Sequence[str]) -> list[Variant]:
     """Return the variants with the given names, or all variants if there are none.
 
@@ -216,7 +166,7 @@ def error_time(
     progress: Callable[[Variant, Point], None] = lambda variant, point: None,
     **settings: Any,
 ) -> list[Curve]:
-    """Run variants on one scene, each with the same time budget.
+    """Run variants on one scene, each with the same time budget or until its last step.
 
     Args:
         scene: Scene to stylize.
@@ -237,53 +187,54 @@ def error_time(
     judge = make_judge(reference, make_novel_views(reference), lpips) if lpips else None
     views = spread(exact.views.covered, LOSS_VIEWS[0])
     start = exact.evaluate(views, scene.sh_dc)
-    running = [_prepared(variant, seconds, (scene, cameras, style), base, weights) for variant in variants]
+    running = [_prepared(variant, (scene, cameras, style), base, weights) for variant in variants]
+
+    def evaluated(stylizer: Stylizer) -> Point:
+        colors = stylizer.stylized()
+        loss, judgment = exact.evaluate(views, colors), judge.judge(colors) if judge else None
+        by_scale = {scale: loss[scale].total / start[scale].total for scale in loss}
+        relative = mean_loss(loss, exact.loss.weights) / mean_loss(start, exact.loss.weights)
+        return Point(stylizer.seconds, stylizer.step, relative, by_scale, judgment)
+
     for part in range(1, SLICES + 1):
         for curve, stylizer in running:
             if stylizer is None:
                 continue
-            while stylizer.seconds < part / SLICES * seconds:
+            while stylizer.seconds < part / SLICES * seconds and stylizer.step < stylizer.job.total_steps:
                 stylizer.run_step()
             if part in MOMENTS:
-                colors = stylizer.stylized()
-                loss, judgment = exact.evaluate(views, colors), judge.judge(colors) if judge else None
-                by_scale = {scale: loss[scale].total / start[scale].total for scale in loss}
-                relative = mean_loss(loss, exact.loss.weights) / mean_loss(start, exact.loss.weights)
-                curve.points.append(Point(stylizer.seconds, stylizer.step, relative, by_scale, judgment))
+                last = curve.points[-1] if curve.points else None
+                curve.points.append(last if last and last.step == stylizer.step else evaluated(stylizer))
                 progress(curve.variant, curve.points[-1])
     return [replace(curve, sh_dc=stylizer.stylized() if stylizer else None) for curve, stylizer in running]
 
 
 def _prepared(
     variant: Variant,
-    seconds: float,
     inputs: tuple[Scene, Sequence[Camera], Tensor],
     base: Settings,
     weights: BackboneWeights | None,
-) -> tuple[Curve, _TimedStylizer | None]:
+) -> tuple[Curve, Stylizer | None]:
     """Prepare a variant to run.
 
     Returns an empty curve, and the stylizer of the variant. If the variant is skipped, the stylizer is None and the
     curve states the reason.
     """
     settings = base.model_copy(update=variant.settings)
-    stylizer = _TimedStylizer.planned(*inputs, settings, weights=weights)
+    stylizer = Stylizer.planned(*inputs, settings, weights=weights)
     reason = _reason_to_leave_out(settings, stylizer)
     if reason:
         return Curve(variant, [], left_out=reason), None
-    stylizer.budget = seconds
-    stylizer.fractions = variant.fractions(max(len(stylizer.job.scales(index)) for index in stylizer.job.views.covered))
     return Curve(variant, [], preparation=_prepare(stylizer)), stylizer
 
 
-def _prepare(stylizer: _TimedStylizer) -> float:
+def _prepare(stylizer: Stylizer) -> float:
     """Prepare the style and every view as the first steps would; return the elapsed seconds."""
     started = time.perf_counter()
     for index in stylizer.job.views.covered:
         chosen = stylizer.job.scales(index)
-        phases = [Phase(stage, 1, scale) for stage, scale, _ in stylizer.fractions]
         stylizer.job.style_targets(stylizer.job.views.cameras[index])
-        scales = sorted({scale for phase in phases for scale in phase.scales(chosen)})
+        scales = sorted({scale for phase in stylizer.job.schedule for scale in phase.scales(chosen)})
         stylizer.job.view_targets.target(index, scales, stylizer.drawn_background(index))
         stylizer.cache_weights(index)
         stylizer.job.views.render(index, stylizer.job.views.colors(index, stylizer.sh_dc.detach()))
