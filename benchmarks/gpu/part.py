@@ -43,7 +43,7 @@ class Sizes:
 #: Sizes that take seconds in the interpreter.
 QUICK = Sizes(
     gaussians=(60, 120),
-    view=(48, 32),
+    view=(32, 16),
     steps=((32, 32, 60),),
     step_repeats=1,
     rank_steps=1,

@@ -87,5 +87,5 @@ def test_failed_part_reports_reason_and_others_continue(tmp_path: Path) -> None:
     assert status == 1
     assert written["parts"]["raster"]["status"] == "failed"
     assert "ZeroDivisionError" in written["parts"]["raster"]["reason"]
-    assert written["parts"]["raster"]["findings"]["view"] == [48, 32]
+    assert written["parts"]["raster"]["findings"]["view"] == [32, 16]
     assert written["parts"]["network"]["status"] == "succeeded"

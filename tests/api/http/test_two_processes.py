@@ -175,4 +175,4 @@ def test_upload_is_locked_across_processes(pair: Pair) -> None:
 
 @pytest.mark.slow
 def test_interleaved_patches_from_two_processes(pair: Pair) -> None:
-    run(pair, 1000, seed=1)
+    run(pair, 400, seed=1)
