@@ -68,7 +68,7 @@ def test_points_are_results_of_jobs(tiny_weights: BackboneWeights) -> None:
     """A variant that has finished repeats its last point; its colors are those of a job with the same settings."""
     settings: dict[str, Any] = {"steps_coarse": 0, "steps_sos": 3}
     scene, views = wall(), cameras(2, 48, 36)
-    (curve,) = error_time(scene, views, style(), choose_variants(["standard"]), 5.0, weights=tiny_weights, **settings)
+    (curve,) = error_time(scene, views, style(), choose_variants(["standard"]), 600.0, weights=tiny_weights, **settings)
     assert [point.step for point in curve.points][-2:] == [3, 3]
     assert len(curve.points) == 6
     job = Stylizer.planned(scene, views, style(), make_settings(**settings), weights=tiny_weights)
