@@ -124,6 +124,14 @@ def has_bfloat16(device: torch.device | str) -> bool:
     return not _is_nvidia(device) or has_tf32(device)
 
 
+def has_bfloat16_instructions(device: torch.device | str) -> bool:
+    """Return whether a device computes in bfloat16 without emulation, as far as PyTorch knows."""
+    if torch.device(device).type != "cpu":
+        return has_bfloat16(device)
+    capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+
+
 def _is_nvidia(device: torch.device | str) -> bool:
     return torch.device(device).type == "cuda" and torch.version.hip is None
 

@@ -38,6 +38,9 @@ _SCAN = 0.2
 #: Fraction of the color energy that depends on the view direction, from which on attenuating it is recommended: it
 #: then shows beside the style (benchmarks/results/README.md).
 _VIEW_DEPENDENT = 0.05
+#: Speedup of convolutions from which on bfloat16 is recommended: at 1.9, less of the float32 loss is left than with
+#: float32 after the same seconds, on each of four pairs (docs/performance.md).
+_MUCH_FASTER = 1.5
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
 ANOTHER_LOSS = "differs from the paper's loss"
@@ -338,18 +341,20 @@ def precision_of(requested: Precision, ratio: float | None) -> Precision:
 
     Args:
         requested: Requested precision.
-        ratio: Ratio of a convolution's time in float32 to that in the requested precision; None if float32 was
-            requested, or the requested one is unavailable.
+        ratio: See `NetworkFacts.precision_ratio`.
     """
     return requested if ratio is not None and ratio > 1 else "float32"
 
 
 def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decision]]:
-    """Choose the network's precision. The plan has no line about it if float32 was requested."""
+    """Choose the network's precision. If float32 was requested, at most recommend bfloat16."""
     requested, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
     chosen = precision_of(requested, ratio)
-    if requested == "float32":
+    if requested == "float32" and (ratio is None or ratio < _MUCH_FASTER):
         return chosen, []
+    if requested == "float32":
+        reason = f"exact; with --precision bfloat16 (approximate), convolutions are {ratio:.1f} times faster here"
+        return chosen, [Decision("precision", "features in float32", reason)]
     if ratio is None:
         needed = "an NVIDIA GPU" if requested == "tf32" else "a CPU, an AMD GPU, or an NVIDIA GPU"
         reason = f"{requested} was requested, but needs {needed} of compute capability 8.0 or higher"

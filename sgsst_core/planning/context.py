@@ -9,7 +9,14 @@ import torch
 
 from sgsst_core.budget import default_memory_limit, memory_for
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_bfloat16, has_tf32, use_whole_float32
+from sgsst_core.features.vgg import (
+    FeatureNetwork,
+    convolutions,
+    has_bfloat16,
+    has_bfloat16_instructions,
+    has_tf32,
+    use_whole_float32,
+)
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.choices import precision_of
@@ -136,22 +143,35 @@ def make_network(weights: BackboneWeights, settings: Settings, precision: Precis
 def precision_ratio(requested: Precision, device: Device, collectives: Collectives) -> float | None:
     """Return how many times faster a convolution is in the requested precision than in float32.
 
-    All ranks must call this.
+    If float32 was requested, measure bfloat16, so that the plan can recommend it. All ranks must call this.
 
     Returns:
-        Ratio measured on the first rank. None if float32 was requested, or some rank lacks the requested precision.
+        Ratio measured on the first rank. None if some rank lacks the precision, or would have to emulate one that was
+            not requested.
     """
     if requested == "float32":
-        return None
-    supported = has_tf32(device) if requested == "tf32" else has_bfloat16(device)
+        measured: Precision = "bfloat16"
+        supported = has_bfloat16_instructions(device)
+    else:
+        measured = requested
+        supported = has_tf32(device) if requested == "tf32" else has_bfloat16(device)
     if not all(collectives.all_gather(supported)):
         return None
-    return collectives.broadcast(lambda: convolution_ratio(requested, device))
+    return collectives.broadcast(lambda: convolution_ratio(measured, device))
 
 
 def convolution_ratio(precision: Precision, device: Device) -> float:
-    """Return the ratio of a convolution's time in float32 to its time in another precision."""
-    return _convolution_seconds("float32", device) / _convolution_seconds(precision, device)
+    """Return the ratio of a convolution's time in float32 to its time in another precision.
+
+    On a CPU, one thread is measured: several would wait for each other while other processes use their cores.
+    """
+    threads = torch.get_num_threads()
+    if device == "cpu":
+        torch.set_num_threads(1)
+    try:
+        return _convolution_seconds("float32", device) / _convolution_seconds(precision, device)
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _convolution_seconds(precision: Precision, device: Device) -> float:

@@ -74,8 +74,8 @@ class NetworkFacts:
         rate: Time per pixel.
         fixed: Constant time of a partition tile, measured on one with almost no pixels. On a GPU, it is the time to
             launch its kernels. Not measured, and 0, for a single rank on a CPU.
-        precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision; None if float32
-            was requested, or the requested one is unavailable.
+        precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision, or in bfloat16 if
+            float32 was requested; None if it is unavailable.
         gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
         vector_channels: Length of a vector that is matched with the style's; 0 if nothing is matched.
         deepest: Name of the deepest layer in use.

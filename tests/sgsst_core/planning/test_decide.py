@@ -260,6 +260,14 @@ def test_content_is_left_out_without_weight() -> None:
     ("asked", "ratio", "precision", "text"),
     [
         ("float32", None, "float32", None),
+        ("float32", 1.4, "float32", None),
+        (
+            "float32",
+            1.9,
+            "float32",
+            "features in float32: exact; with --precision bfloat16 (approximate), convolutions are 1.9 times faster "
+            "here",
+        ),
         ("bfloat16", 1.7, "bfloat16", "features in bfloat16: requested, 1.7 times faster here"),
         (
             "bfloat16",

@@ -64,7 +64,29 @@ def test_rounding_is_to_nearest_and_even() -> None:
 def test_convolutions_are_timed_in_available_precisions() -> None:
     assert convolution_ratio("bfloat16", "cpu") > 0
     assert precision_ratio("bfloat16", "cpu", ALONE) is not None
-    assert precision_ratio("float32", "cpu", ALONE) is precision_ratio("tf32", "cpu", ALONE) is None
+    assert precision_ratio("tf32", "cpu", ALONE) is None
+
+
+@pytest.mark.parametrize(("capabilities", "ratio"), [({"avx512_bf16": True}, 3.0), ({"amx_bf16": False}, None)])
+def test_bfloat16_is_measured_beside_float32_unless_emulated(
+    monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], ratio: float | None
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
+    monkeypatch.setattr(module, "convolution_ratio", lambda precision, device: 3.0 * (precision == "bfloat16"))
+    assert precision_ratio("float32", "cpu", ALONE) == ratio
+
+
+def test_one_thread_is_timed_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: list[int] = []
+
+    def time(precision: str, device: str) -> float:
+        threads.append(torch.get_num_threads())
+        return 1.0
+
+    monkeypatch.setattr(module, "_convolution_seconds", time)
+    torch.set_num_threads(2)
+    assert convolution_ratio("bfloat16", "cpu") == 1.0
+    assert (threads, torch.get_num_threads()) == ([1, 1], 2)
 
 
 def test_tf32_needs_every_rank_to_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
