@@ -352,6 +352,9 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
 def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     """Return the settings of a preset with the given values replaced; None keeps the preset's value.
 
+    With fewer steps than the preset's, the learning rate falls only as far as the preset's falls in as many steps:
+    falling to the preset's end, it would stop the colors before they are near the style's.
+
     Raises:
         SettingsError: If the preset is unknown, or a value is out of range.
 
@@ -365,7 +368,12 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     chosen = {name: value for name, value in values.items() if value is not None}
     if "learning_rate" in chosen:  # an explicit learning rate is constant, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])
-    return checked(Settings, {"preset": preset, **_PRESETS[preset], **chosen})
+    whole = _PRESETS[preset]
+    settings = checked(Settings, {"preset": preset, **whole, **chosen})
+    fraction = (settings.steps_coarse + settings.steps_sos) / (whole["steps_coarse"] + whole["steps_sos"])
+    if fraction >= 1 or "learning_rate_end" in chosen:
+        return settings
+    return settings.model_copy(update={"learning_rate_end": settings.learning_rate_at(fraction)})
 
 
 def checked(model: type[M], values: Mapping[str, object]) -> M:
