@@ -67,11 +67,16 @@ def test_convolutions_are_timed_in_available_precisions() -> None:
     assert precision_ratio("tf32", "cpu", ALONE) is None
 
 
-@pytest.mark.parametrize(("capabilities", "ratio"), [({"avx512_bf16": True}, 3.0), ({"amx_bf16": False}, None)])
+@pytest.mark.parametrize(
+    ("capabilities", "ratio"), [({"avx512_bf16": True}, 3.0), ({"amx_bf16": False}, None), (None, None)]
+)
 def test_bfloat16_is_measured_beside_float32_unless_emulated(
-    monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], ratio: float | None
+    monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool] | None, ratio: float | None
 ) -> None:
+    """Without the list of capabilities, as in earlier versions of PyTorch, nothing is measured."""
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
+    if capabilities is None:
+        monkeypatch.delattr(torch.cpu, "get_capabilities")
     monkeypatch.setattr(module, "convolution_ratio", lambda precision, device: 3.0 * (precision == "bfloat16"))
     assert precision_ratio("float32", "cpu", ALONE) == ratio
 
