@@ -77,7 +77,6 @@ CANDIDATES: dict[str, dict[str, Any]] = {
     "background": {"training_background": "background"},
     "paper-scale": {"feature_scale": "paper"},
     "cold": {"warm_start": False},
-    "lr-half": {"learning_rate": 0.1, "learning_rate_end": 0.05},
     "lr-low-end": {"learning_rate_end": 0.02},
     "lr-high-end": {"learning_rate_end": 0.1},
     "two-scales": {"coarsest_side": 160},
@@ -91,6 +90,7 @@ SCANS_ONLY = ("random", "background")
 SCORED = ("style", "interior_style", "sliced_features", "color_distance")
 COLUMNS = (*SCORED, "background_sensitivity", "content")
 LEAST_PAIRS = 2  # that a candidate is chosen on
+_NAMES = [name.replace("_", " ") for name in COLUMNS]
 
 Figures = Mapping[str, float]
 Rows = dict[str, dict[str, float]]
@@ -255,9 +255,9 @@ def left_out(pairs: Mapping[str, Rows]) -> Iterator[tuple[str, str]]:
 
 
 def tables(pairs: Mapping[str, Rows]) -> str:
-    """Return Markdown tables: mean and worst of all pairs, of each candidate's pairs, and of pairs left out."""
+    """Return Markdown tables: each pair; mean and worst of all pairs, and of each candidate's pairs; pairs left out."""
     names = [name for rows in pairs.values() for name in rows]
-    lines = _head("all pairs", "pairs")
+    lines = [*_each_pair(pairs), "", *_head("all pairs", "pairs")]
     for name in dict.fromkeys(names):
         if name not in CANDIDATES:
             lines += _summary(name, [rows[name] for rows in pairs.values() if name in rows])
@@ -281,6 +281,15 @@ def tables(pairs: Mapping[str, Rows]) -> str:
     return "\n".join(lines)
 
 
+def _each_pair(pairs: Mapping[str, Rows]) -> list[str]:
+    """Return a table of the figures before and after stylization with the defaults."""
+    lines = [f"| {' | '.join(['pair', *_NAMES])} |", "|---" * (len(COLUMNS) + 1) + "|"]
+    for pair, rows in pairs.items():
+        cells = zip(_cells(rows[UNSTYLIZED]), _cells(rows[DEFAULT]), strict=True)
+        lines.append(f"| {' | '.join([pair, *(f'{before} → {after}' for before, after in cells)])} |")
+    return lines
+
+
 def _summary(label: str, figures: Sequence[Figures]) -> list[str]:
     rows = []
     for kind, combine in (("mean", fmean), ("worst", max)):
@@ -290,8 +299,7 @@ def _summary(label: str, figures: Sequence[Figures]) -> list[str]:
 
 
 def _head(first: str, second: str) -> list[str]:
-    columns = [name.replace("_", " ") for name in COLUMNS]
-    return [f"| {' | '.join([first, second, *columns])} |", "|---" * (len(COLUMNS) + 2) + "|"]
+    return [f"| {' | '.join([first, second, *_NAMES])} |", "|---" * (len(COLUMNS) + 2) + "|"]
 
 
 def _row(label: str, second: str, figures: Figures) -> str:
