@@ -81,7 +81,7 @@ def test_tools_describe_themselves(service: Service) -> None:
 
 
 def test_scene_is_estimated_stylized_and_blended(service: Service, files: dict[str, str], tmp_path: Path) -> None:
-    inputs = {**files, "style": [files["style"]], "options": {"steps_coarse": 0, "steps_sos": 5}}
+    inputs = {**files, "style": [files["style"]], "options": {"steps_coarse": 0, "steps_sos": 5, "learning_rate": 0.02}}
 
     async def run() -> None:
         async with tools(service.url) as client, AsyncClient(service.url) as direct:
