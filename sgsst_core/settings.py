@@ -138,7 +138,10 @@ class Settings(BaseModel):
         gt=0, le=100, allow_inf_nan=False, description="Learning rate of Adam; constant if given."
     )
     learning_rate_end: Annotated[float, Option(unit="as learning_rate", instead="learning_rate")] = Field(
-        gt=0, le=100, allow_inf_nan=False, description="Final learning rate of Adam, reached by exponential decay."
+        gt=0,
+        le=100,
+        allow_inf_nan=False,
+        description="Final learning rate of Adam, reached by exponential decay; higher by default with fewer steps.",
     )
     content_weight: Annotated[
         float,

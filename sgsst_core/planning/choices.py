@@ -38,11 +38,11 @@ _SCAN = 0.2
 #: Fraction of the color energy that depends on the view direction, from which on attenuating it is recommended: it
 #: then shows beside the style (benchmarks/results/README.md).
 _VIEW_DEPENDENT = 0.05
+#: Default training background for such an object (docs/quality.md).
+_SCAN_BACKGROUND: PlannedBackground = "palette"
 #: Speedup of convolutions from which on bfloat16 is recommended: at 1.9, less of the float32 loss is left than with
 #: float32 after the same seconds, on each of four pairs (docs/performance.md).
 _MUCH_FASTER = 1.5
-#: Default training background for such an object (docs/quality.md).
-_SCAN_BACKGROUND: PlannedBackground = "palette"
 ANOTHER_LOSS = "differs from the paper's loss"
 
 
@@ -350,9 +350,9 @@ def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decisio
     """Choose the network's precision. If float32 was requested, at most recommend bfloat16."""
     requested, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
     chosen = precision_of(requested, ratio)
-    if requested == "float32" and (ratio is None or ratio < _MUCH_FASTER):
-        return chosen, []
     if requested == "float32":
+        if ratio is None or ratio < _MUCH_FASTER:
+            return chosen, []
         reason = f"exact; with --precision bfloat16 (approximate), convolutions are {ratio:.1f} times faster here"
         return chosen, [Decision("precision", "features in float32", reason)]
     if ratio is None:
