@@ -17,13 +17,28 @@ from worker.styles import parse_styles
 if TYPE_CHECKING:
     from worker.request import StylizeRequest
 
-_SCENE: Any = typer.Argument(metavar="SCENE", help=f"3DGS scene: {SUFFIXES}.", show_default=False)
-_CAMERAS: Any = typer.Option(
-    metavar="PATH",
-    help="cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender).",
-)
-SceneArgument = Annotated[Path, _SCENE]
-CamerasOption = Annotated[Path | None, _CAMERAS]
+
+def local_path(text: str) -> Path:
+    """Return the path of a local file.
+
+    Raises:
+        SettingsError: If `text` is a URL.
+    """
+    from api.client.inputs import path_or_url
+
+    path = path_or_url(text)
+    if isinstance(path, str):
+        raise SettingsError(f"{text}: only `sgsst submit` takes URLs. Download the file, and give its path.")
+    return path
+
+
+_SCENE: dict[str, Any] = {"metavar": "SCENE", "help": f"3DGS scene: {SUFFIXES}.", "show_default": False}
+_CAMERAS: dict[str, Any] = {
+    "metavar": "PATH",
+    "help": "cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender).",
+}
+SceneArgument = Annotated[Path, typer.Argument(parser=local_path, **_SCENE)]
+CamerasOption = Annotated[Path | None, typer.Option(parser=local_path, **_CAMERAS)]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -34,7 +49,7 @@ class JobInputs:
     Scene, style and cameras are texts, because `sgsst submit` also accepts URLs, which a `Path` would change.
     """
 
-    scene: Annotated[str, _SCENE]
+    scene: Annotated[str, typer.Argument(**_SCENE)]
     style: Annotated[
         list[str],
         typer.Option(
@@ -43,7 +58,7 @@ class JobInputs:
             show_default=False,
         ),
     ]
-    cameras: Annotated[str | None, _CAMERAS] = None
+    cameras: Annotated[str | None, typer.Option(**_CAMERAS)] = None
     images: Annotated[
         Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
     ] = None
@@ -102,15 +117,13 @@ class JobInputs:
         Raises:
             SettingsError: If options are malformed or contradict each other, or a file is a URL.
         """
-        from api.client.inputs import path_or_url
         from worker.request import SceneRequest, StylizeRequest
 
-        for text in (self.scene, self.cameras or "", *self.style):
-            if isinstance(path_or_url(text), str):
-                raise SettingsError(f"{text}: only `sgsst submit` takes URLs. Download the file, and give its path.")
-
+        for style in self.style:
+            local_path(style)
+        cameras = None if self.cameras is None else local_path(self.cameras)
         return StylizeRequest(
-            source=SceneRequest.of(Path(self.scene), None if self.cameras is None else Path(self.cameras), options),
+            source=SceneRequest.of(local_path(self.scene), cameras, options),
             styles=parse_styles(self.style),
             images=self.images,
             out=out,

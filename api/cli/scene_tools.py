@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from api.cli.arguments import local_path
 from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import load_network_weights
@@ -289,7 +290,7 @@ def blend_files(texts: Sequence[str], out: Path, *, drop_invalid: bool, spz_axes
         InvalidInputError: If the weights, a scene or the output cannot be used.
     """
     names, weights = zip(*map(split_weight, texts), strict=True)
-    paths = [Path(name) for name in names]
+    paths = [local_path(name) for name in names]
     if len(paths) < 2:
         raise SettingsError("There is one scene to blend. Give at least two, such as scene.ply:0.3 stylized.ply:0.7.")
     fractions = normalized(weights)

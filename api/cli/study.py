@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.table import Table
 from torch import Tensor
 
+from api.cli.arguments import local_path
 from sgsst_core.errors import OutputError
 from sgsst_core.files.images import load_image
 from sgsst_core.quality.study import Share, check_names, write_study
@@ -64,7 +65,7 @@ def make_study(
 def _named(text: str) -> tuple[str, Path]:
     """Return the name and the path of a variant, given as NAME=FILE, or as FILE, which is its own name."""
     name, equals, path = text.partition("=")
-    return (name, Path(path)) if equals and not Path(text).exists() else (text, Path(text))
+    return (name, local_path(path)) if equals and not Path(text).exists() else (text, local_path(text))
 
 
 def _render(source: SceneRequest, cameras: Sequence[Camera], background: tuple[float, float, float]) -> list[Tensor]:

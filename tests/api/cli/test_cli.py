@@ -1265,6 +1265,24 @@ def test_urls_are_refused_unchanged(files: Files, role: str, capsys: pytest.Capt
     assert not files.out.parent.exists()
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["check", "{url}", "--orbit", "2"],
+        ["render", "{url}", "--orbit", "2", "--out", "renders"],
+        ["render", "scene.ply", "--cameras", "{url}", "--out", "renders"],
+        ["convert", "{url}", "scene.spz"],
+        ["blend", "{url}:0.3", "scene.ply:0.7", "--out", "blend.ply"],
+        ["study", "make", "a={url}", "b.ply", "--orbit", "2", "--style", "style.jpg", "--out", "study.html"],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_commands_for_files_name_a_url_unchanged(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    url = "https://files.example.com/scene.ply"
+    assert main([each.format(url=url) for each in arguments]) == 2
+    assert f"{url}: only `sgsst submit` takes URLs" in capsys.readouterr().err
+
+
 def test_error_is_one_line_on_stderr(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "api.cli", "render", "missing.ply", "--orbit", "2", "--out", "renders"]
