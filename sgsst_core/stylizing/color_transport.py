@@ -49,17 +49,26 @@ def transported(colors: Tensor, weights: Tensor, wanted: Tensor) -> Tensor:
         [N, 3] float64.
     """
     start = colors.clamp(-_FARTHEST, _FARTHEST)
-    rounds = _rounds(start[_drawn(weights)], wanted)
+    drawn, counts = _drawn(weights)
+    rounds = _rounds(start[drawn], counts, wanted)
     return _through(start, rounds) if start.is_cuda else _through_compiled(start, rounds)
 
 
-def _rounds(source: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
-    """Return the axes [3, 3] of each round and the maps along them, given samples [n, 3] of both distributions."""
+def _rounds(source: Tensor, counts: Tensor, wanted: Tensor) -> list[tuple[Tensor, list[_Map]]]:
+    """Return the axes [3, 3] of each round and the maps along them.
+
+    Args:
+        source: [n, 3] samples of the colors.
+        counts: [n] integer, how many times each of them was drawn.
+        wanted: [m, 3] samples of the other distribution.
+    """
+    once = torch.ones_like(wanted[:, 0], dtype=counts.dtype)
     rounds: list[tuple[Tensor, list[_Map]]] = []
     for axes in _round_axes():
         axes = axes.to(source.device)
         along = zip((source @ axes).unbind(1), (wanted @ axes).unbind(1), strict=True)
-        rounds.append((axes, [_along(values, others) for values, others in along]))
+        maps = [_along(_quantiles(values, counts), _quantiles(others, once)) for values, others in along]
+        rounds.append((axes, maps))
         source = _through(source, rounds[-1:])
     return rounds
 
@@ -88,14 +97,19 @@ def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]
     return moved
 
 
-def _drawn(weights: Tensor) -> Tensor:
-    """Return indices [_SAMPLES] of colors, sampled in proportion to their weights.
+def _drawn(weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample _SAMPLES colors in proportion to their weights.
 
     Samples are taken at equal steps of the cumulative weights.
+
+    Returns:
+        Indices [n] of the different samples, and how many times [n] each was drawn: few for a small scene.
     """
     running = weights.cumsum(0)
     steps = (torch.arange(_SAMPLES, dtype=running.dtype, device=running.device) + 0.5) * (running[-1] / _SAMPLES)
-    return torch.searchsorted(running, steps).clamp_max(len(weights) - 1)
+    drawn = torch.searchsorted(running, steps).clamp_max(len(weights) - 1)
+    indices, counts = torch.unique_consecutive(drawn, return_counts=True)
+    return indices, counts
 
 
 def _round_axes() -> Iterator[Tensor]:
@@ -109,12 +123,11 @@ def _round_axes() -> Iterator[Tensor]:
         yield unit_rotations(torch.tensor(quat, dtype=torch.float64))
 
 
-def _along(values: Tensor, wanted: Tensor) -> _Map:
-    """Return the transport along one axis that maps values [n] to the distribution of `wanted` values [m].
+def _along(knots: Tensor, targets: Tensor) -> _Map:
+    """Return the transport along one axis that maps a distribution to another, given their quantiles [_KNOTS].
 
     Equal values map to the mean of all their targets.
     """
-    knots, targets = _quantiles(values), _quantiles(wanted)
     apart = torch.diff(knots, prepend=knots[:1] - 1) > _APART
     group = apart.cumsum(0) - 1
     counts = torch.bincount(group).to(knots)
@@ -122,11 +135,12 @@ def _along(values: Tensor, wanted: Tensor) -> _Map:
     return next(sums) / counts, next(sums) / counts
 
 
-def _quantiles(values: Tensor) -> Tensor:
-    """Return [_KNOTS] quantiles of values [n], from the minimum to the maximum."""
-    ordered = values.sort().values
-    positions = torch.linspace(0, len(ordered) - 1, _KNOTS, dtype=torch.float64, device=values.device)
-    return ordered[positions.round().long()]
+def _quantiles(values: Tensor, counts: Tensor) -> Tensor:
+    """Return [_KNOTS] quantiles of values [n] that each occur some number of times [n], from minimum to maximum."""
+    ordered, order = values.sort()
+    ends = counts[order].cumsum(0)
+    positions = torch.linspace(0, int(ends[-1]) - 1, _KNOTS, dtype=torch.float64, device=values.device)
+    return ordered[torch.searchsorted(ends, positions.round().long(), right=True)]
 
 
 def _mapped(values: Tensor, knots: Tensor, targets: Tensor) -> Tensor:
