@@ -31,8 +31,8 @@ from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import wall, write_files
 
-#: Enough steps to be killed during a job, and few enough for a test.
-STEPS = 600
+#: Enough steps to be killed during a job, and enough to see a job run.
+STEPS, FEW_STEPS = 600, 150
 PARAMETERS = {"preset": "standard", "steps_sos": STEPS, "backbone": "vgg16", "early_stop": False, "seed": 3}
 
 
@@ -51,12 +51,15 @@ def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> I
 @pytest.fixture(scope="module")
 def expected(files: dict[str, Path], service: Service, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Return the result of `sgsst stylize` for the same files and settings."""
-    out = tmp_path_factory.mktemp("cli") / "stylized.ply"
+    return stylized(files, service, tmp_path_factory.mktemp("cli"), STEPS)
+
+
+def stylized(files: dict[str, Path], service: Service, folder: Path, steps: int) -> bytes:
     command = [sys.executable, "-m", "api.cli", "stylize", str(files["scene"]), "--style", str(files["style"])]
-    command += ["--cameras", str(files["cameras"]), "--steps-sos", str(STEPS), "--no-early-stop", "--seed", "3"]
-    command += ["--backbone", "vgg16", "--out", str(out)]
+    command += ["--cameras", str(files["cameras"]), "--steps-sos", str(steps), "--no-early-stop", "--seed", "3"]
+    command += ["--backbone", "vgg16", "--out", str(folder / "stylized.ply")]
     subprocess.run(command, check=True, env=service.environment, cwd=ROOT, stdout=subprocess.DEVNULL)
-    return out.read_bytes()
+    return (folder / "stylized.ply").read_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -139,16 +142,16 @@ def check_course(client: httpx.Client, job_id: str, steps: list[int]) -> None:
     points = client.get(f"/v1/jobs/{job_id}/progress").json()["points"]
     assert {point["step"] for point in points} <= set(steps)
     assert points[0]["step"] == next(step for step in steps if step > 0)
-    assert points[-1]["step"] == STEPS
+    assert points[-1]["step"] == steps[-1]
     assert points[-1]["loss"] < points[0]["loss"]
     for point in points:
         seen = [loss for loss in point["scales"] if loss is not None]
         assert np.isclose(np.mean(seen), point["loss"]), "all scales count alike"
 
 
-def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], expected: bytes) -> None:
+def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], tmp_path: Path) -> None:
     with service.client() as client:
-        job_id = submit(client, files, name="my wall")
+        job_id = submit(client, files, name="my wall", steps_sos=FEW_STEPS)
         seen = events(client, job_id)  # returns when the job has ended
         kinds = [(kind, data.get("status") or data.get("name")) for _, kind, data in seen]
         statuses = [what for kind, what in kinds if kind == "status"]
@@ -162,7 +165,7 @@ def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], ex
         assert all(0 <= data["step"] <= data["total"] == 3 for data in progress if data["stage"] == "planning")
         assert all(datetime.fromisoformat(data["updated_at"]).tzinfo for _, kind, data in seen if kind == "progress")
         assert steps == sorted(steps)
-        assert steps[-1] == STEPS
+        assert steps[-1] == FEW_STEPS
         middle = seen[len(seen) // 2][0]
         assert events(client, job_id, after=middle) == [event for event in seen if event[0] > middle]
         assert events(client, job_id, after=seen[-1][0]) == []
@@ -188,7 +191,7 @@ def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], ex
             assert str(service.data).encode() not in content.content, (
                 f"{entry['name']} tells where the service's data is"
             )
-        assert result(client, job_id) == expected
+        assert result(client, job_id) == stylized(files, service, tmp_path, FEW_STEPS)
     modes = {path: status.st_mode for path, status in service.stored().items() if stat.S_ISREG(status.st_mode)}
     assert not [path for path, mode in modes.items() if mode & 0o077]
 
