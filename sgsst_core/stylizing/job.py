@@ -282,9 +282,9 @@ def prepare_job(
         RankLeftOut: If the job continues without this rank.
     """
     weights = weights_for(weights, settings)
-    blend_weights = plan.survey.total_blend_weights
-    regions = regions and regions.resolved(blend_weights)
-    styles = JobStyles.prepared(Style.of(style), regions, settings, scene.sh_dc, blend_weights)
+    attenuated = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
+    fitted = fit_cameras(cameras, settings)
+    styles = _job_styles(plan, scene, fitted, style, settings, regions)
     forget_device_peak(plan.device)
     network = (
         planning_context.network if planning_context else make_network(weights, settings, plan.precision, plan.device)
@@ -300,41 +300,12 @@ def prepare_job(
         timer=Timer(plan.device),
         collectives=team.group,
     )
-    attenuated = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
     rendered = attenuated if plan.seen.all() else attenuated.subset(plan.seen)
     rendered = rendered if "sh" in settings.keep else rendered.without_zero_bands()
     rasterizer = _make_rasterizer(plan, settings, rendered, memory, planning_context)
     if team.group.size > 1:  # the survey's tile intersections are those of whole views
         rasterizer.forget_views()
-    fitted = fit_cameras(cameras, settings)
-    if settings.stroke_depth:
-        level = mean_level(attenuated.means, blend_weights, [fitted[index] for index in plan.covered])
-        styles = replace(styles, bands=band_count(fitted, settings), mean_level=level)
-    regions_seen = plan.survey.regions if plan.weighted else None
-    views = Views(
-        rendered,
-        fitted,
-        rasterizer,
-        covered=list(plan.covered),
-        memory=view_memory(plan, memory),
-        clamp_aware_gradient=settings.clamp_aware_gradient,
-        regions=regions_seen,
-        divider=loss.divider,
-        timer=loss.timer,
-    )
-    view_targets = ViewTargets(
-        views,
-        loss,
-        weighted=plan.weighted,
-        photos=photos,
-        memory=view_memory(plan, memory),
-        cache_content="content" not in settings.keep,
-        regions=regions_seen,
-        background=settings.background,
-        drawn=plan.training_background != "background",
-        maps=styles.maps(rasterizer.repeatable, plan.seen),
-        content_maps=styles.content_maps(rasterizer.repeatable, plan.seen),
-    )
+    views = _make_views(plan, settings, rendered, fitted, rasterizer, loss, memory)
     return StylizationJob(
         plan=plan,
         settings=settings,
@@ -346,11 +317,78 @@ def prepare_job(
         loss=loss,
         graphs=LossGraphs(loss) if plan.graphs and team.group.size == 1 else None,
         views=views,
-        view_targets=view_targets,
+        view_targets=_make_view_targets(plan, settings, styles, views, loss, memory, photos),
         team=team,
         memory_limit=memory_limit,
         memory=memory,
         style_targets=StyleTargetCache(styles.to(network.device), loss),
+    )
+
+
+def _job_styles(
+    plan: Plan,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Tensor | Style,
+    settings: Settings,
+    regions: Regions | None,
+) -> JobStyles:
+    """Return the styles of a job, in depth bands if the settings say so."""
+    blend_weights = plan.survey.total_blend_weights
+    regions = regions and regions.resolved(blend_weights)
+    styles = JobStyles.prepared(Style.of(style), regions, settings, scene.sh_dc, blend_weights)
+    if not settings.stroke_depth:
+        return styles
+    level = mean_level(scene.means, blend_weights, [cameras[index] for index in plan.covered])
+    return replace(styles, bands=band_count(cameras, settings), mean_level=level)
+
+
+def _make_views(
+    plan: Plan,
+    settings: Settings,
+    rendered: Scene,
+    cameras: list[Camera],
+    rasterizer: Rasterizer,
+    loss: SosLoss,
+    memory: int,
+) -> Views:
+    """Return the views of the rendered Gaussians."""
+    return Views(
+        rendered,
+        cameras,
+        rasterizer,
+        covered=list(plan.covered),
+        memory=view_memory(plan, memory),
+        clamp_aware_gradient=settings.clamp_aware_gradient,
+        regions=plan.survey.regions if plan.weighted else None,
+        divider=loss.divider,
+        timer=loss.timer,
+    )
+
+
+def _make_view_targets(
+    plan: Plan,
+    settings: Settings,
+    styles: JobStyles,
+    views: Views,
+    loss: SosLoss,
+    memory: int,
+    photos: PhotoLoader | None,
+) -> ViewTargets:
+    """Return the targets of the views: content, and maps of regions and content weights."""
+    repeatable = views.rasterizer.repeatable
+    return ViewTargets(
+        views,
+        loss,
+        weighted=plan.weighted,
+        photos=photos,
+        memory=view_memory(plan, memory),
+        cache_content="content" not in settings.keep,
+        regions=plan.survey.regions if plan.weighted else None,
+        background=settings.background,
+        drawn=plan.training_background != "background",
+        maps=styles.maps(repeatable, plan.seen),
+        content_maps=styles.content_maps(repeatable, plan.seen),
     )
 
 
