@@ -33,7 +33,7 @@ def _map(values, positions, knots, targets, slopes):
 
 
 @compiled(parallel=True)
-def through(colors, axes, knots, targets):
+def through(colors, axes, knots, targets, slopes):
     """Transform colors by all rounds, in place.
 
     Args:
@@ -41,9 +41,8 @@ def through(colors, axes, knots, targets):
         axes: [r, 3, 3], axes of each round as columns.
         knots: [r, 3, k] with k a power of 2, ascending: knots of each axis' map. Unused knots are infinite.
         targets: [r, 3, k], values at the knots; for unused knots, the last value.
+        slopes: [r, 3, k], slopes between each knot and the next one.
     """
-    slopes = np.zeros_like(knots)
-    slopes[..., :-1] = (targets[..., 1:] - targets[..., :-1]) / (knots[..., 1:] - knots[..., :-1])
     parts = (len(colors) + _TOGETHER - 1) // _TOGETHER
     for part in numba.prange(parts):
         some = colors[part * _TOGETHER : (part + 1) * _TOGETHER]
