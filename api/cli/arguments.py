@@ -39,6 +39,9 @@ _CAMERAS: dict[str, Any] = {
 }
 SceneArgument = Annotated[Path, typer.Argument(parser=local_path, **_SCENE)]
 CamerasOption = Annotated[Path | None, typer.Option(parser=local_path, **_CAMERAS)]
+_STYLE: Any = typer.Option(parser=local_path, metavar="PATH", help="Style image.", show_default=False)
+StyleOption = Annotated[Path, _STYLE]
+OptionalStyleOption = Annotated[Path | None, _STYLE]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 

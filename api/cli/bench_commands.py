@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from api.cli.arguments import CamerasOption, SceneArgument
+from api.cli.arguments import CamerasOption, SceneArgument, StyleOption
 from api.cli.console import FAILURE, error_console, out_console, print_field
 from api.cli.options import with_arguments, with_options
 from worker.options import StylizeOptions, ViewOptions
@@ -32,7 +32,7 @@ class VariantsInputs:
     """Arguments of a command that compares variants; see `with_arguments`."""
 
     scene: SceneArgument
-    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)]
+    style: StyleOption
     cameras: CamerasOption = None
     seconds: Annotated[float, typer.Option(min=1, max=1e6, help="Seconds of optimization per variant.")] = 300.0
 

@@ -12,7 +12,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
-from api.cli.arguments import CamerasOption, JobInputs, SceneArgument
+from api.cli.arguments import CamerasOption, JobInputs, OptionalStyleOption, SceneArgument, local_path
 from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import SettingsError
@@ -72,7 +72,7 @@ def _decisions_table(plan: Plan) -> Table:
 def check(
     scene: SceneArgument,
     cameras: CamerasOption = None,
-    style: Annotated[Path | None, typer.Option(help="Style image.")] = None,
+    style: OptionalStyleOption = None,
     *,
     options: ViewOptions,
 ) -> None:
@@ -107,7 +107,10 @@ def render(
     ] = None,
     cameras: CamerasOption = None,
     compare: Annotated[
-        Path | None, typer.Option(help="Unstylized scene: the video starts with it and ends with SCENE.")
+        Path | None,
+        typer.Option(
+            parser=local_path, metavar="PATH", help="Unstylized scene: the video starts with it and ends with SCENE."
+        ),
     ] = None,
     transparent: Annotated[
         bool, typer.Option("--transparent", help="Write an alpha channel, to a .webm file or PNG images of a video.")
@@ -191,7 +194,11 @@ def convert(
     ] = False,
     cameras: Annotated[
         Path | None,
-        typer.Option(help="Cameras that --compare renders, and that decide the axes of an SPZ. [default: an orbit]"),
+        typer.Option(
+            parser=local_path,
+            metavar="PATH",
+            help="Cameras that --compare renders, and that decide the axes of an SPZ. [default: an orbit]",
+        ),
     ] = None,
     *,
     options: ViewOptions,

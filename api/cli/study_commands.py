@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.arguments import CamerasOption
+from api.cli.arguments import CamerasOption, StyleOption
 from api.cli.console import out_console, print_field, spinner
 from api.cli.options import with_options
 from worker.options import StylizeOptions, ViewOptions
@@ -26,7 +26,7 @@ def make(
         list[str],
         typer.Argument(metavar="[NAME=]SCENE...", help="Two to four scenes to compare.", show_default=False),
     ],
-    style: Annotated[Path, typer.Option(help="Style image.", show_default=False)],
+    style: StyleOption,
     out: Annotated[Path, typer.Option(help="HTML page to write.")] = Path("study.html"),
     cameras: CamerasOption = None,
     *,

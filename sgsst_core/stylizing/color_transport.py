@@ -90,7 +90,7 @@ def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]
             knots[number, axis, : len(positions)] = positions
             targets[number, axis] = become[-1]
             targets[number, axis, : len(become)] = become
-    slopes = torch.zeros_like(knots)  # computed here, because Numba takes three seconds to compile this line
+    slopes = torch.zeros_like(knots)  # computed here, because Numba takes long to compile this line
     slopes[..., :-1] = targets.diff() / knots.diff()
     axes = torch.stack([axes.contiguous() for axes, _ in rounds])
     moved = colors.clone(memory_format=torch.contiguous_format)
