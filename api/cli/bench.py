@@ -11,7 +11,7 @@ import torch
 from rich.table import Column, Table
 from torch import Tensor
 
-from sgsst_core.bench.error_time import Curve, Point, Variant, as_dict, choose_variants, error_time, write_plot
+from sgsst_core.bench.error_time import Curve, Variant, as_dict, choose_variants, error_time, write_plot
 from sgsst_core.bench.quality import Quality, compare_quality, write_sheet
 from sgsst_core.bench.quality import write_plot as write_quality_plot
 from sgsst_core.bench.stability import Case, Measurement, all_cases, measure
@@ -104,15 +104,28 @@ class _Inputs:
 def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     """Run the variants, and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
 
+    The JSON file is written after each evaluation, so that an interrupted run leaves what it has measured.
+
     Args:
-        progress: Callback that receives the variant and the `Point` of each evaluation.
+        progress: Callback that receives a curve after each of its evaluations.
 
     Raises:
         InvalidInputError: If an input cannot be used; the first one is reported.
     """
     inputs = _Inputs.of(request)
-    curves = inputs.run(error_time, request, progress)
-    write_json(request.out / "error_time.json", {**inputs.as_dict(request), **as_dict(curves)})
+    described = inputs.as_dict(request)
+    measured: dict[str, Curve] = {}
+
+    def write(curves: Sequence[Curve]) -> None:
+        write_json(request.out / "error_time.json", {**described, **as_dict(curves)})
+
+    def evaluated(curve: Curve) -> None:
+        measured[curve.variant.name] = curve
+        write(list(measured.values()))
+        progress(curve)
+
+    curves = inputs.run(error_time, request, evaluated)
+    write(curves)
     write_plot(request.out / "error_time.png", curves, request.title)
     for curve in curves:
         if curve.sh_dc is not None:
@@ -124,7 +137,7 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
     """Run the variants, measure their quality, and write `quality.json`, plots, `quality.jpg` and scenes.
 
     Args:
-        progress: Callback that receives the variant and the `Point` of each evaluation.
+        progress: Callback that receives a curve after each of its evaluations.
 
     Raises:
         InvalidInputError: If an input cannot be used; the first one is reported.
@@ -203,9 +216,10 @@ def error_time_table(curves: Sequence[Curve]) -> Table:
     return table
 
 
-def point_line(variant: Variant, point: Point) -> str:
-    """Return one evaluation as a line for a log."""
-    return f"{variant.name}: {point.relative:.2%} of the loss remains after {point.seconds:.1f} s, {point.step} steps"
+def point_line(curve: Curve) -> str:
+    """Return the last evaluation of a curve as a line for a log."""
+    name, point = curve.variant.name, curve.points[-1]
+    return f"{name}: {point.relative:.2%} of the loss remains after {point.seconds:.1f} s, {point.step} steps"
 
 
 def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> list[tuple[Case, Measurement]]:

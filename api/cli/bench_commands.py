@@ -63,7 +63,7 @@ def error_time(
     from api.cli.bench import error_time_table, point_line, run_error_time
 
     request = inputs.request(options, chosen, variants, out)
-    curves = run_error_time(request, lambda variant, point: error_console.print(point_line(variant, point)))
+    curves = run_error_time(request, lambda curve: error_console.print(point_line(curve)))
     Console(width=_TABLE_WIDTH).print(error_time_table(curves))
     _print_skipped_variants(curves, out)
 
@@ -86,7 +86,7 @@ def quality(
     from api.cli.bench import point_line, quality_table, run_quality
 
     request = inputs.request(options, chosen, variants, out)
-    quality = run_quality(request, lambda variant, point: error_console.print(point_line(variant, point)))
+    quality = run_quality(request, lambda curve: error_console.print(point_line(curve)))
     Console(width=_TABLE_WIDTH).print(quality_table(quality))
     _print_skipped_variants(quality.curves, out)
 

@@ -163,7 +163,7 @@ def error_time(
     seconds: float,
     *,
     weights: BackboneWeights | None = None,
-    progress: Callable[[Variant, Point], None] = lambda variant, point: None,
+    progress: Callable[[Curve], None] = lambda curve: None,
     **settings: Any,
 ) -> list[Curve]:
     """Run variants on one scene, each with the same time budget or until its last step.
@@ -175,7 +175,7 @@ def error_time(
         variants: Variants to run.
         seconds: Seconds of optimization per variant.
         weights: Weights of the feature network; None loads the default ones.
-        progress: Function called after each evaluation.
+        progress: Function called after each evaluation, with the curve so far.
         settings: Settings for all variants that override the standard preset.
     """
     base = make_settings("standard", **settings)
@@ -205,7 +205,7 @@ def error_time(
             if part in MOMENTS:
                 last = curve.points[-1] if curve.points else None
                 curve.points.append(last if last and last.step == stylizer.step else evaluated(stylizer))
-                progress(curve.variant, curve.points[-1])
+                progress(curve)
     return [replace(curve, sh_dc=stylizer.stylized() if stylizer else None) for curve, stylizer in running]
 
 

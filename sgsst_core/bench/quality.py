@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.bench.error_time import Curve, Point, Variant, error_time
+from sgsst_core.bench.error_time import Curve, Variant, error_time
 from sgsst_core.bench.error_time import as_dict as curves_as_dict
 from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.errors import SettingsError, WeightsError
@@ -129,7 +129,7 @@ def compare_quality(
     seconds: float,
     *,
     weights: BackboneWeights | None = None,
-    progress: Callable[[Variant, Point], None] = lambda variant, point: None,
+    progress: Callable[[Curve], None] = lambda curve: None,
     **settings: Any,
 ) -> Quality:
     """Run variants on one scene, each with the same time budget, and judge the results.
@@ -141,7 +141,7 @@ def compare_quality(
         variants: Variants to run.
         seconds: Seconds of optimization per variant.
         weights: Weights of the feature network; None loads the default ones.
-        progress: Function called after each evaluation of the loss.
+        progress: Function called after each evaluation of the loss, with the curve so far.
         settings: Settings for all variants that override the standard preset.
 
     Raises:

@@ -15,6 +15,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from plyfile import PlyData
 
 from api.cli.main import main
 from api.cli.scene_tools import view_file_names
+from sgsst_core.bench.error_time import Curve
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
 from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
@@ -491,6 +493,21 @@ def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pyt
     values = json.loads((folder / "error_time.json").read_text())
     assert len(values["variants"]["standard"]["points"]) == 6
     assert len(read_scene(folder / "standard.ply").scene) == len(wall())
+
+
+@pytest.mark.slow
+def test_interrupted_bench_error_time_leaves_its_measurements(files: Files, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(curve: Curve) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("api.cli.bench.point_line", interrupt)
+    folder = files.out.with_name("bench")
+    command = ["bench", "error-time", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
+    command += ["--backbone", "vgg16", "--out", str(folder), "--coarsest-side", "24"]
+    with suppress(KeyboardInterrupt, SystemExit):
+        main([*command, "--seconds", "2", "--variants", "standard,coarse-only"])
+    values = json.loads((folder / "error_time.json").read_text())
+    assert [len(variant["points"]) for variant in values["variants"].values()] == [1]
 
 
 @pytest.mark.slow
