@@ -1,4 +1,4 @@
-"""Permissions of the service's files: only the user who runs the service can read them."""
+"""Permissions of the service's files: only the OS user of the service can read them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines of a plan."""
+"""Decisions of a plan, with their reasons."""
 
 from __future__ import annotations
 

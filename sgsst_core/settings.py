@@ -303,7 +303,7 @@ class Settings(BaseModel):
     measure: Annotated[Fraction, Option(unit="fraction of the steps' time", metavar="S")] = Field(
         0.1,
         description="Measure novel views, which lie between the cameras, for S of the steps' predicted time, or 30 s "
-        "if that is more; 0 measures none.",
+        "if that is more; 0 measures no novel views.",
     )
 
     @property

@@ -138,7 +138,7 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
 
 
 def about_rendering(file: SceneFile) -> list[Decision]:
-    """Return the lines about a render mode other than classic, and about doubtful statements in the file."""
+    """Return decisions about a non-classic render mode, and warnings about unreliable tags in the file."""
     tag, rendering = file.tag, file.scene.rendering
     lines = []
     if rendering != tag.rendering:

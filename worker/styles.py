@@ -51,7 +51,7 @@ def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> Styl
     file, weight = split_weight(text, exists)
     if not (math.isfinite(weight) and weight > 0):
         given = text.rpartition(":")[2]
-        raise SettingsError(f"Style image {text}: the weight {given} is not a finite number greater than 0. Give one.")
+        raise SettingsError(f"Style image {text}: the weight must be a finite number above 0, not {given}.")
     return StyleFile(Path(file), weight)
 
 

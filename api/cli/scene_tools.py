@@ -255,7 +255,7 @@ def _check_target(out: Path, compare: bool) -> None:
 
 
 def _about_lost_mode(out: Path, scene: Scene) -> list[Decision]:
-    """Return the line about a render mode that the format of a written file cannot state."""
+    """Return a warning if the format of the written file cannot record the scene's render mode."""
     stated = CLASSIC if out.suffix.lower() in USD_SUFFIXES else read_scene_header(out).tag.rendering
     if stated == scene.rendering:
         return []

@@ -1,4 +1,4 @@
-"""State of one download. It creates the headers of the request and handles the response, but does not send anything."""
+"""Protocol of one download: request headers and handling of the response. The transport does the sending."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ async def get_caller(
 
 
 def _caller(context: Context, key: KeyRow) -> Caller:
-    """Count a request against the key's rate, and return the key's owner."""
+    """Count a request against the key's rate limit, and return its caller."""
     quotas = Quotas.of_settings(context.settings).with_own(key.quotas)
     context.rates.take(key.id, quotas.requests_a_second)
     return Caller(key.id, key.priority, quotas)

@@ -143,7 +143,7 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
 
 
 async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncIterator[bytes]:
-    """Yield a body of files in large blocks, because each block costs a switch to another thread and back.
+    """Yield a body in large blocks, because writing each block costs two thread switches.
 
     Raises:
         ServiceError: Same errors as `body_parts`.

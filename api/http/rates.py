@@ -22,7 +22,7 @@ class Rates:
         self._left: dict[str, tuple[float, float]] = {}
 
     def take(self, owner: str, a_second: float | None) -> None:
-        """Count a request.
+        """Take one token from the owner's bucket.
 
         Args:
             owner: Owner of the request's key.

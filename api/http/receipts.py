@@ -30,11 +30,11 @@ class Receipts:
         self._renewing: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Start the renewing task."""
+        """Start the renewal task."""
         self._renewing = asyncio.create_task(self._renew())
 
     def close(self) -> None:
-        """Stop the renewing task."""
+        """Stop the renewal task."""
         if self._renewing is not None:
             self._renewing.cancel()
 

@@ -427,7 +427,7 @@ class JobChange(BaseModel):
 
 
 class NewShare(BaseModel):
-    """A link to the result of a job to be created."""
+    """Share link to create for the result of a job."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"days": 7}]})
 
@@ -486,7 +486,7 @@ _RENDERED = ("background", "near", "render_mode", "eps2d", "sh_attenuation")
 
 
 def shared_view(job: JobRow, expires_at: float, artifacts: Sequence[str]) -> SharedView:
-    """Return the view of a shared job, without anything that its viewer does not need.
+    """Return the public view of a shared job: only what the page needs to show it.
 
     Args:
         artifacts: Names of the job's artifacts.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 from weakref import WeakValueDictionary
 
-#: Maximum number of threads that one owner occupies at once, mostly to wait for the disk.
+#: Maximum number of threads per owner. Threads mostly wait for the disk.
 _OF_AN_OWNER = 2
 
 Arguments = ParamSpec("Arguments")

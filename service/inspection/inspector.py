@@ -130,9 +130,9 @@ class InspectionProcess:
                 show(answer["planning"])
             return None
         except (OSError, ValueError):
-            await self.close()  # further output must not be taken for a response to a later request
+            await self.close()  # further output must not be read as the response to a later request
             return None
-        except asyncio.CancelledError:  # the pending response would be taken for that to the next request
+        except asyncio.CancelledError:  # else the pending response would be read as that of the next request
             await self.close()
             raise
         finally:

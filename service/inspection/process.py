@@ -86,7 +86,7 @@ MAX_ANSWER = 64 << 20
 MAX_REPORTS = 10_000
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
-#: Rounding error of 1 minus weights that are rounded to thousandths.
+#: Remaining weight (1 minus the sum of weights) up to which it counts as zero, because floats are rounded.
 _ROUNDING = 1e-6
 
 
@@ -457,7 +457,7 @@ def _run_child(request: dict[str, Any], writing: int) -> NoReturn:
         if request["threads"] > 1:  # the parent has no other threads, which a fork would not copy
             torch.set_num_threads(request["threads"])
         _prefer_oom_kill()
-        # threads that wait for each other use CPU time too
+        # RLIMIT_CPU counts all threads, even those that spin
         _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _memory_besides_reading(request))
         with os.fdopen(writing, "w") as file:
 

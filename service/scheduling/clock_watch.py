@@ -37,7 +37,7 @@ class ClockWatch:
         self._compared_at: float | None = None
 
     def is_lost(self, job: JobRow) -> bool:
-        """Return whether a job whose lease has expired by the database's times may be taken over."""
+        """Return whether an expired lease is lost, and remember when its expiry was first seen."""
         expires, database = job.lease_expires_at, self._store.database
         if expires is None or expires == EXPIRED:
             return True

@@ -129,7 +129,7 @@ def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
 
 
 def count_gpu_seconds(session: Session, owner: str, seconds: float, now: float) -> None:
-    """Count the GPU seconds of an attempt."""
+    """Add an attempt's GPU seconds to its owner's usage of the day."""
     insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=0, gpu_seconds=seconds)
     added = _USAGE.c.gpu_seconds + insert.excluded.gpu_seconds
     session.execute(insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"gpu_seconds": added}))

@@ -150,7 +150,7 @@ def blocks_of(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
 
 
 def _shift(features: Tensor, position_weights: Tensor | None) -> Tensor:
-    """Return a shift [c] near the mean: the mean of some positions, in float32 or float64.
+    """Return an offset [c] to subtract before accumulating: the mean of a few positions, in float32 or float64.
 
     If any of these positions has a positive weight, only positions of positive weight are used. For a constant channel,
     the shift is exactly that constant.

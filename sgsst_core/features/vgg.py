@@ -456,7 +456,7 @@ def _try_fusing(step: _Convolution) -> None:
 def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     """Return the result of the fused convolution; None if cuDNN fails or disagrees with the separate operations.
 
-    PyTorch gives cuDNN the uninitialized output as a summand with factor 0. An algorithm that multiplies instead of
+    PyTorch passes the uninitialized output to cuDNN as an addend with factor 0. An algorithm that multiplies instead of
     skipping it would return NaN whenever the memory happens to contain NaN, so the trial puts NaN there.
     """
     expected = F.conv2d(x, step.weight, step.bias, padding=1).relu_()

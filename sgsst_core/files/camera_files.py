@@ -249,7 +249,7 @@ def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
         return lambda pose: pose
     values = _load_json(dataparser)
     if not isinstance(values, dict):
-        raise CameraError(f"{dataparser}: is not what nerfstudio writes ('transform' and 'scale'). Copy it again.")
+        raise CameraError(f"{dataparser}: needs a JSON object with `transform` and `scale`. Copy it again.")
     applied, stored = np.eye(4), np.eye(4)
     stored[:3] = _array(str(dataparser), values, "transform", (3, 4))
     if "applied_transform" in content:

@@ -32,13 +32,13 @@ from sgsst_core.scene.stored_harmonics import changed
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
     """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
 
-    A color keeps its bytes too if its float32 value does not change. The rest of the file changes in four cases:
+    A color keeps its bytes too if its float32 value does not change. The rest of the file changes in these cases:
 
     - With an SH attenuation, f_rest_* change.
     - Colors of 8 bits in red, green and blue, for programs that show only points, become those of f_dc_*.
     - Dropped rows are absent, and the count in the header is adjusted.
     - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
-    - If another render mode was requested than the file states, comments of the header state it.
+    - If the requested render mode differs from the file's, it is written to comments of the header.
 
     A scene in another format is written as a PLY by `encode_scene`.
 

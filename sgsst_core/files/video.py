@@ -137,7 +137,7 @@ def encoder(
 
 @contextmanager
 def _image_sequence(folder: Path, name: str) -> Iterator[Callable[[VideoFrame], None]]:
-    """Yield a function that writes images into a temporary folder, from which they move at the end of the block."""
+    """Yield a function that writes images to a temporary folder; they are moved to `folder` when the block ends."""
     new = not folder.exists()
     ensure_writable_folder(folder)
     temporary = Path(tempfile.mkdtemp(prefix=".sgsst-", dir=folder))

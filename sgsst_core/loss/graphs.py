@@ -214,7 +214,7 @@ class LossGraphs:
         return _Graph(graph, static_image, static_view, SosResult(result.scales, values, gradient, result.weights))
 
     def _static_inputs(self, key: _Key, image: Tensor, view: ViewTarget) -> tuple[Tensor, ViewTarget]:
-        """Return static tensors in the formats of an image and of its view's targets; their values are not set."""
+        """Return uninitialized static tensors that match an image and its view's targets in shape, layout and dtype."""
         content = {
             scale: {tile: self._static_tensor(("content", scale), view.content[scale][tile])}
             for scale, tile in key.tiles

@@ -113,6 +113,6 @@ def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: 
     for name, count in counts.items():
         if not requested.chosen(count):
             raise SettingsError(
-                f"--scales leaves view {name!r} nothing: it has {count} of the views' {most} scales, and none of them "
-                "has a weight. Give one of them a weight, or views of one size."
+                f"--scales gives no weight to the {count} of {most} scales that view {name!r} has. Give one of them a "
+                "weight, or use views of one size."
             )

@@ -25,7 +25,7 @@ MEASURING_BYTES = 100 << 20
 #: Bytes per Gaussian of a projected scene: for its shape, cached between views, and for its projection, depth and order
 #: while the tile intersections of a view are computed.
 SHAPE_BYTES, BUILDING_BYTES = 32, 104
-#: Bytes per Gaussian during the neighbor search for unseen ones: result, its difference, positions, and search tree.
+#: Bytes per Gaussian of the neighbor search for unseen Gaussians: result, color change, positions, and search tree.
 SEARCH_BYTES = 120
 #: Memory for the gradient of each tile intersection in a rasterizer's backward pass, as a fraction of a view's tile
 #: intersections.
@@ -118,9 +118,9 @@ class PeakMemory:
         return self._visited(self.plan.steps_coarse + self.settings.steps_sos)
 
     def _content(self) -> int:
-        """Return the size in bytes of content features: those of the coarsest scale in phase 1, all of them in phase 2.
+        """Return the bytes of cached content features, content images, coverage and region maps.
 
-        Content images, if they are cached instead, coverage and maps of regions are included.
+        Phase 1 needs the content features of the coarsest scale only.
         """
         views = self.views
         content, coarse = views.content, views.content_coarse

@@ -18,7 +18,7 @@ _CACHING_RENDERS = 3
 RENDER = 0.5
 #: Cost of restricting the survey's tile intersections to the Gaussians of the job, relative to computing them.
 _RESTRICTING = 0.25
-#: Bytes per Gaussian of a view's colors: the contribution of spherical harmonics.
+#: Bytes per Gaussian of a view's SH contribution to colors: three float32.
 COLOR_BYTES = 12
 #: Bytes per pixel of the content image at all scales, float32. It is cached if the background changes from step to
 #: step.
@@ -82,12 +82,12 @@ class RankPart:
     memory: float = 1.0
 
     def seconds(self, whole: float, fixed: float = 0.0) -> float:
-        """Return the rank's time in seconds, given that of a whole view, and how much of it is for any window."""
+        """Return the rank's time in seconds; `whole` is that of a whole view, `fixed` its size-independent portion."""
         fixed = min(fixed, whole)
         return fixed + (whole - fixed) * self.window
 
     def data(self, whole: ViewData, fraction: float, fixed: float = 0.0) -> ViewData:
-        """Return the rank's data of the views, a fraction of those of the whole views."""
+        """Return the rank's data, given the data of whole views and the fraction of their bytes that the rank holds."""
         seconds = self.seconds(whole.seconds, fixed)
         return replace(whole, seconds=seconds, bytes=whole.bytes * fraction, budget=whole.budget * self.memory)
 
@@ -231,7 +231,7 @@ class ViewCosts:
 
 
 def proportional(seconds: float) -> Callable[[RankPart], float]:
-    """Return the function of a part for a time in seconds that is in proportion to the rendered pixels."""
+    """Return a function that scales `seconds` of a whole view to the pixels that a rank renders."""
     return lambda part: part.seconds(seconds)
 
 

@@ -181,7 +181,7 @@ def _vgg16(
     network = FeatureNetwork(load_network_weights("vgg16", folder), _VGG16_LAYERS, dtype, device)
     if [network.channels(layer) for layer in _VGG16_LAYERS] != [len(head) for head in heads]:
         raise WeightsError(
-            "LPIPS weighs the channels of the published VGG16, and the installed one has others: measure with alex."
+            "LPIPS needs the channels of the published VGG16, but the installed one has others. Use the network alex."
         )
 
     def features(rgb: Tensor) -> list[Tensor]:

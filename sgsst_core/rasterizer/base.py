@@ -249,7 +249,7 @@ class Rasterizer(ABC):
         return nullcontext()
 
     def release_view(self, camera: Camera, budget: int) -> None:
-        """Drop the data prepared for a view, whose weights are now cached, and limit those of others to `budget` bytes.
+        """Drop the prepared data of a view whose weights are now cached; limit that of all others to `budget` bytes.
 
         Only rasterizers whose data share a memory budget with cached weights need this.
         """

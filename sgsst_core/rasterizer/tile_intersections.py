@@ -124,7 +124,7 @@ def intersections_of_subset(isects: TileIntersections, indices: NDArray[np.int32
         gaussians = np.empty(len(projection.gaussians), dtype=np.int32)
         take_elements(indices, projection.gaussians, gaussians)
         remains = gaussians >= 0
-        # For every rank: its new rank (-1 if removed), and the number of positions by which its slots move down.
+        # For each Gaussian in depth order: its new rank (-1 if removed), and by how much its slots move down.
         ranks = np.where(remains, np.cumsum(remains, dtype=np.int32) - np.int32(1), np.int32(-1))
         first_slots = run_starts(np.where(remains, np.diff(isects.first_slots), 0))
         shifts = (isects.first_slots - first_slots)[:-1]

@@ -50,7 +50,7 @@ class ViewMaps(ABC):
         return torch.cat(parts, dim=2)[:, :, : self.count].clamp(0, 1)
 
     def _pass(self, camera: Camera, parts: range) -> Tensor:
-        """Render up to three masks; without parts, render the background.
+        """Render the masks of up to three regions; if `parts` is empty, render the background.
 
         The background is bit-identical in all passes, so it can be subtracted.
         """

@@ -94,7 +94,7 @@ class Camera:
             )
         for side, value in (("width", width), ("height", height)):
             if not (math.isfinite(value) and value > 0 and value == int(value)):
-                raise CameraError(f"{name}: `{side}` is {value}. Give the number of pixels.")
+                raise CameraError(f"{name}: `{side}` must be a positive number of whole pixels, not {value}.")
         rigid = torch.from_numpy(exact_rotation(name, pose))
         return Camera(name, int(width), int(height), fx, fy, cx, cy, rigid)
 

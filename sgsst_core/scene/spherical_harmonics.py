@@ -94,10 +94,10 @@ def rest_colors(
     """
     stored = {0: 0, 3: 1, 8: 2, 15: 3}.get(int(sh_rest.shape[1]))
     if stored is None:
-        raise ValueError(f"sh_rest has {sh_rest.shape[1]} coefficients a Gaussian; 0, 3, 8 or 15 are possible")
+        raise ValueError(f"sh_rest must have 0, 3, 8 or 15 coefficients per Gaussian, not {sh_rest.shape[1]}")
     degree = stored if degree is None else degree
     if not 0 <= degree <= stored:
-        raise ValueError(f"degree {degree} asked of spherical harmonics of degree {stored}")
+        raise ValueError(f"degree must be between 0 and {stored}, not {degree}")
     if degree == 0:
         return torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     if isinstance(sh_rest, StoredHarmonics):

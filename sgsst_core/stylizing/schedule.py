@@ -68,7 +68,7 @@ class ViewOrder:
         self._covered = covered
 
     def next_view(self) -> int:
-        """Remove and return the next view; draw a new round only when it is needed, because checkpoints store it."""
+        """Remove and return the next view. Rounds are drawn lazily, because checkpoints store the rest of a round."""
         if not self.left:
             self.left = drawn_round(self._covered, self.generator)
         return self.left.pop()

@@ -49,5 +49,5 @@ def _not_enough(job: StylizationJob, attempt: str) -> DeviceMemoryError:
     return DeviceMemoryError(
         f"The GPU's memory ({total / 1e9:.1f} GB, {free / 1e9:.1f} GB free) is not enough for a step{attempt}. Stop "
         f"other programs on this GPU, or give a smaller --memory-limit than {job.memory_limit / 1e9:.1f} GB or a "
-        "smaller --max-resolution."
+        "smaller --resolution (`max_resolution` in Python)."
     )

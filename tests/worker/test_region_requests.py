@@ -81,7 +81,7 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
         ((["a:sphere=0,0,0,1"], ["a"], [], []), "expected NAME=FILE"),
         ((["a:sphere=0,0,0,1"], [], ["a=0"], []), "must be greater than 0"),
         ((["a:sphere=0,0,0,1"], [], ["a=x"], []), "not a finite number"),
-        ((["a:sphere=0,0,0,1"], ["a=x.jpg:0"], [], []), "the weight 0 is not a finite number greater than 0"),
+        ((["a:sphere=0,0,0,1"], ["a=x.jpg:0"], [], []), "the weight must be a finite number above 0, not 0"),
         ((["a:sphere=0,0,0,1"], ["a=x.jpg"], [], ["a"]), "is frozen, so it cannot have a style or weight"),
         ((["a:sphere=0,0,0,1"], [], [], ["a"], ["a=light"]), "is frozen, so it cannot have a style or weight"),
         ((["a:sphere=0,0,0,1"], [], [], [], ["a"]), "--region-content-weight a: '' is not a weight. Give a number"),

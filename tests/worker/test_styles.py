@@ -34,7 +34,7 @@ def test_existing_file_with_colon_takes_precedence(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("weight", ["0", "-1", "1e999"])
 def test_invalid_weights_are_refused(weight: str) -> None:
-    with pytest.raises(SettingsError, match=f"the weight {weight} is not a finite number greater than 0"):
+    with pytest.raises(SettingsError, match=f"the weight must be a finite number above 0, not {weight}"):
         parse_style(f"a.jpg:{weight}")
 
 

@@ -148,7 +148,7 @@ class RankProcess:
         die_with_parent()  # a suspended process would not notice the end of its parent, Ray's daemon
 
     def place(self) -> RankPlace:
-        """Return the location of this process."""
+        """Return the node, host, process ID and GPUs of this rank."""
         import ray
 
         node = ray.get_runtime_context().get_node_id()

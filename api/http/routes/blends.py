@@ -85,14 +85,14 @@ async def create_blend(request: Request, job_id: JobId, context: ContextDep, cal
     others = {part.job_id: part.weight for part in body.others}
     if len({job_id, *others}) != 1 + len(body.others):
         raise RefusedInputError("others: A job is named twice. Give each job one weight.", "invalid-request")
-    job = await asyncio.to_thread(_find_all, context, caller, job_id, others)
+    job = await asyncio.to_thread(_find_owned, context, caller, job_id, others)
     row = await context.derived.blended(job, Blend(body.weight, others, by_name(body.format)), caller.quotas)
     view = artifact_view(row)
     return Response(view.model_dump_json(), 201, {"Location": view.url}, media_type="application/json")
 
 
-def _find_all(context: Context, caller: Caller, job_id: str, others: dict[str, float]) -> JobRow:
-    """Return the caller's job with this id, after checking that the others are the caller's too."""
+def _find_owned(context: Context, caller: Caller, job_id: str, others: dict[str, float]) -> JobRow:
+    """Return the caller's job; raise an error unless the caller owns the jobs in `others` too."""
     for other in others:
         find(context, caller, other)
     return find(context, caller, job_id)

@@ -91,11 +91,11 @@ def _nothing_to_do(full: bool) -> CaseResult:
 
 
 def _small_style(side: int, full: bool) -> CaseResult:
-    """Check a style image smaller than a cell of the deep layers, which are then skipped in the loss."""
+    """Check a style image smaller than the stride of the deepest layers, which the loss then skips."""
     result = compare_losses(
         texture(_HEIGHT, _WIDTH, 1), texture(side, side, 2), texture(_HEIGHT, _WIDTH, 3), untiled=False
     )
-    return CaseResult(result.error, result.bound, f"deep layers have no cell in it and are left out; {result.note}")
+    return CaseResult(result.error, result.bound, f"deepest layers have no features and are skipped; {result.note}")
 
 
 def _long_style(full: bool) -> CaseResult:

@@ -127,9 +127,9 @@ def _pixels(situation: Situation, factor: float | None = None) -> Situation:
 
 
 def _white_on_white() -> Situation:
-    """Return a job in which scene and style differ by only about a hundredth of their values.
+    """Return a job with a nearly white scene (0.95), and a white style and background.
 
-    Relative to this difference, rounding errors are a hundred times as large.
+    The loss depends on small differences of large values, which amplifies rounding errors.
     """
     style = partial(_flat, 1, 1, 1, 64, 64)
     settings = {"background": (1.0, 1.0, 1.0), "content_weight": 0, "learning_rate": 0.01}

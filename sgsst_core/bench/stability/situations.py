@@ -159,7 +159,7 @@ def strain(situation: Situation) -> CaseResult:
             "the loss is not finite": math.isfinite(before) and math.isfinite(after),
             f"colors moved by {moved:.3g} in {job.job.total_steps} steps": moved
             <= most + 1e-5 * float(start.abs().max()),
-            "another run has other bits": torch.equal(colors, jobs[1].stylized()),
+            "a repeated run is not bit-identical": torch.equal(colors, jobs[1].stylized()),
             f"the loss rose from {before:.6g} to {after:.6g}": not (situation.falls and judged)
             or after <= max((1 + RISE) * before, NO_LOSS),
         }.items()
@@ -277,7 +277,7 @@ def _evaluate_both(
     coverage: Tensor | None,
     content_weight: float,
 ) -> tuple[SosResult, SosResult]:
-    """Return the loss of an image by the job's network, and in float64 with the same ReLU and pool decisions."""
+    """Evaluate the loss with the job's network, and in float64 with the same ReLU and max-pool decisions."""
     settings = job.job.settings
 
     def evaluated(network: FeatureNetwork) -> SosResult:

@@ -177,8 +177,8 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
     expected = [section for section in sections if section]
     if number != len(expected) or table < 32 or table + 16 * number > size:
         raise SceneError(
-            f"{path}: the SPZ header declares {number} streams, listed at byte {table}; there should be "
-            f"{len(expected)} in the {size} bytes. The file is truncated or its header is wrong. Copy it again."
+            f"{path}: the SPZ header declares {number} streams with their table at byte {table}; expected "
+            f"{len(expected)} streams in {size} bytes. The file is truncated or its header is wrong. Copy it again."
         )
     with path.open("rb") as file:
         file.seek(32)
@@ -278,7 +278,7 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
         raise SceneError(f"{path}: holds no Gaussians. Export the scene again.")
     if version > 1 and not fractional_bits <= 24:
         raise SceneError(
-            f"{path}: positions have {fractional_bits} fractional bits of 24: the SPZ header is wrong. Export it again."
+            f"{path}: SPZ header: fractional bits must be at most 24, not {fractional_bits}. Export it again."
         )
     sections = (
         (6 if version == 1 else 9) * count,

@@ -101,7 +101,7 @@ def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.Capture
     assert main([*plan, "--out", str(files.out.with_suffix(".json"))]) == 0
     assert shares in files.out.with_suffix(".json").read_text()
     assert main([*files.stylize(), "--style", f"{other}:0"]) == 2
-    assert "the weight 0 is not a finite number greater than 0" in capsys.readouterr().err
+    assert "the weight must be a finite number above 0, not 0" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -476,7 +476,7 @@ def test_missing_or_impossible_lenses_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ([], "is not what nerfstudio writes"),
+        ([], "needs a JSON object with `transform` and `scale`"),
         ({"scale": 1.0}, "has no 'transform'"),
         ({"transform": np.eye(4)[:3].tolist(), "scale": 0}, "scale is 0"),
         ({"transform": (2 * np.eye(4))[:3].tolist(), "scale": 1}, "off a rotation"),

@@ -109,5 +109,5 @@ def test_scales_beyond_those_of_the_views_are_refused() -> None:
         check_scales((1.0, 0.0, 0.5, 1.0), views, 24)
     with pytest.raises(SettingsError, match="gives scale 1 a weight, but the views have one scale, 0"):
         check_scales((0.0, 1.0), views, 96)
-    with pytest.raises(SettingsError, match="leaves view 'view_0' nothing: it has 1 of the views' 3 scales"):
+    with pytest.raises(SettingsError, match="gives no weight to the 1 of 3 scales that view 'view_0' has"):
         check_scales((0.0, 1.0), [*cameras(1, 30, 20), *cameras(2, 128, 96)[1:]], 24)

@@ -120,7 +120,7 @@ WRONG: dict[str, tuple[Any, Any, Any, str]] = {
     "text": ("front", K, 990, "not a matrix of numbers"),
     "skew": (torch.eye(4), SKEWED, 990, "undistort"),
     "focal": (torch.eye(4), -K, 990, "above 0"),
-    "size": (torch.eye(4), K, 99.5, "`width` is 99.5. Give the number of pixels"),
+    "size": (torch.eye(4), K, 99.5, "`width` must be a positive number of whole pixels, not 99.5"),
 }
 
 

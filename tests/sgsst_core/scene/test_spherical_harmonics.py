@@ -246,9 +246,9 @@ def test_clamp_aware_gradient_recovers_clamped_colors() -> None:
 
 def test_wrong_number_of_coefficients_is_refused() -> None:
     scene, view = cloud(5, degree=1), camera()
-    with pytest.raises(ValueError, match="4 coefficients"):
+    with pytest.raises(ValueError, match="coefficients per Gaussian, not 4"):
         rest_colors(torch.zeros(5, 4, 3), scene.means, view)
-    with pytest.raises(ValueError, match="degree 2 asked"):
+    with pytest.raises(ValueError, match="degree must be between 0 and 1, not 2"):
         rest_colors(scene.sh_rest, scene.means, view, degree=2)
     with pytest.raises(ValueError, match="degree 4"):
         basis(torch.zeros(1, 3), 4)

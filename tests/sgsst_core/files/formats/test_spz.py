@@ -211,7 +211,10 @@ ROW = 20 + 9
         (gzip.compress(b"something else that was packed"), "a gzip file, but no SPZ"),
         (b"\x1f\x8b" + bytes(100), "damaged gzip file"),
         (b"NGSP" + bytes(5), "ends within its SPZ header"),
-        (b"NGSP" + struct.pack("<IIBBBBI", 4, 616, 1, 12, 0, 6, 32) + bytes(12), "6 streams, listed at byte 32"),
+        (
+            b"NGSP" + struct.pack("<IIBBBBI", 4, 616, 1, 12, 0, 6, 32) + bytes(12),
+            "6 streams with their table at byte 32",
+        ),
         (b"NGSP" + struct.pack("<IIBBBBI", 4, 616, 1, 12, 0, 5, 32) + bytes(92), "5 streams"),
         (
             b"NGSP" + struct.pack("<IIBBBBI", 4, 616, 0, 12, 0, 5, 32) + bytes(12) + struct.pack("<10Q", *[9, 9] * 5),
