@@ -48,7 +48,7 @@ class ServiceSettings(BaseSettings):
         inspection_seconds, inspection_bytes: Base limits of CPU time and memory for checking a job's files; both grow
             with the size of the files (`service.inspection.inspector`).
         dry_run_seconds: Base limit of CPU time for a dry run; it grows with Gaussians and views.
-        receive_seconds: Time without new bytes after which a request body is abandoned.
+        receive_seconds: Time without new bytes after which a request body is abandoned, or without reading a response.
         session_days: Lifetime of a browser session that was started with a key.
         upload_hours: Time after which an unfinished upload, or a finished one that no job uses, expires.
         retention_days: Time after which the results of a finished job expire; the job's record is deleted after another

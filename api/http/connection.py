@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import struct
 from enum import Enum, auto
 from http import HTTPStatus
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from api.http.context import SESSION_COOKIE
 from api.http.memory import memory
 from api.http.problems import HeadTooLargeError, MalformedRequestError, TooManyConnectionsError, from_service
 from service.errors import ServiceError
@@ -22,6 +25,20 @@ MAX_HEADERS = 200
 MAX_WAITING = 8
 
 
+#: Start of the session cookie in a Cookie header.
+_SESSION = f"{SESSION_COOKIE}=".encode()
+
+
+def _session_cookie(cookies: bytes) -> bytes:
+    """Return the value of a Cookie header without all cookies but the session's.
+
+    Starlette parses all of them, in quadratic time if they are quoted (CVE-2024-7592; Python before 3.11.10 and 3.12.6)
+    and on the event loop.
+    """
+    pairs = (pair.strip() for pair in cookies.split(b";"))
+    return b"; ".join(pair for pair in pairs if pair.startswith(_SESSION) and b'"' not in pair)
+
+
 class _Stage(Enum):
     """Part of a request that the next byte of a connection belongs to."""
 
@@ -33,17 +50,17 @@ class _Stage(Enum):
 class Connection(HttpToolsProtocol):
     """A connection that is closed if its client takes too long or sends too much.
 
-    At most one block of a body is read ahead of the app. Trailers are dropped.
+    At most one block of a body is read ahead of the app. Trailers are dropped, and cookies of other services.
 
     Attributes:
         head_seconds: Time limit in seconds for a head (request line and headers), from the start of the connection or
             the first byte of the head. The same limit applies after a response to the body bytes that the app has not
-            read.
+            read, and to the client's reading of each chunk of a response.
         most: Maximum number of simultaneous connections of this process; further ones get status 503.
     """
 
     # An object with more than 30 attributes in its `__dict__` takes 2 kB more, and the base class has 28.
-    __slots__ = ("_error", "_stage", "_steps", "_timer", "_unused_bytes")
+    __slots__ = ("_error", "_stage", "_steps", "_timer", "_unread_timer", "_unused_bytes")
 
     head_seconds = 60.0
     most = 10_000
@@ -54,6 +71,7 @@ class Connection(HttpToolsProtocol):
         self._steps = self._unused_bytes = 0
         self._error: ServiceError | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._unread_timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the timer of the first head."""
@@ -69,7 +87,28 @@ class Connection(HttpToolsProtocol):
         """Stop the timer, and stop counting the connection."""
         memory.connections -= 1
         self._stop_timer()
+        self._stop_unread_timer()
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """Stop sending until the client has read what was sent; close the connection if it takes too long."""
+        super().pause_writing()
+        self._unread_timer = self.loop.call_later(self.head_seconds, self._drop_unread)
+
+    def resume_writing(self) -> None:
+        """Continue sending."""
+        self._stop_unread_timer()
+        super().resume_writing()
+
+    def _drop_unread(self) -> None:
+        """Close the connection, and drop what the system would otherwise go on sending."""
+        self.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.transport.abort()
+
+    def _stop_unread_timer(self) -> None:
+        if self._unread_timer is not None:
+            self._unread_timer.cancel()
+            self._unread_timer = None
 
     def data_received(self, data: bytes | memoryview) -> None:
         """Parse received bytes. Refuse the connection if a head, trailers or chunk extensions are too long."""
@@ -90,9 +129,11 @@ class Connection(HttpToolsProtocol):
         super().on_message_begin()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Store a header; drop a trailer."""
+        """Store a header; drop a trailer, and all cookies but the session's."""
         if self._stage is _Stage.BODY:
             return
+        if name.lower() == b"cookie":
+            value = _session_cookie(value)
         if len(self.headers) == MAX_HEADERS:
             self._abort(HeadTooLargeError(f"The request has more than {MAX_HEADERS} headers."))
         super().on_header(name, value)

@@ -16,6 +16,7 @@ from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.documentation import Responses, headers
+from api.http.memory import memory
 from service.errors import NotFoundError, ServiceError
 from service.examples import SHA256
 
@@ -90,7 +91,7 @@ class SentFile:
         inline: Whether a browser may show the file inline.
         policy: Content-Security-Policy; None for none.
         check: Function that checks that the stored file has this content. It is fast if the file was checked recently.
-        read: Function that yields the bytes from one offset up to another, in blocks.
+        read: Function that yields the bytes from one offset up to another, in chunks of at most a given size.
     """
 
     sha256: str
@@ -100,7 +101,7 @@ class SentFile:
     inline: bool
     policy: str | None
     check: Callable[[], None]
-    read: Callable[[int, int], Iterator[bytes]]
+    read: Callable[[int, int, int], Iterator[bytes]]
 
 
 def file_answers(starts: dict[str, Any], *, always_policy: bool = False) -> Responses:
@@ -162,7 +163,7 @@ async def send_file(request: Request, file: SentFile, conditions: Conditions) ->
     if request.method == "HEAD":
         return Response(status_code=status, headers=response_headers, media_type=file.kind)
     await anyio.to_thread.run_sync(file.check, limiter=_LARGE_CHECKS if file.size > _LARGE_BYTES else None)
-    body = file.read(start, stop)
+    body = file.read(start, stop, memory.share() // 2)  # one chunk is read while another is sent
     first = await asyncio.to_thread(_first, body)  # an error at this point can still be sent as a response
     return StreamingResponse(chain(first, body), status, response_headers, file.kind)
 

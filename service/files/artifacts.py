@@ -14,7 +14,7 @@ from pathlib import Path
 
 from service.errors import DamagedFileError, LostFileError
 from service.files.cache import file_digest
-from service.files.objects import ObjectStore
+from service.files.objects import CHUNK, ObjectStore
 from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import RESULT_FORMATS
@@ -66,9 +66,9 @@ class Artifacts:
             size, sha256 = temporary.stat().st_size, file_digest(temporary)
         return Published(name, location, size, sha256)
 
-    def read(self, location: str, start: int, stop: int) -> Iterator[bytes]:
-        """Yield the bytes from `start` up to `stop` in chunks."""
-        return self.objects.read(location, start, stop)
+    def read(self, location: str, start: int, stop: int, chunk: int = CHUNK) -> Iterator[bytes]:
+        """Yield the bytes from `start` up to `stop` in chunks of at most `chunk` bytes."""
+        return self.objects.read(location, start, stop, chunk)
 
     def check(self, location: str, sha256: str) -> None:
         """Verify the SHA-256 of a result, unless it was verified recently and has not changed since.

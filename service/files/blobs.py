@@ -21,7 +21,7 @@ from typing import IO, Protocol
 
 from service.errors import LockedError, LostUploadError, NoSpaceError, NotFoundError, StoreError, TooLargeError
 from service.files.cache import file_digest
-from service.files.objects import ObjectStore
+from service.files.objects import CHUNK, ObjectStore
 from service.store.inputs import Inputs, check_offset
 from service.store.tables import BlobRow, UploadRow
 
@@ -171,14 +171,14 @@ class Blobs(ABC):
             StoreError: If the file store does not respond.
         """
 
-    def read(self, row: BlobRow, start: int, stop: int) -> Iterator[bytes]:
-        """Yield the bytes of a blob from `start` up to `stop`, directly from the file store.
+    def read(self, row: BlobRow, start: int, stop: int, chunk: int = CHUNK) -> Iterator[bytes]:
+        """Yield the bytes of a blob from `start` up to `stop` in chunks, directly from the file store.
 
         Raises:
             FileNotFoundError: If the blob has just been removed.
             StoreError: If the file store does not respond.
         """
-        return self.objects.read(f"{BLOBS}/{row.location}", start, stop)
+        return self.objects.read(f"{BLOBS}/{row.location}", start, stop, chunk)
 
     @contextmanager
     def local_files(self, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:

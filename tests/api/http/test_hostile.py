@@ -28,6 +28,7 @@ from PIL import Image, ImageCms, PngImagePlugin
 
 from api.cli.options import kind_of
 from api.http.connection import MAX_HEAD_BYTES, MAX_HEADERS
+from api.http.context import SESSION_COOKIE
 from service.examples import SHARE_ID, UPLOAD_ID
 from service.files.artifacts import Artifacts
 from service.parameters import JobParameters
@@ -48,6 +49,8 @@ MB = 1_000_000
 GROWTH = 48 * MB
 #: Seconds after which the service under test gives up on a stalled body or head.
 STILL = 2.0
+#: Size in bytes of the largest result of the finished job.
+LARGE = 16 * MB
 TUS = {"Tus-Resumable": "1.0.0"}
 OFFSET_STREAM = "application/offset+octet-stream"
 
@@ -1117,6 +1120,7 @@ def done(service: Service, store: Store, files: Files, tmp_path_factory: pytest.
     folder = tmp_path_factory.mktemp("results")
     (folder / "stylized.ply").write_bytes(files["scene"])
     (folder / "log.txt").write_bytes(b"")
+    (folder / "colors.f16").write_bytes(bytes(LARGE))
     (folder / "report.html").write_text("<script>alert(1)</script>")
     artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
     published = [artifacts.put(job_id, lease.epoch, path.name, path) for path in sorted(folder.iterdir())]
@@ -1461,6 +1465,36 @@ def test_unread_body_must_end(service: Service) -> None:
                     break
             assert answered.startswith(b"HTTP/1.1 405 ")
             assert answered.count(b"HTTP/1.1") == 1, "it is answered twice"
+
+
+def test_unread_responses_take_little_memory_and_end(service: Service, done: str) -> None:
+    """Clients that request a large file and read nothing are disconnected; `unharmed` limits the memory."""
+    with contextlib.ExitStack() as stack:
+        unread = [stack.enter_context(connect(service)) for _ in range(60)]
+        for connection in unread:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            connection.sendall(lines(f"GET /v1/jobs/{done}/artifacts/colors.f16 HTTP/1.1"))
+        process = api_of(service)
+        wait_for(lambda: len(process.net_connections("tcp")) > 60, "the connections to be accepted")
+        wait_for(lambda: len(process.net_connections("tcp")) < 10, "unread connections to be closed")
+        assert len(closed(unread[0])) < LARGE
+
+
+def test_quoted_cookies_take_linear_time(service: Service) -> None:
+    """Python's parser of quoted cookies takes quadratic time: ten seconds for 60 kB."""
+    with connect(service) as connection:
+        connection.settimeout(5)
+        for name in ("other", SESSION_COOKIE):
+            connection.sendall(b'GET /v1/session HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: %s="' % name.encode())
+            connection.sendall(b'\\"' * 30_000 + b'"\r\n\r\n')
+            assert answer_on(connection)[0].startswith(b"HTTP/1.1 200 ")
+
+
+def test_session_cookie_is_found_among_others(service: Service, client: httpx.Client) -> None:
+    cookies = 'theme=dark; sgsst_session=unknown; quoted="a\\073b"'
+    answer = client.delete("/v1/session", headers={"Cookie": cookies, "Origin": "https://example.com"})
+    assert (answer.status_code, answer.json()["code"]) == (403, "cross-origin"), "it counts as a session"
+    assert client.delete("/v1/session", headers={"Cookie": "theme=dark"}).status_code == 204
 
 
 def test_late_end_of_body_preserves_connection(service: Service) -> None:
