@@ -11,7 +11,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.outgoing import parse_origins
 
-MB, GB = 1_000_000, 1_000_000_000
+GB = 1_000_000_000
 
 
 def is_loopback(host: str) -> bool:

@@ -114,3 +114,12 @@ class ClusterAwayError(RanksFailedError, InfrastructureError):
     """Cluster that is unavailable, or that has no capacity for even a single worker."""
 
     code = "workers-failed"
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Return whether an error reports a lack of memory.
+
+    PyTorch raises a plain RuntimeError on the CPU, and a subclass of it on GPUs.
+    """
+    text = str(error)
+    return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text

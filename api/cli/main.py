@@ -18,7 +18,7 @@ from api.cli.scene_commands import blend, check, convert, plan, render
 from api.cli.study_commands import study_app
 from api.cli.stylize_commands import demo, stylize
 from api.cli.weights_commands import weights_app
-from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError
+from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_out_of_memory
 from sgsst_core.options import renamed_hint
 
 #: Base of errors in the arguments, which typer does not export.
@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             error_console.print(f"error: {problem}")
         return BAD_INPUT
     except (MemoryError, RuntimeError) as error:
-        if not _out_of_memory(error):
+        if not is_out_of_memory(error):
             raise
         error_console.print("error: out of memory. Use a smaller --resolution, fewer --views or a --memory-limit.")
         return FAILURE
@@ -139,15 +139,6 @@ def _check_names(arguments: Sequence[str]) -> None:
         flag = argument.partition("=")[0]
         if flag.startswith("--") and (hint := renamed_hint(flag)):
             raise SettingsError(f"{flag}: {hint}.")
-
-
-def _out_of_memory(error: Exception) -> bool:
-    """Return whether an error reports a lack of memory.
-
-    PyTorch raises a plain RuntimeError on the CPU, and a subclass of it on GPUs.
-    """
-    text = str(error)
-    return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -146,10 +146,7 @@ def check_roles(
             input="photos",
         )
     _check_camera_files([entry["name"] for entry in by_role["cameras"]])
-    names = [(entry["role"], entry["name"].lower()) for entry in inputs]
-    twice = (
-        next((name for name in names if names.count(name) > 1), None) if len(names) < 50 else _first_duplicate(names)
-    )
+    twice = _first_duplicate((entry["role"], entry["name"].lower()) for entry in inputs)
     if twice:
         raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}. Rename one.", "invalid-request")
     for role in _FOLDER_ROLES:
@@ -203,7 +200,7 @@ def _check_region_masks(names: Sequence[str], regions: Sequence[RegionRequest]) 
         )
 
 
-def _first_duplicate(names: Sequence[tuple[str, str]]) -> tuple[str, str] | None:
+def _first_duplicate(names: Iterable[tuple[str, str]]) -> tuple[str, str] | None:
     seen: set[tuple[str, str]] = set()
     for name in names:
         if name in seen:

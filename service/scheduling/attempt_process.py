@@ -247,22 +247,17 @@ def summary(result: Result) -> dict[str, Any]:
 
 def failure(error: Exception) -> Message:
     """Return the message for an error; the error is permanent if a retry would fail in the same way."""
-    from sgsst_core.errors import DivergedError, InvalidInputError, SgsstError
+    from sgsst_core.errors import DivergedError, InvalidInputError, SgsstError, is_out_of_memory
 
     if is_outage(error):
         detail = "".join(traceback.format_exception(error))
         return {"kind": "failed", "error": OUTAGE, "permanent": False, "detail": detail}
-    code = error.code if isinstance(error, SgsstError) else "out-of-memory" if _out_of_memory(error) else "internal"
+    code = error.code if isinstance(error, SgsstError) else "out-of-memory" if is_out_of_memory(error) else "internal"
     message = (
-        str(error) if isinstance(error, SgsstError) or _out_of_memory(error) else f"{type(error).__name__}: {error}"
+        str(error) if isinstance(error, SgsstError) or is_out_of_memory(error) else f"{type(error).__name__}: {error}"
     )
     permanent = isinstance(error, InvalidInputError | DivergedError)
     return {"kind": "failed", "error": {"code": code, "message": message}, "permanent": permanent}
-
-
-def _out_of_memory(error: Exception) -> bool:
-    text = str(error)
-    return isinstance(error, MemoryError) or "can't allocate memory" in text or "out of memory" in text
 
 
 def log(line: str) -> None:

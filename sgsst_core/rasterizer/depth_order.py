@@ -45,15 +45,14 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
         shift = max((highest - lowest).bit_length() - target.bit_length(), 0)
         buckets = ((highest - lowest) >> shift) + 1
         chunks = np.linspace(0, count, threads + 1).astype(np.int64)
-        ends = np.zeros((threads, buckets), dtype=np.int64)
-        _count(bits, lowest, shift, chunks, ends)
+        counts = np.zeros((threads, buckets), dtype=np.int64)
+        _count(bits, lowest, shift, chunks, counts)
+        starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts.sum(axis=0))])
         # First position that each chunk writes to in each bucket: after all lower buckets, and after the entries of all
         # preceding chunks in the same bucket.
-        totals = ends.sum(axis=0)
-        starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(totals)])
-        ends = starts[:-1] + np.cumsum(ends, axis=0) - ends
+        offsets = starts[:-1] + np.cumsum(counts, axis=0) - counts
         order, keys = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int64)
-        _scatter(bits, visible, lowest, shift, chunks, ends, order, keys)
+        _scatter(bits, visible, lowest, shift, chunks, offsets, order, keys)
         bounds = np.searchsorted(starts, chunks).astype(np.int64)
         _sort_buckets(starts, bounds, keys, order)
     return order
