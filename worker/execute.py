@@ -24,7 +24,7 @@ from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, sent_json
 from sgsst_core.report.page import write_page
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, relative_loss, round_evaluation
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation
 from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.options import RunOptions
@@ -65,8 +65,8 @@ class Result:
     @property
     def losses(self) -> tuple[float, float]:
         """Return the mean loss before and after, over the same scales."""
-        after = mean_loss(self.after, self.weights)
-        return after / relative_loss(self.before, self.after, self.weights), after
+        before = on_scales_of(self.after, self.before)
+        return mean_loss(before, self.weights), mean_loss(self.after, self.weights)
 
 
 def execute(

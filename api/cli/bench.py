@@ -208,7 +208,7 @@ def error_time_table(curves: Sequence[Curve]) -> Table:
     for curve in curves:
         if not curve.points:
             continue
-        losses = [f"{point.relative:.3f}" for point in curve.points]
+        losses = [_number(point.relative) for point in curve.points]
         end = curve.points[-1]
         ends = [end.by_scale[scale] for scale in scales]
         judged = [end.judgment.style, end.judgment.color_distance] if end.judgment else [None, None]
@@ -219,7 +219,8 @@ def error_time_table(curves: Sequence[Curve]) -> Table:
 def point_line(curve: Curve) -> str:
     """Return the last evaluation of a curve as a line for a log."""
     name, point = curve.variant.name, curve.points[-1]
-    return f"{name}: {point.relative:.2%} of the loss remains after {point.seconds:.1f} s, {point.step} steps"
+    remains = "the initial loss was 0," if point.relative is None else f"{point.relative:.2%} of the loss remains"
+    return f"{name}: {remains} after {point.seconds:.1f} s, {point.step} steps"
 
 
 def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> list[tuple[Case, Measurement]]:

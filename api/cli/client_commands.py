@@ -17,7 +17,7 @@ from rich.progress import BarColumn, TextColumn
 from rich.table import Table
 
 from api.cli.arguments import JobInputs, JsonOption
-from api.cli.console import INTERRUPTED, JOB_FAILED, error_console, out_console
+from api.cli.console import INTERRUPTED, JOB_FAILED, error_console, loss_text, out_console
 from api.cli.options import with_arguments, with_options
 from api.cli.progress_bars import transfer_bar
 from api.client.inputs import different_names, path_or_url
@@ -443,8 +443,7 @@ def _job_text(job: Job) -> str:
         lines.append(f"{'progress:':<12}{_progress_text(job)}")
     result = job.data.get("result")
     if result:
-        before, after = result["loss_before"], result["loss_after"]
-        lines.append(f"{'loss:':<12}{before:.4g} before, {after:.4g} after ({after / before:.1%})")
+        lines.append(f"{'loss:':<12}{loss_text(result['loss_before'], result['loss_after'])}")
     if job.error:
         lines.append(f"{'error:':<12}{job.error['message']}")
     return "\n".join(lines)

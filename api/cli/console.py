@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 from rich.console import Console
 
+from sgsst_core.loss.convergence import ratio
+
 #: Exit codes: an unusable input or option, and any other failure.
 BAD_INPUT, FAILURE = 2, 1
 #: Exit codes of client commands: no such job or file, a job whose status does not allow the request, and a job that
@@ -17,6 +19,12 @@ INTERRUPTED = 130
 
 out_console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
+
+
+def loss_text(before: float, after: float) -> str:
+    """Return the loss before and after a job, and their ratio."""
+    relative = ratio(after, before)
+    return f"{before:.4g} before, {after:.4g} after" + ("" if relative is None else f" ({relative:.1%})")
 
 
 def print_field(name: str, value: object) -> None:

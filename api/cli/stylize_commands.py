@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from api.cli.arguments import JobInputs
-from api.cli.console import FAILURE, error_console, out_console, print_field, spinner
+from api.cli.console import FAILURE, error_console, loss_text, out_console, print_field, spinner
 from api.cli.interrupt import stop_on_signal
 from api.cli.options import with_arguments, with_options
 from api.cli.weights_commands import fetch
@@ -189,8 +189,7 @@ def _print_restarts(ended: RanksResult) -> None:
 
 
 def _print_result(outputs: Outputs, result: Result, command: str) -> None:
-    before, after = result.losses
-    print_field("loss", f"{before:.4g} before, {after:.4g} after ({after / before:.1%})")
+    print_field("loss", loss_text(*result.losses))
     for line in _loss_over_time(result):
         print_field("loss over time", line)
     paths = [("stylized scene", outputs.ply)]

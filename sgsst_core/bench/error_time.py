@@ -11,6 +11,7 @@ some loss sooner than all other variants.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -25,6 +26,7 @@ from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.loss.convergence import ratio
 from sgsst_core.planning.measuring import LOSS_VIEWS
 from sgsst_core.quality.exact import Float32Reference
 from sgsst_core.quality.judge import Judgment
@@ -43,7 +45,7 @@ from sgsst_core.report.palette import INK, color_of
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, Settings, make_settings
-from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.evaluation import relative_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Number of slices of the time budget. Variants take turns slice by slice, so that a temporary slowdown of the machine
@@ -120,15 +122,15 @@ class Point:
     Attributes:
         seconds: Seconds of optimization.
         step: Number of steps.
-        relative: Loss relative to the unstylized scene, mean over scales.
-        by_scale: Relative loss of each scale.
+        relative: Loss relative to the unstylized scene, mean over scales; None if the latter is 0.
+        by_scale: Relative loss of each scale; None where that of the unstylized scene is 0.
         judgment: Judgment on the novel views; None if AlexNet is not installed, or if no view can be judged.
     """
 
     seconds: float
     step: int
-    relative: float
-    by_scale: dict[int, float]
+    relative: float | None
+    by_scale: dict[int, float | None]
     judgment: Judgment | None = None
 
 
@@ -192,8 +194,8 @@ def error_time(
     def evaluated(stylizer: Stylizer) -> Point:
         colors = stylizer.stylized()
         loss, judgment = exact.evaluate(views, colors), judge.judge(colors) if judge else None
-        by_scale = {scale: loss[scale].total / start[scale].total for scale in loss}
-        relative = mean_loss(loss, exact.loss.weights) / mean_loss(start, exact.loss.weights)
+        by_scale = {scale: ratio(loss[scale].total, start[scale].total) for scale in loss}
+        relative = relative_loss(start, loss, exact.loss.weights)
         return Point(stylizer.seconds, stylizer.step, relative, by_scale, judgment)
 
     for part in range(1, SLICES + 1):
@@ -251,10 +253,17 @@ def _reason_to_leave_out(settings: Settings, stylizer: Stylizer) -> str | None:
 def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point]]:
     """Return the points that no other point dominates in seconds and loss, ordered by seconds."""
     front: list[tuple[str, Point]] = []
-    points = [(curve.variant.name, point) for curve in curves for point in curve.points]
-    for name, point in sorted(points, key=lambda item: (item[1].seconds, item[1].relative)):
-        if not front or point.relative < front[-1][1].relative:
+    points = [
+        (curve.variant.name, point, point.relative)
+        for curve in curves
+        for point in curve.points
+        if point.relative is not None
+    ]
+    least = math.inf
+    for name, point, relative in sorted(points, key=lambda item: (item[1].seconds, item[2])):
+        if relative < least:
             front.append((name, point))
+            least = relative
     return front
 
 

@@ -26,6 +26,11 @@ def smoothed(losses: Sequence[float], window: int) -> float:
     return math.exp(sum(math.log(max(loss, 1e-300)) for loss in last) / len(last))
 
 
+def ratio(after: float, before: float) -> float | None:
+    """Return a loss relative to an earlier one; None if the earlier one is exactly 0."""
+    return after / before if before else None
+
+
 def has_reached(losses: Sequence[float], target: float, round_length: int) -> bool:
     """Return whether the mean over the last whole round of views is at most `target`."""
     return len(losses) >= round_length and smoothed(losses, round_length) <= target

@@ -11,7 +11,7 @@ from typing import Any
 
 from sgsst_core.budget import device_peak
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.convergence import smoothed
+from sgsst_core.loss.convergence import ratio, smoothed
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.parallel.collectives import TRAFFIC
@@ -19,7 +19,7 @@ from sgsst_core.planning.measuring import allowed_seconds
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
 from sgsst_core.report.machine import machine, peak_memory, program_version
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, relative_loss
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, relative_loss
 from sgsst_core.stylizing.loop import Stopped
 from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -107,7 +107,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
             "after": _evaluation_json(after, weights),
             "relative": relative_loss(before, after, weights),
             "relative_by_scale": {
-                str(scale): after[scale].total / before[scale].total for scale in before if scale in after
+                str(scale): ratio(after[scale].total, before[scale].total) for scale in before if scale in after
             },
         },
         "loss_over_time": loss_over_time(stylizer, before),
@@ -298,12 +298,13 @@ def loss_over_time(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | N
 
     Returns:
         `relative`: Final loss. `reached`: Seconds and step at which the loss first fell to 0.5, 0.2, 0.1 and so on.
-        `last_tenth`: Loss before and after the last tenth of the time. None if no step used all scales.
+        `last_tenth`: Loss before and after the last tenth of the time. None if no step used all scales, or if
+            the initial loss is 0.
     """
     records = [record for record in stylizer.history if record.stage == "sos"]
-    if not records:
-        return None
     start, losses = mean_loss(before, stylizer.job.loss.weights), [record.loss for record in records]
+    if not records or not start:
+        return None
     length = stylizer.job.round_length
     relative = [smoothed(losses[max(0, end - length) : end], length) / start for end in range(1, len(losses) + 1)]
     reached = []
@@ -358,14 +359,14 @@ def _terms_json(terms: LossTerms) -> dict[str, float]:
 
 
 def _record_json(record: StepRecord, before: Evaluation, weights: ScaleWeights) -> dict[str, Any]:
-    start = mean_loss({scale: before[scale] for scale in record.terms if scale in before} or before, weights)
+    start = mean_loss(on_scales_of(record.terms, before), weights)
     return {
         "step": record.step,
         "stage": record.stage,
         "seconds": round(record.seconds, 3),
         "view": record.view,
         "loss": record.loss,
-        "relative": record.loss / start,
+        "relative": ratio(record.loss, start),
         "scales": {str(scale): _terms_json(terms) for scale, terms in record.terms.items()},
         "parts": {name: round(seconds, 4) for name, seconds in record.parts.items()},
         "memory_bytes": record.memory,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from sgsst_core.loss.convergence import smoothed
+from sgsst_core.loss.convergence import ratio, smoothed
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.targets import StyleTargets
 from sgsst_core.loss.terms import LossTerms
@@ -69,12 +69,16 @@ def _last_round(history: Sequence[StepRecord], round_length: int) -> list[StepRe
     return [record for record in last if record.stage == last[-1].stage]
 
 
-def relative_loss(before: Evaluation, after: Evaluation, weights: ScaleWeights = EVEN) -> float:
-    """Return the loss after a job relative to that before it, over the scales that were computed."""
-    return mean_loss(after, weights) / mean_loss(_shared(before, after), weights)
+def relative_loss(before: Evaluation, after: Evaluation, weights: ScaleWeights = EVEN) -> float | None:
+    """Return the loss after a job relative to that before it, over the scales that were computed.
+
+    It is None if the loss before the job is 0.
+    """
+    return ratio(mean_loss(after, weights), mean_loss(on_scales_of(after, before), weights))
 
 
-def _shared(before: Evaluation, after: Evaluation) -> Evaluation:
+def on_scales_of(after: Evaluation, before: Evaluation) -> Evaluation:
+    """Return the part of `before` on the scales of `after`, or all of `before` if they have none in common."""
     return {scale: before[scale] for scale in after if scale in before} or before
 
 

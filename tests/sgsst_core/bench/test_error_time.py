@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from api.cli.bench import error_time_table, point_line
 from sgsst_core.bench.error_time import (
     VARIANTS,
     Curve,
@@ -106,6 +107,14 @@ def test_pareto_front_contains_undominated_points() -> None:
     curves = [curve("standard", (1, 0.9), (2, 0.5), (4, 0.3)), curve("two-views", (1, 0.8), (2, 0.6), (3, 0.4))]
     front = [(name, point.seconds) for name, point in pareto_front(curves)]
     assert front == [("two-views", 1), ("standard", 2), ("two-views", 3), ("standard", 4)]
+
+
+def test_initial_loss_of_zero_has_no_ratio(tmp_path: Path) -> None:
+    curves = [Curve(VARIANTS["standard"], [Point(seconds, 1, None, {0: None}) for seconds in (1, 2)])]
+    assert as_dict(curves)["pareto_front"] == []
+    assert point_line(curves[0]) == "standard: the initial loss was 0, after 2.0 s, 1 steps"
+    assert error_time_table(curves).row_count == 1
+    write_plot(tmp_path / "plot.png", curves, "black")
 
 
 def test_presets_are_variants_with_their_own_settings() -> None:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from api.cli.console import loss_text
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.json_files import write_json
 from sgsst_core.loss.terms import LossTerms
@@ -18,12 +19,14 @@ from sgsst_core.planning.plan import Prediction
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
 from sgsst_core.report.history import history_of, running_mean
+from sgsst_core.report.page import render_page
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import ball, blind_camera, cameras, style
+from worker.execute import Result
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -190,6 +193,20 @@ def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evalua
         "from": pytest.approx(0.06),
         "to": summary["relative"],
     }
+
+
+def test_initial_loss_of_zero_has_no_ratio(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:
+    stylizer, before, after = finished
+    nothing = {scale: LossTerms() for scale in before}
+    report = json.loads(json.dumps(build_report(stylizer, sources, "finished", nothing, after), allow_nan=False))
+    assert report["loss"]["relative"] is None
+    assert set(report["loss"]["relative_by_scale"].values()) == {None}
+    assert {record["relative"] for record in report["history"]} == {None}
+    assert report["loss_over_time"] is None
+    assert "–" in render_page(report, None)
+    result = Result("finished", 7, 7, nothing, after)
+    assert loss_text(*result.losses) == f"0 before, {mean_loss(after):.4g} after"
+    assert Result("finished", 7, 7, before, nothing).losses == (mean_loss(before), 0)
 
 
 def test_loss_over_time_needs_steps(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
