@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_dep
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.base import CameraKey, camera_key
 from sgsst_core.scene.camera import Camera, between, resized
-from sgsst_core.scene.camera_path import nearest_walk, similarly_rotated
+from sgsst_core.scene.camera_path import moved, nearest_walk, similarly_rotated
 from sgsst_core.scene.gaussians import Scene, sampled
 
 #: Distance, relative to the median distance of consecutive cameras, beyond which two cameras are not neighbors. The
@@ -43,7 +44,8 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
     rotations = torch.stack([camera.world_to_camera[:3, :3].double() for camera in cameras])
     walk = nearest_walk(centers, rotations)
     steps = (centers[walk[1:]] - centers[walk[:-1]]).norm(dim=1)
-    reach = JUMP * float(steps[steps > 0].median()) if bool((steps > 0).any()) else 0.0
+    moves = steps[torch.from_numpy(moved(steps.numpy(), centers.numpy()))]
+    reach = JUMP * float(moves.median()) if len(moves) else math.inf
 
     def pairs(order: Sequence[int]) -> list[tuple[Camera, Camera]]:
         return [

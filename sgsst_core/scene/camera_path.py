@@ -26,6 +26,10 @@ _COSINE_ROUNDING = 1e-6
 _SHORTER = 0.5
 #: Rotation, and change of the focal length's logarithm, that take as long as the median distance of two cameras.
 _UNIT_ROTATION, _UNIT_ZOOM = math.radians(30), math.log(1.5)
+#: Distances between cameras at or below this fraction of their mean are jitter of a camera that stands.
+_JITTER = 0.1
+#: Rounding of positions, relative to the largest coordinate.
+_POSITION_ROUNDING = 1e-9
 #: Smaller changes between two cameras, in these units, are rounding: the cameras coincide.
 _NO_CHANGE = 1e-9
 
@@ -158,6 +162,16 @@ def similarly_rotated(rotations: Tensor, rotation: Tensor) -> Tensor:
     return cosine >= math.cos(LARGEST_ROTATION) - _COSINE_ROUNDING
 
 
+def moved(distances: NDArray[np.float64], centers: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return for which distances [n] between some of the camera centers [m, 3] a camera has moved, as [n] bool.
+
+    Rounding of the coordinates and jitter of cameras at one station do not count.
+    """
+    jitter = _JITTER * distances.sum() / max(len(distances), 1)
+    mask: NDArray[np.bool_] = distances > max(jitter, _POSITION_ROUNDING * np.abs(centers).max())
+    return mask
+
+
 def framed(camera: Camera, side: int | None, *, even: bool) -> Camera:
     """Return a camera of a video at another size, cropped by at most one pixel per axis to even sides.
 
@@ -180,14 +194,18 @@ def framed(camera: Camera, side: int | None, *, even: bool) -> Camera:
 
 
 def _changes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """Return the change [n - 1] between consecutive cameras, where 1 is the median distance of two that differ."""
-    distances = np.linalg.norm(np.diff(_centers(cameras), axis=0), axis=1)
-    moved = distances[distances > 0]
+    """Return the change [n - 1] between consecutive cameras, where 1 is the median distance of those that moved.
+
+    If none moved, it is that of the rotation and zoom.
+    """
+    centers = _centers(cameras)
+    distances = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    moves = distances[moved(distances, centers)]
     rotations = Rotation.from_matrix(_rotations(cameras))
     angles = (rotations[:-1].inv() * rotations[1:]).magnitude() if len(cameras) > 1 else np.zeros(0)
     zooms = np.abs(np.diff([_relative_intrinsics(camera)[:2] for camera in cameras], axis=0)).max(axis=1, initial=0.0)
-    moves = distances / np.median(moved) if len(moved) else distances
-    changes: NDArray[np.float64] = np.max([moves, angles / _UNIT_ROTATION, zooms / _UNIT_ZOOM], axis=0)
+    relative = distances / np.median(moves) if len(moves) else np.zeros_like(distances)
+    changes: NDArray[np.float64] = np.max([relative, angles / _UNIT_ROTATION, zooms / _UNIT_ZOOM], axis=0)
     return changes
 
 

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sgsst_core.errors import CameraError
+from sgsst_core.quality.novel_cameras import neighbors
 from sgsst_core.scene.camera import Camera, look_at
-from sgsst_core.scene.camera_path import CameraPath, catmull_rom_tangents, framed, in_path_order
+from sgsst_core.scene.camera_path import CameraPath, catmull_rom_tangents, framed, in_path_order, moved
 
 
 def camera(center, rotation=None, focal=100.0, size=(64, 48)):
@@ -71,6 +72,29 @@ def test_positions_are_those_of_the_barry_goldman_pyramid():
     centers = np.stack([c.center.numpy() for c in cameras])
     expected = np.stack([barry_goldman(path.knots, centers, time) for time in times])
     assert np.allclose([c.center.numpy() for c in path.at(times)], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("origin", "jitter"), [(0.0, 1e-3), (4.2e6, 1e-10)])
+def test_jitter_at_stations_does_not_change_the_timing(origin, jitter):
+    noise = np.random.default_rng(0).normal(0, jitter, (24, 3))
+    still = [camera([origin + index // 8, 0, 0], rotated(45 * index)) for index in range(24)]
+    shaken = [camera([origin + index // 8, 0, 0] + noise[index], rotated(45 * index)) for index in range(24)]
+    assert np.allclose(CameraPath(shaken).knots, CameraPath(still).knots, rtol=1e-2)
+    assert len(neighbors(shaken)) == len(neighbors(still)) == 23
+
+
+def test_jitter_of_a_pan_does_not_count_as_motion():
+    noise = np.random.default_rng(0).normal(0, 1e-10, (24, 3))
+    pan = [camera([1.0, 2.0, 3.0] + noise[index], rotated(15 * index)) for index in range(24)]
+    assert np.allclose(np.diff(CameraPath(pan).knots), math.sqrt(0.5))
+    assert len(neighbors(pan)) == 23
+
+
+@pytest.mark.parametrize("count", [3, 5000])
+def test_every_camera_of_an_arc_has_moved(count):
+    angles = np.linspace(0, 2, count)
+    centers = 1e3 + np.stack([np.sin(angles), np.cos(angles), angles], axis=1)
+    assert moved(np.linalg.norm(np.diff(centers, axis=0), axis=1), centers).all()
 
 
 def test_knots_are_centripetal_where_cameras_move():
