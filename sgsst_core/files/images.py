@@ -39,6 +39,8 @@ WHITE: Color = (1.0, 1.0, 1.0)
 #: Formats whose further images are no frames, but previews or maps of the brightness.
 _STILL = ("JPEG", "MPO", "HEIF")
 _JPEG_QUALITY = 95
+#: Largest pixel of a float image whose white is 1. Resampling and sharpening overshoot.
+_OVERSHOOT = 2.0
 _EXIF_ORIENTATION = 0x0112
 #: EXIF orientations that swap width and height.
 _SWAPPING = (5, 6, 7, 8)
@@ -248,12 +250,15 @@ def _to_rgb(path: Path, image: Image.Image, profile: ColorProfile | None, backgr
 def _full_scale(mode: str, largest: float) -> float:
     """Return the pixel value of white.
 
-    For float and 32-bit images, it is the smallest common maximum (1, 255 or 65535) that no pixel exceeds.
+    For float and 32-bit images, it is the smallest common maximum (1, 255 or 65535) that no pixel exceeds. Floats
+    up to 2 count as overshoot of an image whose white is 1.
     """
     if mode.startswith("I;16"):
         return 65535.0
-    ranges = (1.0, 255.0, 65535.0) if mode == "F" else (65535.0,)
-    return next((full for full in ranges if largest <= full), max(largest, 1.0))
+    ranges = (255.0, 65535.0) if mode == "F" else (65535.0,)
+    if mode == "F" and largest <= _OVERSHOOT:
+        return 1.0
+    return next((full for full in ranges if largest <= full), largest)
 
 
 def _save(path: Path, image: Tensor, **options: Any) -> None:

@@ -103,6 +103,12 @@ def test_gray_of_8_16_and_32_bits_is_read(tmp_path: Path) -> None:
     assert torch.equal(one[:, :, 2], torch.from_numpy(narrow > 100).float())
 
 
+def test_overshoot_of_float_pixels_is_clipped(tmp_path: Path) -> None:
+    for values, expected in (([0.5, 1.0001], [0.5, 1]), ([0.5, 2.0], [0.5, 1]), ([51.0, 2.5], [0.2, 2.5 / 255])):
+        image = load_image(save(tmp_path / "a.tif", Image.fromarray(np.array([values], dtype="f4"))))
+        assert image[0, :, 0].tolist() == pytest.approx(expected)
+
+
 def test_transparent_16_bit_gray_is_composited(tmp_path: Path) -> None:
     values = np.array([[1000, 2000]], dtype="u2")
     image = load_image(save(tmp_path / "a.png", Image.fromarray(values), transparency=1000))
