@@ -6,9 +6,9 @@ Kokaram, "The Linear Monge-Kantorovitch Linear Color Mapping for Example-Based C
 
     A = S^-1/2 (S^1/2 T S^1/2)^1/2 S^-1/2,   c -> A (c - m) + m_style
 
-where S and m are the scene's covariance and mean, and T the style's covariance. Colors that this map moves out of 0..1
-are clipped. For a dark object and a bright style of two colors, only a pale gray would be left, which is why
-`warm_start` does not use it.
+where S and m are the scene's covariance and mean, and T the style's covariance. Colors outside 0..1, of the scene or
+moved there by this map, are clipped. For a dark object and a bright style of two colors, only a pale gray would be
+left, which is why `warm_start` does not use it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def warm_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
 
 def with_moments(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
     """Return DC coefficients with the style's mean and covariance, clipped to 0..1; arguments as in `warm_start`."""
-    colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
+    colors = (COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)
     mean, covariance = color_moments(colors, weights.double() / weights.double().amax())
     wanted_mean, wanted = style_moments(style)
     matched = (colors - mean) @ _monge_map(covariance, wanted.to(mean)).T + wanted_mean.to(mean)
@@ -84,8 +84,9 @@ def luminance_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
     Returns:
         [N, 3] float32.
     """
-    own = luminance(COLOR_OFFSET + SH_C0 * sh_dc.double())
-    matched = _matched(own, _luminance_moments(own, weights.double()), _style_luminance(style))
+    colors = COLOR_OFFSET + SH_C0 * sh_dc.double()
+    own, shown = luminance(colors), luminance(colors.clamp(0, 1))
+    matched = _matched(shown, _luminance_moments(shown, weights.double()), _style_luminance(style))
     return (sh_dc.double() + ((matched - own) / SH_C0)[:, None]).to(sh_dc.dtype)
 
 

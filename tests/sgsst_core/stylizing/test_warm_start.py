@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.style import Style
-from sgsst_core.stylizing.warm_start import warm_start, with_moments
+from sgsst_core.stylizing.warm_start import luminance_start, warm_start, with_moments
 from tests.sgsst_core.synthetic_images import synthetic_image
 
 Start = Callable[[Tensor, Tensor, Style], Tensor]
@@ -54,6 +54,17 @@ def test_matching_colors_are_unchanged(start: Start) -> None:
         torch.testing.assert_close(started, sh_dc, rtol=1e-4, atol=1e-4)
     else:
         torch.testing.assert_close(colors_of(started), colors_of(sh_dc), rtol=0, atol=0.06)
+
+
+@pytest.mark.parametrize("start", [with_moments, luminance_start])
+def test_extreme_color_does_not_flatten_the_others(start: Start) -> None:
+    style = synthetic_image(30, 30, seed=2).float()
+    sh_dc = (torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) - 0.5) / SH_C0
+    extreme = sh_dc.clone()
+    extreme[0] = 1e4
+    ones = torch.ones(2000, dtype=torch.float64)
+    usual = start(sh_dc, ones, Style.of(style))
+    torch.testing.assert_close(start(extreme, ones, Style.of(style))[1:], usual[1:], rtol=0, atol=0.02)
 
 
 def test_dark_scene_gets_both_colors_of_a_bright_style() -> None:
