@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sgsst_core.constants import NEAR
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, spread
 
@@ -133,13 +134,14 @@ class DepthBands(ViewMaps):
         return torch.cat(parts)
 
 
-def mean_level(means: Tensor, weights: Tensor, cameras: Sequence[Camera]) -> float:
+def mean_level(means: Tensor, weights: Tensor, cameras: Sequence[Camera], near: float = NEAR) -> float:
     """Return the mean logarithm to base 2 of pixels per scene unit, over a few views and the Gaussians in them.
 
     Args:
         means: [N, 3], positions of the Gaussians.
         weights: [N] float64, total blend weights.
         cameras: Cameras of views that see something.
+        near: Near plane in world units; nearer Gaussians do not count.
     """
     sums = torch.zeros(2, dtype=torch.float64)
     for camera in spread(cameras, _LEVEL_VIEWS):
@@ -147,7 +149,7 @@ def mean_level(means: Tensor, weights: Tensor, cameras: Sequence[Camera]) -> flo
             points = _in_camera(means[rows], camera)
             x, y, z = points.unbind(1)
             column, row = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
-            inside = (z > 0) & (column > 0) & (column < camera.width * z) & (row > 0) & (row < camera.height * z)
+            inside = (z >= near) & (column > 0) & (column < camera.width * z) & (row > 0) & (row < camera.height * z)
             inside &= weights[rows] > 0
             own = weights[rows][inside]
             sums += torch.stack([own @ _levels(points[inside], camera), own.sum()])

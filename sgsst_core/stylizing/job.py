@@ -339,7 +339,7 @@ def _job_styles(
     styles = JobStyles.prepared(Style.of(style), regions, settings, scene.sh_dc, blend_weights)
     if not settings.stroke_depth:
         return styles
-    level = mean_level(scene.means, blend_weights, [cameras[index] for index in plan.covered])
+    level = mean_level(scene.means, blend_weights, [cameras[index] for index in plan.covered], settings.near)
     return replace(styles, bands=band_count(cameras, settings), mean_level=level)
 
 

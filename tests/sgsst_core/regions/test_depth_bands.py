@@ -95,6 +95,14 @@ def test_mean_level_is_that_of_what_the_views_show() -> None:
     assert mean_level(scene.means, weights, [view]) == pytest.approx(total / summed, abs=1e-9)
 
 
+def test_mean_level_ignores_what_the_near_plane_cuts() -> None:
+    view = camera()
+    to_world = view.world_to_camera.double().inverse()
+    far, near = (to_world @ torch.tensor([0, 0, depth, 1.0], dtype=torch.float64) for depth in (5.0, 1e-6))
+    means, weights = torch.stack([far, far, near])[:, :3].float(), torch.ones(3, dtype=torch.float64)
+    assert mean_level(means, weights, [view]) == mean_level(means[:2], weights[:2], [view])
+
+
 @pytest.mark.parametrize("bands", [2, 4])
 def test_loss_of_bands_agrees_with_the_float64_reference(tiny_weights: BackboneWeights, bands: int) -> None:
     """The reference compares each scale with the style in its own band; missing scales count as the coarsest."""
