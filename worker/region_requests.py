@@ -30,6 +30,8 @@ from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style
 REST = "rest"
 #: Maximum number of regions, the rest excluded.
 MOST_REGIONS = 16
+#: Maximum weight of a region. Larger ones can raise the gradient beyond `LARGEST_GRADIENT`.
+MOST_REGION_WEIGHT = 1e6
 _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,31}"
 _COMPARISON = re.compile(r"(?P<name>[^<>=!]+)(?P<sign>>=|<=|!=|>|<|=)(?P<value>.+)", re.DOTALL)
 _COUNTS = {"box": 6, "sphere": 4, "half-space": 4}
@@ -111,7 +113,7 @@ class RegionOptions(BaseModel):
         examples=["wave.jpg"],
     )
     weight: float = Field(
-        1.0, gt=0, le=1e12, allow_inf_nan=False, description="Weight of the region's style in the loss."
+        1.0, gt=0, le=MOST_REGION_WEIGHT, allow_inf_nan=False, description="Weight of the region's style in the loss."
     )
     freeze: bool = Field(False, description="Freeze the region: its colors stay bit-identical.")
     content_weight: Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False), OR_STRENGTH] | None = Field(
@@ -234,8 +236,8 @@ def region_options(
         name, _, value = text.partition("=")
         region = known(name, f"--region-weight {text}")
         weight = _number(value, text, "--region-weight")
-        if not 0 < weight <= 1e12:
-            raise SettingsError(f"--region-weight {text}: the weight must be greater than 0 and at most 1e12.")
+        if not 0 < weight <= MOST_REGION_WEIGHT:
+            raise SettingsError(f"--region-weight {text}: the weight must be greater than 0 and at most 1,000,000.")
         by_name[name] = region.model_copy(update={"weight": weight})
     for text in content_weights:
         name, _, value = text.partition("=")

@@ -120,6 +120,14 @@ def test_json_regions_have_content_weights_by_name_or_number() -> None:
             checked(RegionOptions, {"name": "a", "select": "sphere=0,0,0,1", "content_weight": weight})
 
 
+def test_region_weights_have_a_maximum() -> None:
+    assert region_requests(region_options([], [], ["rest=1e6"], []))[0].weight == 1e6
+    with pytest.raises(SettingsError, match="at most 1,000,000"):
+        region_options([], [], ["rest=1.1e6"], [])
+    with pytest.raises(SettingsError, match="weight"):
+        checked(RegionOptions, {"name": REST, "weight": 1.1e6})
+
+
 def test_json_regions_need_selections_and_unique_names() -> None:
     with pytest.raises(SettingsError, match="needs a SPEC"):
         region_requests([RegionOptions(name="a")])
