@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 #: Number of values of a codebook, one per byte.
 VALUES = 256
 _VALUE_ITERATIONS = 60
+#: Maximum number of starts of a codebook. Only numbers with extreme values need more than one.
+_VALUE_STARTS = 4
 
 #: Clusters of the first level of a palette, rows that they are fitted to, and iterations per level.
 _COARSE = 256
@@ -29,7 +31,8 @@ def value_codebook(values: NDArray[Any]) -> NDArray[np.float32]:
     """Return the codebook of numbers of any shape, [VALUES] float32 in ascending order, padded with its largest value.
 
     Lloyd's algorithm on sorted numbers: a cluster is an interval, whose mean follows from two cumulative sums. It
-    starts with entries whose density is the cube root of that of the numbers, which is best for a fine quantizer.
+    starts with entries whose density is the cube root of that of the numbers, which is best for a fine quantizer. While
+    extreme numbers leave most entries unused, these are moved to where the error is.
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     distinct = ordered[np.concatenate([[True], ordered[1:] != ordered[:-1]])]
@@ -38,13 +41,33 @@ def value_codebook(values: NDArray[Any]) -> NDArray[np.float32]:
     origin = ordered.mean()  # sums of differences from the mean cancel less
     sums = np.concatenate([[0.0], np.cumsum(ordered - origin)])
     codebook = _companded(ordered)
-    for _ in range(_VALUE_ITERATIONS):
-        edges = np.concatenate([[0], np.searchsorted(ordered, _middles(codebook)), [len(ordered)]])
-        counts = np.diff(edges)
-        means = origin + np.diff(sums[edges]) / np.maximum(counts, 1)
-        codebook = np.sort(np.where(counts > 0, means, codebook))
-    entries = codebook.astype(np.float32)
-    return _padded(entries[np.unique(nearest_entries(ordered, entries))])
+    for _ in range(_VALUE_STARTS):
+        for _ in range(_VALUE_ITERATIONS):
+            edges = np.concatenate([[0], np.searchsorted(ordered, _middles(codebook)), [len(ordered)]])
+            counts = np.diff(edges)
+            means = origin + np.diff(sums[edges]) / np.maximum(counts, 1)
+            codebook = np.sort(np.where(counts > 0, means, codebook))
+        entries = codebook.astype(np.float32)
+        used = entries[np.unique(nearest_entries(ordered, entries))]
+        if len(used) >= VALUES // 2:
+            break
+        codebook = _with_unused_entries(ordered, used)
+    return _padded(used)
+
+
+def _with_unused_entries(ordered: NDArray[np.float64], used: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Add entries up to VALUES, in each cluster of sorted numbers in proportion to the cube root of its squared error.
+
+    They are evenly spaced within the numbers of a cluster.
+    """
+    labels = nearest_entries(ordered, used)
+    first = np.searchsorted(labels, np.arange(len(used)))
+    last = np.append(first[1:], len(ordered)) - 1
+    cumulative = np.cumsum(np.cbrt(np.bincount(labels, (ordered - used[labels]) ** 2)))
+    bounds = np.repeat(np.append(0.0, cumulative), 2)[1:-1]
+    shares = (np.arange(VALUES - len(used)) + 0.5) / (VALUES - len(used))
+    added = np.interp(shares * cumulative[-1], bounds, np.stack([ordered[first], ordered[last]], axis=1).ravel())
+    return np.sort(np.concatenate([used, added]))
 
 
 def _padded(entries: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -34,6 +34,18 @@ def test_values_get_their_nearest_entry_and_a_small_error() -> None:
     assert error(values, wide[labels]) < 1.05 * error(values, reference[other, 0])
 
 
+def test_extreme_values_leave_the_others_their_entries() -> None:
+    values = np.random.default_rng(0).normal(size=20_000).astype(np.float32)
+    usual = value_codebook(values)
+    usual_error = error(values, usual[nearest_entries(values, usual)])
+    for extremes in ([1e3], [1e7], [-1e7], [1e3, 1e7, -1e5]):
+        extreme = np.concatenate([values, np.float32(extremes)])
+        codebook = value_codebook(extreme)
+        nearest = codebook[nearest_entries(extreme, codebook)]
+        assert error(values, nearest[: len(values)]) < 1.2 * usual_error
+        np.testing.assert_allclose(nearest[len(values) :], extremes, rtol=1e-6)
+
+
 def test_few_distinct_rows_are_stored_exactly() -> None:
     generator = np.random.default_rng(2)
     rows = generator.normal(size=(300, 9)).astype(np.float32)[generator.integers(0, 300, 5000)]
