@@ -252,6 +252,8 @@ class _Scene:
         for name, values in (("DC", self.scene.sh_dc), ("higher", self.scene.sh_rest)):
             if values.shape[1]:
                 done = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
+                if name == "DC":
+                    done += "; --target-loss may be reached at once, because they raise the initial loss"
                 question = _Question(f"{name} SH coefficients above {LARGE_COEFFICIENT:g}", done)
                 findings += self.ask(_large_coefficients(values), question)
         return findings

@@ -97,6 +97,7 @@ def test_extreme_gaussians_are_counted_and_the_worst_is_named(
     assert (finding.count, finding.total) == (len(rows), len(scene))
     assert finding.worst.startswith(worst)
     assert finding.done
+    assert ("--target-loss" in finding.done) == (column == "sh_dc")
 
 
 def test_findings_do_not_depend_on_the_slice_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
