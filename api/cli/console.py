@@ -22,9 +22,11 @@ error_console = Console(stderr=True, highlight=False, markup=False, emoji=False,
 
 
 def loss_text(before: float, after: float) -> str:
-    """Return the loss before and after a job, and their ratio."""
+    """Return the loss before and after a job, and their ratio; say so if the loss has risen."""
     relative = ratio(after, before)
-    return f"{before:.4g} before, {after:.4g} after" + ("" if relative is None else f" ({relative:.1%})")
+    text = f"{before:.4g} before, {after:.4g} after" + ("" if relative is None else f" ({relative:.1%})")
+    risen = "; it has risen: give more steps, unless the scene already matched the style"
+    return text + (risen if after > before else "")
 
 
 def print_field(name: str, value: object) -> None:

@@ -205,7 +205,10 @@ def test_initial_loss_of_zero_has_no_ratio(finished: tuple[Stylizer, Evaluation,
     assert report["loss_over_time"] is None
     assert "–" in render_page(report, None)
     result = Result("finished", 7, 7, nothing, after)
-    assert loss_text(*result.losses) == f"0 before, {mean_loss(after):.4g} after"
+    assert loss_text(*result.losses).startswith(f"0 before, {mean_loss(after):.4g} after; it has risen")
+    assert loss_text(0.0, 0.0) == "0 before, 0 after"
+    assert loss_text(4.0, 1.0) == "4 before, 1 after (25.0%)"
+    assert "(150.0%); it has risen" in loss_text(2.0, 3.0)
     assert Result("finished", 7, 7, before, nothing).losses == (mean_loss(before), 0)
 
 
