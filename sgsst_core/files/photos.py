@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 import torch
 from PIL import Image
@@ -50,18 +50,25 @@ class PhotoFolder:
 
     Args:
         folder: Existing folder.
+        masks: Whether the files are masks, which may also be named as those of COLMAP (0001.jpg.png) and RealityScan
+            (0001.jpg.mask.png) if no file has a camera's name.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, masks: bool = False) -> None:
         self._folder = folder
         self._extensions = {*Image.registered_extensions(), *HEIF_SUFFIXES}
         #: Files by every trailing part of their relative path, without extension.
         self._index: dict[tuple[str, ...], list[Path]] = {}
+        #: Masks by their names without `.mask`, and without the extension of a photo.
+        self._masks: dict[tuple[str, ...], list[Path]] = {}
         for path in sorted(folder.rglob("*")):
             if path.suffix.lower() in self._extensions and not path.name.startswith(".") and path.is_file():
-                parts = path.relative_to(folder).with_suffix("").parts
-                for start in range(len(parts)):
-                    self._index.setdefault(parts[start:], []).append(path)
+                stem = path.relative_to(folder).with_suffix("")
+                _add(self._index, stem, path)
+                if masks:
+                    photo = stem.with_suffix("") if stem.suffix.lower() == ".mask" else stem
+                    for name in {photo, self._without_extension(photo)}:
+                        _add(self._masks, name, path)
 
     def named(self, name: str) -> list[Path]:
         """Return the files that match a camera's name best.
@@ -69,14 +76,25 @@ class PhotoFolder:
         The longest matching path wins, then files outside deeper subfolders, then files with the exact extension.
         """
         wanted = PurePosixPath(name.replace("\\", "/"))
-        known = wanted.suffix.lower() in self._extensions
-        parts = tuple(part for part in (wanted.with_suffix("") if known else wanted).parts if part not in ("..", "/"))
-        for start in range(len(parts)):
-            paths = self._index.get(parts[start:], [])
-            if paths:
-                direct = [path for path in paths if path.parent == self._folder.joinpath(*parts[start:-1])] or paths
-                return [path for path in direct if path.suffix == wanted.suffix] or direct
+        stem = self._without_extension(wanted)
+        for index, key in ((self._index, stem), (self._masks, wanted), (self._masks, stem)):
+            parts = tuple(part for part in key.parts if part not in ("..", "/"))
+            for start in range(len(parts)):
+                paths = index.get(parts[start:], [])
+                if paths:
+                    direct = [path for path in paths if path.parent == self._folder.joinpath(*parts[start:-1])] or paths
+                    return [path for path in direct if path.suffix == wanted.suffix] or direct
         return []
+
+    def _without_extension(self, name: PurePath) -> PurePath:
+        """Return a name without the extension of an image."""
+        return name.with_suffix("") if name.suffix.lower() in self._extensions else name
+
+
+def _add(index: dict[tuple[str, ...], list[Path]], name: PurePath, path: Path) -> None:
+    """Add a file to an index under every trailing part of its name."""
+    for start in range(len(name.parts)):
+        index.setdefault(name.parts[start:], []).append(path)
 
 
 def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
@@ -112,7 +130,7 @@ def some_names(names: Sequence[str]) -> str:
 
 
 def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
-    """Find the masks of cameras by name, as `check_photos` finds photos. Only headers are read.
+    """Find the masks of cameras by name (see `PhotoFolder`). Only headers are read.
 
     Returns:
         Mask of each camera; None for a camera without one.
@@ -122,7 +140,7 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     """
     if not folder.is_dir():
         raise ImageError(f"{folder}: is not a folder of masks. Give the folder that the cameras' names refer to.")
-    files = PhotoFolder(folder)
+    files = PhotoFolder(folder, masks=True)
     masks: list[Photo | None] = []
     for camera in cameras:
         paths = files.named(camera.name)
@@ -132,7 +150,7 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     if not any(masks):
         raise ImageError(
             f"{folder}: holds no mask for any of {len(cameras)} views. Masks are found by the cameras' names, with or "
-            f"without extension, such as {cameras[0].name}."
+            f"without extension, or with `.png` or `.mask.png` behind it, such as {cameras[0].name}."
         )
     return masks
 

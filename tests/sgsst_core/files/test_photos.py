@@ -12,7 +12,7 @@ from PIL import Image
 
 from sgsst_core.errors import ImageError
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.photos import Photo, check_photos, load_photo
+from sgsst_core.files.photos import Photo, check_photos, find_masks, load_photo
 from sgsst_core.scene.camera import Camera, resized
 
 
@@ -60,6 +60,33 @@ def test_rig_photos_are_matched_by_folder_and_extension(tmp_path: Path) -> None:
     assert [str(path.relative_to(tmp_path)) for path in matched] == ["cam1/a.png", "cam0/a.png", "cam1/a.jpg", "b.png"]
     with pytest.raises(ImageError, match="more than one photo for 2 of 3 views: a, cam1/a"):
         check_photos(tmp_path, [camera("a"), camera("b"), camera("cam1/a")])
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("a.jpg.png", "a.jpg"),
+        ("a.jpg.png", "a"),
+        ("a.jpg.mask.png", "images/a.jpg"),
+        ("a.mask.png", "a.jpg"),
+        ("cam1/a.jpg.png", "images/cam1/a.jpg"),
+        ("a.v2.png", "a.v2.jpg"),
+    ],
+)
+def test_masks_are_found_by_the_conventions_of_colmap_and_realityscan(tmp_path: Path, file: str, name: str) -> None:
+    save(tmp_path / "cam0" / "other.jpg.png", Image.new("RGB", (90, 60)))
+    path = save(tmp_path / file, Image.new("RGB", (90, 60)))
+    assert paths(find_masks(tmp_path, [camera(name)])) == [path]
+    if path.stem != "a.v2":
+        with pytest.raises(ImageError, match="no photo"):
+            check_photos(tmp_path, [camera(name)])
+
+
+def test_masks_named_as_their_cameras_come_first(tmp_path: Path) -> None:
+    for name in ("a.png", "a.jpg.png", "b.jpg.png", "b.png.png"):
+        save(tmp_path / name, Image.new("RGB", (90, 60)))
+    masks = find_masks(tmp_path, [camera(name) for name in ("a.jpg", "b.jpg", "b.png")])
+    assert [path.name for path in paths(masks)] == ["a.png", "b.jpg.png", "b.png.png"]
 
 
 def test_missing_photos_are_named(tmp_path: Path) -> None:
