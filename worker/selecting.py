@@ -112,5 +112,5 @@ def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], nea
 
 
 def _load_mask(mask: Photo, camera: Camera) -> Tensor:
-    """Load a mask, [H, W] in 0..1; white is inside."""
+    """Load a mask, [H, W] in 0..1; what is white and opaque is inside."""
     return load_photo(mask, camera, color_managed=False).mean(dim=2)

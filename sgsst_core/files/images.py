@@ -34,6 +34,7 @@ MAX_JPEG_SCANS = 100
 
 #: sRGB color, each channel in 0..1.
 Color = tuple[float, float, float]
+BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 
 #: Formats whose further images are no frames, but previews or maps of the brightness.

@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from sgsst_core.errors import ImageError
-from sgsst_core.files.images import HEIF_SUFFIXES, load_image, stored_size
+from sgsst_core.files.images import BLACK, HEIF_SUFFIXES, Color, load_image, stored_size
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import undistort
 
@@ -155,16 +155,22 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     return masks
 
 
-def load_photo(photo: Photo, camera: Camera, *, color_managed: bool = True) -> Tensor:
+def load_photo(photo: Photo, camera: Camera, *, background: Color = BLACK, color_managed: bool = True) -> Tensor:
     """Read a photo as its pinhole camera sees it: [height, width, 3] float32 in 0..1.
 
     If the camera has a lens, its distortion is removed (`undistort`). Otherwise the photo is resized to the camera's
     size (antialiased bicubic).
 
+    Args:
+        photo: Photo of the camera, from `check_photos` or `find_masks`.
+        camera: Camera at the size of the result.
+        background: sRGB color behind transparent parts, in 0..1; black, as in masks and renders, by default.
+        color_managed: Whether the ICC profile is applied. Masks hold no colors.
+
     Raises:
         ImageError: If the photo cannot be read (see `load_image`), or its aspect differs from the camera's.
     """
-    pixels = load_image(photo.path, oriented=photo.oriented, color_managed=color_managed)
+    pixels = load_image(photo.path, background=background, oriented=photo.oriented, color_managed=color_managed)
     if not fits((pixels.shape[1], pixels.shape[0]), camera):
         raise _misfit(photo.path, (pixels.shape[1], pixels.shape[0]), camera)
     if camera.lens is not None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from sgsst_core.errors import ImageError, SceneError, SettingsError
@@ -144,3 +145,18 @@ def test_region_styles_are_loaded(tmp_path: Path, file: SceneFile) -> None:
         2.0,
         "half-space=1,0,0,0",
     )
+
+
+def test_masks_in_the_alpha_channel_select_what_is_opaque(tmp_path: Path) -> None:
+    scene: Scene = wall()
+    file = read_scene(write_files(tmp_path, scene)[0])
+    view = cameras()[0]
+    (tmp_path / "masks").mkdir()
+    right = (scene.means[:, 0] > 0).float()[:, None].expand(-1, 3).contiguous()
+    alpha = (make_rasterizer("cpu", scene).render(right, view)[..., 0] * 255).round().to(torch.uint8)
+    image = Image.new("RGBA", (view.width, view.height), "white")
+    image.putalpha(Image.fromarray(alpha.numpy()))
+    image.save(tmp_path / "masks" / f"{view.name}.png")
+    selected = select(parse_selection(f"masks={tmp_path / 'masks'}", "a"), file, [view], 0.2)
+    clear = scene.means[:, 0].abs() > 0.15
+    assert torch.equal(selected[clear], scene.means[clear, 0] > 0)
