@@ -67,11 +67,14 @@ class Inputs:
     regions: Regions | None
     fingerprint: str
 
-    @property
-    def load_photo(self) -> Callable[[int], Tensor] | None:
-        """Return a function that loads the photo of a camera by its index; None if the job has no photos."""
+    def photo_loader(self, background: Color) -> Callable[[int], Tensor] | None:
+        """Return a function that loads the photo of a camera by its index; None if the job has no photos.
+
+        Args:
+            background: Background color of the job, which transparent parts of photos get as renders do.
+        """
         photos, cameras = self.photos, self.cameras
-        return (lambda index: load_photo(photos[index], cameras[index])) if photos else None
+        return (lambda index: load_photo(photos[index], cameras[index], background=background)) if photos else None
 
 
 def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> Inputs:

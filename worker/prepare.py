@@ -127,7 +127,7 @@ def prepare(
             inputs.style,
             settings,
             weights=inputs.weights,
-            photos=inputs.load_photo,
+            photos=inputs.photo_loader(settings.background),
             collectives=collectives,
             planning_context=planning_context,
             regions=regions,

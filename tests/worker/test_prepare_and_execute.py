@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.formats import by_name
@@ -22,6 +23,7 @@ from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.small_scenes import wall
 from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import Result, execute
+from worker.inputs import read_inputs
 from worker.options import JobVideo
 from worker.prepare import Job, prepare
 from worker.previews import Previews
@@ -53,6 +55,23 @@ def run_job(
 @pytest.fixture
 def request_(tmp_path: Path) -> StylizeRequest:
     return small_request(tmp_path, 8)
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.0, 0.2)])
+def test_transparent_parts_of_photos_get_the_background_of_the_job(
+    tmp_path: Path, background: tuple[float, float, float]
+) -> None:
+    request = small_request(tmp_path, 8, background=background)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in ("view_0", "view_1", "view_2"):
+        image = Image.new("RGBA", (64, 48), (0, 255, 0, 255))
+        image.paste((9, 9, 9, 0), (0, 0, 32, 48))
+        image.save(photos / f"{name}.png")
+    load = read_inputs(replace(request, images=photos)).photo_loader(request.settings.background)
+    assert load is not None
+    assert load(1)[:, :32].unique(dim=0).unique(dim=1).flatten().tolist() == pytest.approx(list(background))
+    assert load(1)[0, 40].tolist() == [0, 1, 0]
 
 
 @pytest.mark.slow
