@@ -116,7 +116,8 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
     """Return the axes to read an SPZ scene with, and the line for the plan if the cameras decide.
 
     If neither request nor file state them, they are those under which the cameras see the scene. Without cameras, or if
-    both see it, they stay open. Nothing is raised: `read_scene` and `read_capture` report unusable files.
+    they see it under both, the axes stay "auto", and the scene gets a note. Nothing is raised: `read_scene` and
+    `read_capture` report unusable files.
     """
     requested = source.spz_axes
     if source.cameras is None or requested != "auto":
@@ -132,7 +133,7 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
     rdf = shown_by(means, cameras, source.near).typical
     rub = shown_by(means * means.new_tensor([1, -1, -1]), cameras, source.near).typical
     if rub <= _CLEARLY_MORE * rdf:
-        return requested, []
+        return ("rdf" if rdf > _CLEARLY_MORE * rub else requested), []
     reason = f"a typical view has {rub:.1%} of the Gaussians in its frame so, and {rdf:.1%} with rdf; see --spz-axes"
     return "rub", [Decision("axes", "the scene is rotated by 180 degrees about x (rub: y up, z backward)", reason)]
 

@@ -20,6 +20,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
 from tests.small_scenes import ball, cameras, wall, write_files
 from worker.capture import Capture, about_rendering, choose_axes, read_capture
+from worker.description import describe_scene
 from worker.inputs import read_scene_and_capture
 from worker.request import SceneRequest
 
@@ -143,12 +144,34 @@ def test_cameras_determine_axes_of_spz_without_stated_axes(tmp_path: Path) -> No
         source = spz(folder, scene)
         remove_axes(source.scene)
         axes, about = choose_axes(source)
+        assert axes == ("rub" if folder is other else "rdf")
+        assert not read_scene(source.scene, spz_axes=axes).notes
         read = read_scene(source.scene, spz_axes=axes).scene
         assert torch.allclose(read.means, SCENE.means, atol=1e-3)
         assert len(about) == (folder is other)
     assert about[0].decision == "the scene is rotated by 180 degrees about x (rub: y up, z backward)"
     assert choose_axes(source.model_copy(update={"spz_axes": "rdf"}))[1] == []
     assert choose_axes(source.model_copy(update={"cameras": None, "orbit": 3}))[1] == []
+
+
+def test_scene_that_cameras_see_under_both_axes_gets_a_note(tmp_path: Path) -> None:
+    path, shift = tmp_path / "scene.spz", torch.eye(4, dtype=torch.float64)
+    shift[2, 3] = 3
+    views = [replace(view, world_to_camera=view.world_to_camera @ shift) for view in cameras()]
+    centered = replace(ball(), means=ball().means - torch.tensor([0.0, 0.0, 3.0]))
+    write_scene(path, centered, by_name("spz"))
+    source = SceneRequest(scene=path, cameras=write_files(tmp_path, centered, views)[1])
+    assert not describe_axes(source)
+    remove_axes(path)
+    note = "; axes: read as rdf; the file states none. If the scene is upside down, pass --spz-axes rub"
+    assert describe_axes(source) == note
+    assert describe_axes(source.model_copy(update={"cameras": None, "orbit": 3})) == note
+    assert not describe_axes(source.model_copy(update={"spz_axes": "rdf"}))
+
+
+def describe_axes(source: SceneRequest) -> str:
+    """Return what the line about a scene says about its axes."""
+    return describe_scene(read_scene_and_capture(source)[0]).partition("SH degree 0")[2]
 
 
 def remove_axes(path: Path) -> None:

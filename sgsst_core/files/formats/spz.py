@@ -66,6 +66,7 @@ _AXES_NUMBERS: dict[int, Axes] = {0: "rub", 4: "rub", 6: "rdf"}
 #: Extension record of written files, which states the axes of a PLY.
 _AXES_RECORD = struct.pack("<III", _AXES_EXTENSION, 4, 6)
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
+_ASSUMED_AXES = "axes: read as rdf; the file states none. If the scene is upside down, pass --spz-axes rub"
 #: Maximum number of unknown extensions that a note names.
 _NOTED_EXTENSIONS = 8
 
@@ -292,7 +293,7 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
 
 
 def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
-    """Fill the arrays of a scene, and return notes on version 1 to 3.
+    """Fill the arrays of a scene, and return notes on version 1 to 3, and on axes that the file does not state.
 
     Raises:
         SceneError: If a stream is damaged, or not as long as the header declares.
@@ -322,12 +323,12 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
             block = array[start : start + _BLOCK_ROWS]
             block[:] = decode(np.frombuffer(take(len(block) * row_bytes), np.uint8))
     next(streams, None)  # reach the end of the last stream, where its checksum is verified
-    axes = spz.axes
-    if axes == "auto":
-        axes = spz.stated_axes or (_stated_axes(path, bytes(records)) if spz.extended else None) or "rdf"
+    stated_axes = spz.stated_axes or (_stated_axes(path, bytes(records)) if spz.extended else None)
+    axes = stated_axes if spz.axes == "auto" else spz.axes
     if axes == "rub":
         _rotate(into)
-    return () if spz.streams else _notes(spz.degree, bytes(records) if spz.extended else b"")
+    notes = () if spz.streams else _notes(spz.degree, bytes(records) if spz.extended else b"")
+    return notes if axes else (*notes, _ASSUMED_AXES)
 
 
 def _rotate(arrays: Arrays) -> None:

@@ -111,7 +111,10 @@ def test_unknown_extensions_are_noted(tmp_path: Path, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700)), version=version)
     data = path.read_bytes()
-    assert not read_scene(path).notes
+    assert read_scene(path).notes == (
+        "axes: read as rdf; the file states none. If the scene is upside down, pass --spz-axes rub",
+    )
+    assert not read_scene(path, spz_axes="rdf").notes
     records = axes_record(6) + struct.pack("<II", 0xADBE0002, 3) + b"abc" + struct.pack("<II", 7, 0)
     path.write_bytes(with_records(data, records + struct.pack("<II", 9, 1000)))
     assert read_scene(path).notes == ("SPZ extensions 0x7, 0xadbe0002 are unknown and left out",)
