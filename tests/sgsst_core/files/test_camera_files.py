@@ -196,6 +196,18 @@ def test_blender_with_a_broken_image_is_refused(tmp_path: Path) -> None:
         read_cameras(save(tmp_path / "t.json", content))
 
 
+def test_size_of_a_resized_image_is_refused(tmp_path: Path) -> None:
+    content = nerfstudio(views(1))
+    del content["w"], content["h"]
+    path, image = save(tmp_path / "t.json", content), tmp_path / "images" / "img_0.png"
+    image.parent.mkdir()
+    Image.new("RGB", (WIDTH, HEIGHT)).save(image)
+    assert (read_cameras(path)[0].width, read_cameras(path)[0].fx) == (WIDTH, 500)
+    Image.new("RGB", (WIDTH // 2, HEIGHT // 2)).save(image)
+    with pytest.raises(CameraError, match=r"camera 0 .* gives no size, .*seems to be resized; add .* 'w' and 'h'"):
+        read_cameras(path)
+
+
 def test_nerfstudio_training_frame_is_applied(tmp_path: Path) -> None:
     """Cameras moved as by nerfstudio show a scene trained by nerfstudio in the same way."""
     cameras = views()
