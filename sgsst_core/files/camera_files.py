@@ -7,6 +7,7 @@ camera with lens distortion is the pinhole with the same focal lengths and princ
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Mapping
@@ -39,8 +40,10 @@ _RADIAL_NAMES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL"
 _FISHEYE_NAMES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 #: Camera models without a focal length.
 _NO_PINHOLES = ("EQUIRECTANGULAR", "SPHERICAL", "ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
-#: Offset of a principal point from the middle of an image, relative to half its sides, above which an image is taken for
-#: a resized one if the file gives no sizes.
+#: Levels of subfolders that are searched for a COLMAP model, and entries per folder and folders per level.
+_SEARCHED_LEVELS, _SEARCHED_ENTRIES = 3, 100
+#: Offset of a principal point from the middle of an image, relative to half its sides, above which an image counts as
+#: resized if the file gives no sizes.
 _OFF_CENTER = 0.1
 #: COLMAP's camera models with a single focal length; the others have two.
 _ONE_FOCAL = (
@@ -99,8 +102,24 @@ def _read_folder(folder: Path, photos: Path | None) -> list[Camera]:
             return read_cameras(folder / name, photos)
     if _has_model(folder / "colmap" / "sparse" / "0"):
         return _read_colmap(folder / "colmap" / "sparse" / "0")
+    below = _model_below(folder)
+    if below:
+        raise CameraError(f"{folder}: holds no cameras, but {below} has a COLMAP model. Give that folder.")
     refuse_folder(folder)
     raise CameraError(f"{folder}: holds no cameras in a known format. Give {_FORMATS}.")
+
+
+def _model_below(folder: Path) -> Path | None:
+    """Return the first COLMAP model in subfolders; None if there is none among the entries that are searched."""
+    level = [folder]
+    with contextlib.suppress(OSError):
+        for _ in range(_SEARCHED_LEVELS):
+            entries = [entry for parent in level for entry in sorted(parent.iterdir())[:_SEARCHED_ENTRIES]]
+            level = [entry for entry in entries if entry.is_dir()][:_SEARCHED_ENTRIES]
+            for entry in level:
+                if _has_model(entry):
+                    return entry
+    return None
 
 
 def _has_model(folder: Path) -> bool:

@@ -196,6 +196,14 @@ def test_blender_with_a_broken_image_is_refused(tmp_path: Path) -> None:
         read_cameras(save(tmp_path / "t.json", content))
 
 
+@pytest.mark.parametrize("model", ["model", "sfm/sparse", "colmap/dense/sparse"])
+def test_error_about_a_folder_names_a_model_below(tmp_path: Path, model: str) -> None:
+    colmap(tmp_path / model, views(2), text=True)
+    with pytest.raises(CameraError, match=rf"{tmp_path}: holds no cameras, but {tmp_path / model} has a COLMAP model"):
+        read_cameras(tmp_path)
+    assert len(read_cameras(tmp_path / model)) == 2
+
+
 def test_size_of_a_resized_image_is_refused(tmp_path: Path) -> None:
     content = nerfstudio(views(1))
     del content["w"], content["h"]
