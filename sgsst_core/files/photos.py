@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath, PurePosixPath
 
@@ -47,6 +48,7 @@ class PhotoFolder:
 
     A name matches a file with or without its extension. Leading folders of the name are dropped until a file matches:
     "images/cam0/0001.png" matches FOLDER/images/cam0/0001.png, else FOLDER/cam0/0001.jpg, else FOLDER/0001.jpg.
+    If nothing matches, upper and lower case count as the same, unless that would match several files.
 
     Args:
         folder: Existing folder.
@@ -61,10 +63,13 @@ class PhotoFolder:
         self._index: dict[tuple[str, ...], list[Path]] = {}
         #: Masks by their names without `.mask`, and without the extension of a photo.
         self._masks: dict[tuple[str, ...], list[Path]] = {}
+        #: Files by their names in lower case.
+        self._folded: dict[tuple[str, ...], list[Path]] = {}
         for path in sorted(folder.rglob("*")):
             if path.suffix.lower() in self._extensions and not path.name.startswith(".") and path.is_file():
                 stem = path.relative_to(folder).with_suffix("")
                 _add(self._index, stem, path)
+                _add(self._folded, PurePath(str(stem).casefold()), path)
                 if masks:
                     photo = stem.with_suffix("") if stem.suffix.lower() == ".mask" else stem
                     for name in {photo, self._without_extension(photo)}:
@@ -78,12 +83,25 @@ class PhotoFolder:
         wanted = PurePosixPath(name.replace("\\", "/"))
         stem = self._without_extension(wanted)
         for index, key in ((self._index, stem), (self._masks, wanted), (self._masks, stem)):
-            parts = tuple(part for part in key.parts if part not in ("..", "/"))
-            for start in range(len(parts)):
-                paths = index.get(parts[start:], [])
-                if paths:
-                    direct = [path for path in paths if path.parent == self._folder.joinpath(*parts[start:-1])] or paths
-                    return [path for path in direct if path.suffix == wanted.suffix] or direct
+            paths = self._best(index, key, wanted.suffix)
+            if paths:
+                return paths
+        paths = self._best(self._folded, PurePosixPath(str(stem).casefold()), wanted.suffix)
+        return paths if len(paths) == 1 else []
+
+    def unreadable(self, names: Collection[str]) -> list[str]:
+        """Return the suffixes of files that have these names of cameras, but no suffix of an image."""
+        stems = {self._without_extension(PurePosixPath(name.replace("\\", "/"))).name for name in names}
+        return sorted({path.suffix for path in self._folder.rglob("*") if path.stem in stems} - self._extensions - {""})
+
+    def _best(self, index: dict[tuple[str, ...], list[Path]], name: PurePath, suffix: str) -> list[Path]:
+        parts = tuple(part for part in _normalized(name).parts if part not in ("..", "/"))
+        for start in range(len(parts)):
+            paths = index.get(parts[start:], [])
+            if paths:
+                depth = len(self._folder.parts) + len(parts) - start
+                direct = [path for path in paths if len(path.parts) == depth] or paths
+                return [path for path in direct if path.suffix == suffix] or direct
         return []
 
     def _without_extension(self, name: PurePath) -> PurePath:
@@ -93,8 +111,14 @@ class PhotoFolder:
 
 def _add(index: dict[tuple[str, ...], list[Path]], name: PurePath, path: Path) -> None:
     """Add a file to an index under every trailing part of its name."""
-    for start in range(len(name.parts)):
-        index.setdefault(name.parts[start:], []).append(path)
+    parts = _normalized(name).parts
+    for start in range(len(parts)):
+        index.setdefault(parts[start:], []).append(path)
+
+
+def _normalized(name: PurePath) -> PurePath:
+    """Return a name with composed accents, since macOS stores them decomposed."""
+    return type(name)(unicodedata.normalize("NFC", str(name)))
 
 
 def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
@@ -114,13 +138,24 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     files = PhotoFolder(folder)
     matches = [files.named(camera.name) for camera in cameras]
     missing = [camera.name for camera, paths in zip(cameras, matches, strict=True) if not paths]
-    several = [camera.name for camera, paths in zip(cameras, matches, strict=True) if len(paths) > 1]
-    for what, names, most in (("no photo", missing, MOST_MISSING * len(cameras)), ("more than one photo", several, 0)):
-        if len(names) > most:
-            raise ImageError(
-                f"{folder}: holds {what} for {len(names)} of {len(cameras)} views: {some_names(names)}. Photos are "
-                "found by the cameras' names, with or without extension: give the folder that holds exactly these."
-            )
+    several = {camera.name: paths for camera, paths in zip(cameras, matches, strict=True) if len(paths) > 1}
+    by_name = (
+        "Photos are found by the cameras' names, with or without extension: give the folder that holds exactly these."
+    )
+    if len(missing) > MOST_MISSING * len(cameras):
+        suffixes = files.unreadable(missing)
+        advice = (
+            f"Files of these names are {', '.join(suffixes)}: convert them to PNG or JPEG." if suffixes else by_name
+        )
+        raise ImageError(
+            f"{folder}: holds no photo for {len(missing)} of {len(cameras)} views: {some_names(missing)}. {advice}"
+        )
+    if several:
+        first = " and ".join(str(path.relative_to(folder)) for path in next(iter(several.values()))[:2])
+        raise ImageError(
+            f"{folder}: holds more than one photo for {len(several)} of {len(cameras)} views: {some_names([*several])} "
+            f"(such as {first}). {by_name}"
+        )
     return [_fitting(paths[0], camera) if paths else None for camera, paths in zip(cameras, matches, strict=True)]
 
 

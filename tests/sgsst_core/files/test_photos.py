@@ -44,6 +44,10 @@ def paths(matches: list[Photo | None]) -> list[Path]:
         ("sub/0001.jpg", "0001.jpg"),
         ("frame.0001.jpg", "frame.0001"),
         ("frame.0001.jpg", "frame.0001.jpg"),
+        ("IMG_1.JPG", "img_1.jpg"),
+        ("Cam0/a.jpg", "cam0/A"),
+        ("u\u0308.jpg", "\u00fc.jpg"),
+        ("\u00fc.jpg", "u\u0308.jpg"),
     ],
 )
 def test_photos_are_matched_by_name(tmp_path: Path, file: str, name: str) -> None:
@@ -58,7 +62,8 @@ def test_rig_photos_are_matched_by_folder_and_extension(tmp_path: Path) -> None:
     names = ["cam1/a.png", "images/cam0/a", "cam1/a.jpg", "b.png"]
     matched = paths(check_photos(tmp_path, [camera(name) for name in names]))
     assert [str(path.relative_to(tmp_path)) for path in matched] == ["cam1/a.png", "cam0/a.png", "cam1/a.jpg", "b.png"]
-    with pytest.raises(ImageError, match="more than one photo for 2 of 3 views: a, cam1/a"):
+    several = r"more than one photo for 2 of 3 views: a, cam1/a \(such as cam0/a.png and cam1/a.jpg\)"
+    with pytest.raises(ImageError, match=several):
         check_photos(tmp_path, [camera("a"), camera("b"), camera("cam1/a")])
 
 
@@ -87,6 +92,20 @@ def test_masks_named_as_their_cameras_come_first(tmp_path: Path) -> None:
         save(tmp_path / name, Image.new("RGB", (90, 60)))
     masks = find_masks(tmp_path, [camera(name) for name in ("a.jpg", "b.jpg", "b.png")])
     assert [path.name for path in paths(masks)] == ["a.png", "b.jpg.png", "b.png.png"]
+
+
+def test_case_of_a_name_counts_if_files_differ_by_it(tmp_path: Path) -> None:
+    for name in ("IMG.png", "Img.png", "b.png"):
+        save(tmp_path / name, Image.new("RGB", (90, 60)))
+    matches = check_photos(tmp_path, [camera("IMG"), camera("img"), camera("B")])
+    assert [photo and photo.path.name for photo in matches] == ["IMG.png", None, "b.png"]
+
+
+def test_photos_in_an_unreadable_format_are_named(tmp_path: Path) -> None:
+    for name in ("a.dng", "sub/b.exr", "notes.txt"):
+        save(tmp_path / name, Image.new("RGB", (90, 60)), format="PNG")
+    with pytest.raises(ImageError, match=r"2 views: a\.jpg, b\. Files of these names are \.dng, \.exr: convert them"):
+        check_photos(tmp_path, [camera("a.jpg"), camera("b")])
 
 
 def test_missing_photos_are_named(tmp_path: Path) -> None:
