@@ -34,7 +34,10 @@ _NERFSTUDIO = {key: f"_model.gauss_params.{key}" for key in SPLAT_KEYS.values()}
     "sh0": "_model.gauss_params.features_dc",
     "shN": "_model.gauss_params.features_rest",
 }
-_EXPORT = "Export the scene as PLY with the program that wrote it (`ns-export gaussian-splat` of nerfstudio)."
+_EXPORT = (
+    "Export the scene as PLY with the program that wrote it (`ns-export gaussian-splat` of nerfstudio); the original "
+    "3DGS code has point_cloud/iteration_*/point_cloud.ply beside it."
+)
 #: NumPy's float64 scalar, which nerfstudio's learning rate schedules leave in a checkpoint, under both of its names.
 _NUMPY_SCALARS: list[Any] = [
     *((np.float64().__reduce__()[0], f"numpy.{module}.multiarray.scalar") for module in ("core", "_core")),

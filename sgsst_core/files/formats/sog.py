@@ -39,7 +39,7 @@ from sgsst_core.files.formats.quantized import (
 )
 from sgsst_core.files.formats.render_tag import RenderTag, extras_of, extras_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
-from sgsst_core.files.formats.unsupported import advice, is_checkpoint
+from sgsst_core.files.formats.unsupported import advice, is_checkpoint, is_usdz
 from sgsst_core.files.json_files import json_numbers
 from sgsst_core.scene.rendering import Rendering
 
@@ -179,7 +179,7 @@ def _check_end(path: Path) -> None:
 
 def _matches(start: FileStart) -> bool:
     head = start.head
-    archive = head.startswith(_ZIP_MAGIC) and not is_checkpoint(head)
+    archive = head.startswith(_ZIP_MAGIC) and not is_checkpoint(head) and not is_usdz(head)
     return archive or (head.lstrip().startswith(b"{") and b'"means"' in head)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
@@ -28,22 +29,77 @@ def is_checkpoint(head: bytes) -> bool:
     return (head.startswith(b"PK") and _CHECKPOINT in head[:200]) or head.startswith(_PICKLE)
 
 
+def is_usdz(head: bytes) -> bool:
+    """Return whether the first bytes of a file are those of a USDZ archive, whose first file is a USD layer."""
+    return head.startswith(b"PK") and b".usd" in head[:200]
+
+
+#: What a file is and what to do, by its first bytes without leading blanks and its suffix. The first match counts.
+_KNOWN: tuple[tuple[Callable[[bytes, str], bool], str], ...] = (
+    (lambda head, _: not head, "empty. Copy or export it again."),
+    (
+        lambda head, _: is_checkpoint(head),
+        "a checkpoint, not a scene. Make a PLY of it: `sgsst convert CHECKPOINT scene.ply` (gsplat, nerfstudio) or "
+        "`ns-export gaussian-splat` (nerfstudio); the original 3DGS code has point_cloud/iteration_*/point_cloud.ply "
+        "beside it.",
+    ),
+    (
+        lambda head, _: head.startswith(b"version https://git-lfs"),
+        "a pointer of Git LFS, not the file itself. Run `git lfs pull`.",
+    ),
+    (
+        lambda head, _: _is_html(head) and b"SuperSplat" in head,
+        "a viewer of SuperSplat, with the scene in it or beside it. Export the scene as PLY or SOG instead.",
+    ),
+    (lambda head, _: _is_html(head), "an HTML page, such as an error message. Download the scene again."),
+    (
+        lambda head, _: head.startswith(b"{") and b'"lodLevels"' in head,
+        f"a streamed SOG, whose levels of detail are in other files. {advice('lod-meta.json')}",
+    ),
+    (
+        lambda head, _: head.startswith(b"{") and b'"geometricError"' in head,
+        "a tileset of 3D Tiles, whose data are in other files. Give the scene that it was made of.",
+    ),
+    (
+        lambda head, suffix: suffix in (".lcc", ".lcc2") or (head.startswith(b"{") and b'"totalSplats"' in head),
+        f"a scene of XGRIDS. {advice('scene.lcc')}",
+    ),
+    (
+        lambda head, _: head.startswith((b"PXR-USDC", b"#usda")) or is_usdz(head),
+        "OpenUSD, which is written but not read. Give the scene that it was made of, or export it as PLY.",
+    ),
+    (
+        lambda head, _: head.startswith(b"x,y,z,") and b"f_dc_0" in head,
+        "a table of splat-transform, which cannot be read. Write a PLY instead: `splat-transform SOURCE scene.ply`.",
+    ),
+    (
+        lambda head, suffix: head.startswith(b"RAD0") or suffix == ".rad",
+        "a scene for streaming of Spark. Give the scene that it was made of.",
+    ),
+    (
+        lambda head, suffix: head.startswith(b"spx") or suffix == ".spx",
+        "an SPX scene. Convert it to PLY with gsbox (https://github.com/gotoeasy/gsbox).",
+    ),
+    (
+        lambda head, suffix: suffix == ".gltf" or (head.startswith(b"{") and b'"asset"' in head),
+        "a glTF document whose data are in other files. Save it as one GLB; Gaussians need KHR_gaussian_splatting.",
+    ),
+    (
+        lambda head, suffix: suffix == ".obj" or _is_obj(head),
+        "an OBJ mesh without Gaussians. Train Gaussians on renders of it first.",
+    ),
+)
+
+
 def refuse_unsupported(start: FileStart) -> None:
     """Raise a SceneError that says what to do if the file has a known format that is no scene."""
-    path, head, suffix = start.path, start.head, start.path.suffix.lower()
-    if is_checkpoint(head):
-        raise SceneError(
-            f"{path}: is a checkpoint, not a scene. Make a PLY of it: `sgsst convert CHECKPOINT scene.ply` (gsplat, "
-            "nerfstudio) or `ns-export gaussian-splat` (nerfstudio); the original 3DGS code has "
-            "point_cloud/iteration_*/point_cloud.ply beside it."
-        )
-    if suffix == ".gltf" or (head.lstrip().startswith(b"{") and b'"asset"' in head):
-        raise SceneError(
-            f"{path}: is a glTF document whose data are in other files. Save it as one GLB; Gaussians need "
-            "KHR_gaussian_splatting."
-        )
-    if suffix == ".obj" or _is_obj(head):
-        raise SceneError(f"{path}: is an OBJ mesh without Gaussians. Train Gaussians on renders of it first.")
+    for matches, text in _KNOWN:
+        if matches(start.head.lstrip(), start.path.suffix.lower()):
+            raise SceneError(f"{start.path}: is {text}")
+
+
+def _is_html(head: bytes) -> bool:
+    return head[:20].lower().startswith((b"<!doctype html", b"<html"))
 
 
 def _is_obj(head: bytes) -> bool:
@@ -71,6 +127,8 @@ def refuse_folder(folder: Path) -> NoReturn:
         raise SceneError(
             f"{folder}: is a run of gsplat without a PLY. Make one: `sgsst convert {checkpoint} scene.ply`."
         )
+    if (folder / "lod-meta.json").is_file():
+        raise SceneError(f"{folder}: is a streamed SOG. {advice(str(folder / 'lod-meta.json'))}")
     raise SceneError(f"{folder}: is a folder. Give the file of a scene.")
 
 

@@ -379,7 +379,7 @@ GAUSSIAN = [f"property float {name}" for name in BASE]
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "expected PLY, compressed PLY"),
+        (b"", "is empty"),
         (b"\x89PNG\r\n", "expected PLY, compressed PLY"),
         (b"plywood", "no PLY header"),
         (b"ply\nformat ascii 1.0\nelement vertex 3\n", "no 'end_header'"),

@@ -130,7 +130,7 @@ def write_hostile(case: str, folder: Path) -> Path:
         ("short", "damaged checkpoint"),
         ("half", "cannot be read: File is not a zip file"),
         ("other", "neither a checkpoint of gsplat's trainer nor one of nerfstudio.*ns-export"),
-        ("list", "neither a checkpoint"),
+        ("list", r"neither a checkpoint.*original 3DGS code has point_cloud/iteration_\*/point_cloud\.ply beside it"),
         ("nerfacto", "holds no Gaussians"),
         ("degree 0", "SH degree 0"),
         ("nan", "nan.pt: The scene: `quats` holds 2464 NaN"),
