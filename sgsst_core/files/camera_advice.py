@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from sgsst_core.errors import CameraError
@@ -39,22 +39,67 @@ _NERFSTUDIO_EXPORT = (
 _DATABASE = (
     "a database of COLMAP, which has no poses. Give the sparse model that `colmap mapper` writes, such as sparse/0"
 )
+_AS_COLMAP = "Export the cameras as a COLMAP model, or give those that the scene was trained with"
+_METASHAPE_PROJECT = (
+    "a project of Metashape. Export its cameras as Colmap (File > Export > Export Cameras, version 2.2 or later)"
+)
+_REALITY_CAPTURE_PROJECT = (
+    "data of RealityCapture that only it reads. Export the registration in COLMAP's format from the project"
+)
+_BLOCKS_EXCHANGE = f"a BlocksExchange file. {_AS_COLMAP}"
+_LLFF = "poses of LLFF, computed by COLMAP. Give the COLMAP model, such as sparse/0"
+_NEUS = f"the cameras of a data set for NeuS. {_AS_COLMAP}"
+_MESHROOM = f"a file of Meshroom. {_AS_COLMAP} (Meshroom's node ExportColmap)"
+_PIX4D = f"camera parameters of Pix4D. {_AS_COLMAP}"
+_VISUALSFM = f"a model of VisualSFM. {_AS_COLMAP}"
+_ANIMATION = f"an animation file. {_AS_COLMAP}"
+_VIEWER_PATH = "a camera path of nerfstudio's viewer. Give the transforms.json of the data set"
+_VIEWER_POSES = (
+    "poses or settings of SuperSplat, which have no sizes of images. Give the cameras that the scene was trained with, "
+    "or use --orbit"
+)
+_ARCHIVE = "an archive. Unpack it, and give the folder with the cameras"
 
 #: Advice by the start of a file, in lower case and without a byte order mark or blanks.
 _BY_HEAD: tuple[tuple[Callable[[bytes], bool], str], ...] = (
     (lambda head: head.startswith((b"<?xml", b"<document")) and b"<chunk" in head, _METASHAPE),
     (lambda head: head.startswith(b"#name,x,y,"), _REALITY_CAPTURE),
+    (lambda head: b"<blocksexchange" in head, _BLOCKS_EXCHANGE),
+    (lambda head: head.startswith(b"<realitycaptureproject"), _REALITY_CAPTURE_PROJECT),
     (lambda head: head.startswith(b"# bundle file"), _BUNDLER),
+    (lambda head: head.startswith(b"imagename x y z omega phi kappa"), _PIX4D),
+    (lambda head: head.startswith(b"nvm_v3"), _VISUALSFM),
+    (lambda head: head.startswith((b"ogawa", b"kaydara fbx binary")), _ANIMATION),
     (lambda head: head.startswith(b"sqlite format 3\0"), _DATABASE),
 )
-#: Advice by the suffix of a file, where only its name is known.
-_BY_SUFFIX = {".xml": _METASHAPE, ".csv": _REALITY_CAPTURE, ".out": _BUNDLER, ".r3d": _RECORD3D, ".db": _DATABASE}
+#: Advice by the end of a file's name.
+_BY_SUFFIX = {
+    ".r3d": _RECORD3D,
+    ".psx": _METASHAPE_PROJECT,
+    ".rcproj": _REALITY_CAPTURE_PROJECT,
+    ".xmp": _REALITY_CAPTURE_PROJECT,
+    "poses_bounds.npy": _LLFF,
+    "cameras_sphere.npz": _NEUS,
+    ".sfm": _MESHROOM,
+    "_calibrated_external_camera_parameters.txt": _PIX4D,
+    ".nvm": _VISUALSFM,
+    ".abc": _ANIMATION,
+    ".fbx": _ANIMATION,
+    ".zip": _ARCHIVE,
+}
+#: Likely advice by the end of a file's name, where only the name is known.
+_LIKELY_BY_SUFFIX = {".xml": _METASHAPE, ".csv": _REALITY_CAPTURE, ".out": _BUNDLER, ".db": _DATABASE, **_BY_SUFFIX}
 
 
 def advice_for_name(name: str) -> str:
-    """Return advice for the suffix of a known format, with a leading space; empty for other suffixes."""
-    advice = _BY_SUFFIX.get(PurePosixPath(name).suffix.lower())
+    """Return advice for the name of a file in a known format, with a leading space; empty for other names."""
+    advice = _at_end(name, _LIKELY_BY_SUFFIX)
     return "" if advice is None else f" It may be {advice}."
+
+
+def _at_end(name: str, table: Mapping[str, str]) -> str | None:
+    """Return the advice of the first end of a name in a table; None if there is none."""
+    return next((advice for end, advice in table.items() if name.lower().endswith(end)), None)
 
 
 def refuse_file(path: Path) -> None:
@@ -69,8 +114,9 @@ def refuse_file(path: Path) -> None:
     for matches, advice in _BY_HEAD:
         if matches(head):
             raise _refusal(path, advice)
-    if path.suffix.lower() == ".r3d":
-        raise _refusal(path, _RECORD3D)
+    known = _at_end(path.name, _BY_SUFFIX)
+    if known is not None:
+        raise _refusal(path, known)
 
 
 def refuse_json(path: Path, content: Any) -> None:
@@ -88,6 +134,10 @@ def refuse_json(path: Path, content: Any) -> None:
         ({"cameras", "shots"}, _OPENSFM),
         ({"sfm_data_version"}, _OPENMVG),
         ({"file_path", "transform"}, _NERFSTUDIO_EXPORT),
+        ({"views", "intrinsics", "poses"}, _MESHROOM),
+        ({"camera_path"}, _VIEWER_PATH),
+        ({"position", "target"}, _VIEWER_POSES),
+        ({"tonemapping", "cameras"}, _VIEWER_POSES),
     ):
         if names <= first.keys():
             raise _refusal(path, advice)

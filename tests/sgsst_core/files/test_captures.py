@@ -170,6 +170,22 @@ def test_rig_capture_has_no_points_file(tmp_path: Path) -> None:
         ("reconstruction.json", '[{"cameras": {}, "shots": {}, "points": {}}]', "OpenSfM.*export_colmap"),
         ("sfm_data.json", '{"sfm_data_version": "0.3", "views": []}', "OpenMVG.*openMVG2Colmap"),
         ("transforms_train.json", '[{"file_path": "a.png", "transform": []}]', "`ns-export cameras`.*no focal"),
+        ("b.xml", '<?xml version="1.0"?>\n<BlocksExchange version="3.2">', "a BlocksExchange file.*as a COLMAP model"),
+        ("scan.rcproj", '<RealityCaptureProject id="1"/>', "RealityCapture.*in COLMAP's format"),
+        ("a.xmp", "<x:xmpmeta/>", "RealityCapture.*in COLMAP's format"),
+        ("scan.psx", '<?xml version="1.0"?>\n<document version="1.2.0"/>', "a project of Metashape.*as Colmap"),
+        ("poses_bounds.npy", "\x93NUMPY", "poses of LLFF.*Give the COLMAP model"),
+        ("cameras_sphere.npz", "PK\3\4", "data set for NeuS"),
+        ("cameras.sfm", '{"version": [], "views": [], "intrinsics": [], "poses": []}', "Meshroom.*ExportColmap"),
+        ("cameras.json", '{"views": [], "intrinsics": [], "poses": []}', "Meshroom"),
+        ("p_calibrated_external_camera_parameters.txt", "imageName X Y Z Omega Phi Kappa\n", "parameters of Pix4D"),
+        ("model.nvm", "NVM_V3\n\n5", "VisualSFM"),
+        ("c.abc", "Ogawa", "an animation file"),
+        ("c.fbx", "Kaydara FBX Binary", "an animation file"),
+        ("camera_path.json", '{"camera_type": "perspective", "camera_path": []}', "nerfstudio's viewer"),
+        ("poses.json", '[{"name": "0", "position": [1], "target": [0]}]', "poses or settings of SuperSplat"),
+        ("settings.json", '{"tonemapping": "none", "cameras": []}', "poses or settings of SuperSplat"),
+        ("capture.zip", "PK\3\4", "an archive. Unpack it"),
     ],
 )  # fmt: skip
 def test_unsupported_formats_suggest_a_conversion(tmp_path: Path, name: str, content: str, message: str) -> None:
@@ -231,7 +247,8 @@ def test_damaged_files_are_read_or_refused_with_a_message(tmp_path: Path, name: 
 
 def test_file_name_suggests_a_format() -> None:
     assert advice_for_name("My Export.CSV").startswith(" It may be cameras of RealityCapture. ")
-    assert advice_for_name("cameras.zip") == ""
+    assert advice_for_name("data.ZIP").startswith(" It may be an archive. Unpack it")
+    assert advice_for_name("cameras.doc") == ""
 
 
 def test_frame_pinhole_overrides_the_files_lens() -> None:
