@@ -23,6 +23,8 @@ from sgsst_core.scene.stored_harmonics import RowLayout
 _ORDER = (*itertools.chain(*PROPERTIES.values()), "opacity")
 #: Log scale of the missing axis of flat Gaussians. In any scene, their thickness is far below rounding errors.
 FLAT = -40.0
+#: Rounding error of positions, relative to the median standard deviation of Gaussians, above which it is noted.
+MOST_ROUNDED = 0.1
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,24 @@ class _Flaws:
     valid: NDArray[np.bool_]
     counts: dict[str, tuple[int, int]]
     unrotated: NDArray[np.bool_]
+
+
+def about_rounded_positions(means: NDArray[Any], scales: NDArray[Any]) -> tuple[str, ...]:
+    """Return a note if positions in double precision are too large for float32.
+
+    Args:
+        means: Positions [N, 3] float32.
+        scales: Log scales [N, 3].
+    """
+    with np.errstate(over="ignore"):
+        error = 0.5 * float(np.spacing(np.nanmedian(np.abs(means), axis=0)).max())
+        fraction = error / max(float(np.exp(np.nanmedian(scales))), 1e-30)
+    if not fraction > MOST_ROUNDED:
+        return ()
+    return (
+        f"positions are rounded to float32 by up to {error:.2g}, {fraction:.1f} times the size of a typical Gaussian; "
+        "subtract an offset from the positions of Gaussians and cameras first",
+    )
 
 
 class SceneColumns:

@@ -29,7 +29,7 @@ from sgsst_core.files.formats.render_tag import FILTER_3D, UNTAGGED, RenderTag
 from sgsst_core.files.formats.scene_format import Arrays, SceneFormat, SceneHeader
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
-from sgsst_core.files.scene_columns import SceneColumns
+from sgsst_core.files.scene_columns import SceneColumns, about_rounded_positions
 from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import RenderMode
@@ -169,6 +169,8 @@ def read_scene(
         _read_binary(file, ply, offset, columns)
     file.check_unchanged(stamp)
     retained = columns.valid_rows(path, drop_invalid)
+    if ply is not None and ply.has_double_positions:
+        notes += about_rounded_positions(columns.arrays["means"], columns.arrays["scales"])
     arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in columns.arrays.items()}
     if stored:
         arrays["sh_rest"] = StoredHarmonics(stored, coefficients=header.coefficients, file=file)

@@ -263,9 +263,12 @@ class _Scene:
         if far < FAR_WORLD:
             return []
         step = float(np.spacing(np.float32(self.center.abs().max())))
+        double = self.file.header is not None and self.file.header.has_double_positions
         done = (
-            "the file's float32 positions are too coarse here; move the scene to the origin before training. The CPU "
-            "subtracts positions in float64, gsplat on a GPU loses more precision"
+            "positions become float32, which is too coarse here; subtract an offset from those of Gaussians and cameras"
+            if double
+            else "the file's float32 positions are too coarse here; move the scene to the origin before training. The "
+            "CPU subtracts positions in float64, gsplat on a GPU loses more precision"
         )
         worst = f"center {far:.3g} extents away; positions are {step:.3g} apart, {step / self.extent:.1e} of the extent"
         return [Finding("scene", "scene far from its origin", len(self.scene), len(self.scene), worst, done)]

@@ -97,6 +97,11 @@ class PlyHeader:
         return [element.name for element in self.elements]
 
     @property
+    def has_double_positions(self) -> bool:
+        """Return whether positions are stored in double precision."""
+        return any((prop.name, prop.kind) == ("x", "f8") for prop in self.vertex.properties)
+
+    @property
     def vertex(self) -> PlyElement:
         """Return the element that holds the Gaussians; raise ValueError if there is none."""
         return self.elements[self.names.index("vertex")]
