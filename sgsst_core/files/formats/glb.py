@@ -139,8 +139,13 @@ def _chunks(start: FileStart) -> tuple[bytes, int, int]:
     if length > start.size:
         raise SceneError(f"{path}: the GLB header declares {length} bytes of {start.size}: {truncated}")
     first = _HEADER.size + _CHUNK.size
-    if kind != b"JSON" or json_bytes > min(_MAX_JSON_BYTES, start.size - first):
+    if kind != b"JSON" or json_bytes > start.size - first:
         raise SceneError(f"{path}: the GLB header declares {json_bytes} bytes of JSON: {truncated}")
+    if json_bytes > _MAX_JSON_BYTES:
+        raise SceneError(
+            f"{path}: has {json_bytes} bytes of JSON; at most {_MAX_JSON_BYTES} can be read. Export the Gaussians "
+            "without the other objects of the file."
+        )
     try:
         with path.open("rb") as file:
             file.seek(first)
@@ -202,7 +207,7 @@ def _parsed(
         coefficients,
         {name: accessor(*attribute) for name, attribute in _ATTRIBUTES.items()},
         [accessor(name, "VEC3") for name in _HARMONICS[:coefficients]],
-        Frame.of(Y_UP @ _node_matrix(document, mesh)),
+        _frame(path, document, mesh),
         tag=extras_tag(primitive.get("extras"), "the extras of the GLB"),
     )
 
@@ -230,12 +235,21 @@ def _accessor(
     return Accessor(data_offset + start + first, stride, _COMPONENTS[kind], code, normalized)
 
 
-def _node_matrix(document: dict[str, Any], mesh: int) -> NDArray[np.float64]:
-    """Return the transformation [4, 4] of the only node that shows a mesh; identity if no node does."""
+def _frame(path: Path, document: dict[str, Any], mesh: int) -> Frame:
+    """Return the transformation of the only node that shows a mesh, to the axes of a PLY."""
     nodes = document.get("nodes", [])
     showing = [index for index, node in enumerate(nodes) if node.get("mesh") == mesh]
     if len(showing) > 1:
-        raise ValueError(f"{len(showing)} nodes show the Gaussians")
+        raise SceneError(f"{path}: {len(showing)} nodes show its Gaussians; one can be read. Export them once.")
+    matrix = Y_UP @ _node_matrix(nodes, showing)
+    try:
+        return Frame.of(matrix)
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}, by the transformation of its node. Export it without that.") from error
+
+
+def _node_matrix(nodes: list[dict[str, Any]], showing: list[int]) -> NDArray[np.float64]:
+    """Return the transformation [4, 4] of the node that shows the Gaussians; identity if no node does."""
     parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
     matrix, node = np.eye(4), showing[0] if showing else None
     for _ in range(_MAX_DEPTH):

@@ -219,9 +219,9 @@ FIRST = "meshes__0__primitives__0__"
         (by_hand(bufferViews__0__byteStride=0), "not a valid GLB scene"),
         (by_hand(bufferViews__0__byteOffset=2**70), "not a valid GLB scene"),
         (by_hand(buffers__0__uri="../../etc/passwd"), "is not in the file"),
-        (by_hand(nodes=[{"mesh": 0}, {"mesh": 0}]), "2 nodes show the Gaussians"),
+        (by_hand(nodes=[{"mesh": 0}, {"mesh": 0}]), r"scene\.glb: 2 nodes show its Gaussians; one can be read"),
         (by_hand(nodes=[{"mesh": 0, "scale": [1, 2, 1]}]), "distorts the scene"),
-        (by_hand(nodes=[{"mesh": 0, "scale": [1, 1, -1]}]), "mirrors or distorts"),
+        (by_hand(nodes=[{"mesh": 0, "scale": [1, 1, -1]}]), r"scene\.glb: the transformation mirrors or distorts"),
         (by_hand(nodes=[{"mesh": 0, "scale": [1e200, 1e200, 1e200]}]), "not finite"),
         (by_hand(nodes=[{"mesh": 0, "rotation": [0, 0, 0, 0]}]), "rotation"),
         (by_hand(nodes=[{"mesh": 0, "matrix": [1, 2]}]), "not a valid GLB scene"),
@@ -234,7 +234,10 @@ FIRST = "meshes__0__primitives__0__"
         (by_hand().replace(b"JSON", b"json"), "of JSON"),
         (by_hand()[:4] + b"\1" + by_hand()[5:], "GLB of version 1"),
         (by_hand()[:12] + struct.pack("<I", 2**32 - 4) + by_hand()[16:], "4294967292 bytes of JSON"),
-        (joined({"meshes": "x" * (1 << 20)}, b""), "bytes of JSON"),
+        (
+            joined({"meshes": "x" * (1 << 20)}, b""),
+            "bytes of JSON; at most 1048576 can be read. Export the Gaussians without",
+        ),
         (b"glTF" + struct.pack("<IIII", 2, 20 + 200_000, 200_000, 0x4E4F534A) + b"[" * 200_000, "RecursionError"),
     ],
 )
