@@ -149,7 +149,13 @@ def _convert_entries(path: Path, entries: list[Any], convert: Any) -> list[Camer
     return cameras
 
 
+def _stated(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that are not null."""
+    return {key: value for key, value in values.items() if value is not None}
+
+
 def _inria_camera(where: str, entry: Mapping[str, Any]) -> Camera:
+    entry = _stated(entry)
     name = _name(where, entry, "img_name", "id")
     where = f"{where} ({name!r})"
     pose = np.eye(4)
@@ -168,7 +174,7 @@ def _read_transforms(path: Path, content: Mapping[str, Any], photos: Path | None
     def convert(where: str, frame: Mapping[str, Any]) -> Camera:
         name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
         where = f"{where} ({name!r})"
-        values = {**content, **frame}  # values of the frame take precedence
+        values = {**_stated(content), **_stated(frame)}  # values of the frame take precedence
         size = _transforms_size(where, path.parent / name, values, files)
         pose = np.eye(4)
         matrix = _array(where, values, "transform_matrix", (4, 4), (3, 4))

@@ -204,6 +204,16 @@ def test_error_about_a_folder_names_a_model_below(tmp_path: Path, model: str) ->
     assert len(read_cameras(tmp_path / model)) == 2
 
 
+def test_null_counts_as_not_stated(tmp_path: Path) -> None:
+    content, entries = nerfstudio(views(1)), inria(views(1))
+    content |= {"cx": None, "fl_y": None}
+    entries[0] |= {"cx": None, "cy": None}
+    content["frames"][0]["w"] = None
+    for values in (content, entries):
+        (view,) = read_cameras(save(tmp_path / "t.json", values))
+        assert (view.width, view.fy, view.cx, view.cy) == (WIDTH, 500, WIDTH / 2, HEIGHT / 2)
+
+
 def test_size_of_a_resized_image_is_refused(tmp_path: Path) -> None:
     content = nerfstudio(views(1))
     del content["w"], content["h"]
