@@ -11,6 +11,7 @@ from sgsst_core.errors import CameraError, SceneError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
+from sgsst_core.files.images import WHITE, Color
 from sgsst_core.files.photos import Photo, check_photos, photo_size, some_names
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
@@ -148,6 +149,24 @@ def about_rendering(file: SceneFile) -> list[Decision]:
     elif tag.reason and rendering != CLASSIC:
         lines.append(Decision("rendering", rendering.text, f"{tag.reason} says so; see --render-mode and --eps2d"))
     return [*lines, *(Decision("rendering", f"warning: drawn {drawn}", reason) for drawn, reason in tag.warnings)]
+
+
+def about_background(scene: Path, background: Color) -> list[Decision]:
+    """Return a warning if the original 3DGS code trained a scene on white, but the job's background is not white.
+
+    Args:
+        scene: File of the scene, RUN/point_cloud/iteration_N/point_cloud.ply.
+        background: Background color of the job.
+    """
+    arguments = scene.absolute().parent.parent.parent / "cfg_args"
+    try:
+        text = arguments.read_text(encoding="utf-8") if scene.name == "point_cloud.ply" else ""
+    except (OSError, ValueError):
+        return []
+    if background == WHITE or "white_background=True" not in text:
+        return []
+    reason = f"{arguments} has white_background=True; add --background white"
+    return [Decision("background", "warning: the scene was trained on white, which is not that of the job", reason)]
 
 
 def orbit_request(source: SceneRequest) -> OrbitRequest:

@@ -32,7 +32,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job_styles import check_style_size
-from worker.capture import Capture, about_rendering, choose_axes, read_capture
+from worker.capture import Capture, about_background, about_rendering, choose_axes, read_capture
 from worker.ranks.geometry import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 from worker.selecting import select_regions
@@ -85,7 +85,9 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     """
     settings, images = request.settings, request.images
     source = request.source
-    axes, about_axes = collectives.broadcast(lambda: choose_axes(source, images))
+    axes, about_axes, about_color = collectives.broadcast(
+        lambda: (*choose_axes(source, images), about_background(source.scene, settings.background))
+    )
     weights = _same_weights(request.backbone, collectives)
     style = together(collectives, lambda: load_styles(request.styles, request.style_background))
     scene_file, reader = read_shared_scene(
@@ -109,7 +111,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     own = None
     if reader:
         own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps, regions)
-    decisions = (*about_axes, *about_rendering(scene_file), *capture.decisions)
+    decisions = (*about_axes, *about_rendering(scene_file), *about_color, *capture.decisions)
     same = _same_fingerprint(own, collectives)
     return Inputs(weights, style, scene_file, cameras, capture.orbit, photos, decisions, regions, same)
 

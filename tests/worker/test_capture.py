@@ -14,12 +14,13 @@ from PIL import Image
 
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.formats import by_name
+from sgsst_core.files.images import BLACK, WHITE
 from sgsst_core.files.photos import load_photo
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
 from tests.small_scenes import ball, cameras, wall, write_files
-from worker.capture import Capture, about_rendering, choose_axes, read_capture
+from worker.capture import Capture, about_background, about_rendering, choose_axes, read_capture
 from worker.description import describe_scene
 from worker.inputs import read_scene_and_capture
 from worker.request import SceneRequest
@@ -203,6 +204,19 @@ def test_plan_names_render_mode_and_warnings(tmp_path: Path) -> None:
         "2dgs, eps2d 0.3",
         "warning: drawn as Gaussians without thickness",
     ]
+
+
+def test_white_background_of_the_run_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    assert about_background(path, BLACK) == []
+    (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3, white_background=True)")
+    (line,) = about_background(path, BLACK)
+    assert line.decision.startswith("warning: the scene was trained on white")
+    assert line.reason == f"{tmp_path}/cfg_args has white_background=True; add --background white"
+    assert about_background(path, WHITE) == []
+    assert about_background(tmp_path / "a" / "b" / "scene.ply", BLACK) == []
+    (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3, white_background=False)")
+    assert about_background(path, BLACK) == []
 
 
 @pytest.mark.parametrize("mode", ["auto", "classic", "antialiased"])
