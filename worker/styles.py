@@ -12,7 +12,7 @@ from sgsst_core.errors import SettingsError
 
 #: Maximum number of images of a style. More are probably a mistake.
 MOST_STYLE_IMAGES = 16
-_WEIGHTED = re.compile(r"(?P<file>.+):(?P<weight>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", re.DOTALL)
+_WEIGHTED = re.compile(r"(?P<file>.+):(?P<weight>[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)", re.DOTALL)
 
 
 @dataclass(frozen=True)

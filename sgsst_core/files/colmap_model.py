@@ -45,7 +45,7 @@ _MODELS = {
 _PARAMETERS = dict(_MODELS.values())
 #: Stricter than `int` and `float`, which accept `1_0` and digits of other scripts.
 _INTEGER = re.compile("[0-9]{1,18}")
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.errors import SettingsError
-from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style, parse_styles
+from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style, parse_styles, split_weight
 
 
 @pytest.mark.parametrize(
@@ -23,6 +23,11 @@ from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style, parse_style
 )
 def test_only_a_trailing_number_is_a_weight(text: str, path: str, weight: float) -> None:
     assert parse_style(text) == StyleFile(Path(path), weight)
+
+
+def test_long_names_are_read_in_linear_time() -> None:
+    name = "a.jpg:" + "3" * 1_000_000 + "x"  # hours in quadratic time
+    assert split_weight(name, lambda path: False) == (name, 1.0)
 
 
 def test_existing_file_with_colon_takes_precedence(tmp_path: Path) -> None:

@@ -388,6 +388,8 @@ def test_camera_models_match_pycolmap(tmp_path: Path) -> None:
         ("cameras.txt", "500.0", "5_00.0", "line 2: '5_00.0' is not a number"),
         ("cameras.txt", "500.0", "nan", "line 2: 'nan' is not a number"),
         ("cameras.txt", "500.0", "٥", "line 2: '٥' is not a number"),
+        # hours in quadratic time
+        pytest.param("cameras.txt", "500.0", "5" * 1_000_000 + "x", "is not a number", id="long word"),
         ("cameras.txt", "640", "6_40", "line 2: '6_40' is not a whole number"),
         ("cameras.txt", "640", "6" * 5000, "is not a whole number"),
         ("cameras.txt", "PINHOLE", "PINHOL", "line 2: expected id, COLMAP camera model"),
