@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -167,14 +168,14 @@ def _inria_camera(where: str, entry: Mapping[str, Any]) -> Camera:
     return _camera(where, name, (width, height), (fx, fy, cx, cy), _inverse(where, pose))
 
 
-def _read_transforms(path: Path, content: Mapping[str, Any], photos: Path | None) -> list[Camera]:
+def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -> list[Camera]:
     files = PhotoFolder(photos) if photos is not None and photos.is_dir() else None
-    frame_change = _dataparser_change(path, content)
+    frame_change, common = _dataparser_change(path, content), _stated(content)
 
-    def convert(where: str, frame: Mapping[str, Any]) -> Camera:
+    def convert(where: str, frame: dict[str, Any]) -> Camera:
         name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
         where = f"{where} ({name!r})"
-        values = {**_stated(content), **_stated(frame)}  # values of the frame take precedence
+        values = ChainMap(_stated(frame), common)  # a copy of the common values per frame could take hours
         size = _transforms_size(where, path.parent / name, values, files)
         pose = np.eye(4)
         matrix = _array(where, values, "transform_matrix", (4, 4), (3, 4))

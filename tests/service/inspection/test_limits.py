@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,10 +16,11 @@ from PIL import Image
 from service.errors import RefusedInputError
 from service.files.blobs import BlobFolder
 from service.inspection.inspector import InspectionProcess, Inspector, Show
-from service.inspection.process import WORK
+from service.inspection.process import WORK, _check_frames_have_sizes
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
+from sgsst_core.errors import CameraError
 from sgsst_core.files.scene_file import write_scene
 from tests.small_scenes import wall, write_files
 
@@ -109,3 +111,13 @@ def test_work_beyond_its_time_limit_is_refused(tmp_path: Path) -> None:
     request = {"folder": str(tmp_path), "staged": {}, "parameters": {}, "limits": {}, "seconds": 0, "bytes": 0}
     for work, answer in asyncio.run(ask_all()).items():
         assert answer["error"]["code"] == "inspection-limit", work
+
+
+def test_sizes_of_many_frames_are_checked_in_a_file_of_many_values(tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    content = {"h": 1, **{str(number): 0 for number in range(100_000)}, "frames": [{"w": 1}] * 100_000}
+    path.write_text(json.dumps(content))
+    _check_frames_have_sizes(path)  # many minutes if each frame copied the values
+    path.write_text(json.dumps({"frames": [{"w": 1}]}))
+    with pytest.raises(CameraError, match="gives no size"):
+        _check_frames_have_sizes(path)

@@ -160,6 +160,25 @@ def test_nerfstudio_frame_lenses_override_the_files(tmp_path: Path) -> None:
     assert (other.kind, other.model) == (None, "FISHEYE624")
 
 
+def test_values_of_the_file_are_not_copied_for_each_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    class Content(dict[str, Any]):
+        """Dictionary that counts copies; a dict with its own `__iter__` is copied through `keys`."""
+
+        def __iter__(self) -> Any:
+            return super().__iter__()
+
+        def keys(self) -> Any:
+            calls.append(1)
+            return super().keys()
+
+    content, cameras = Content(nerfstudio(views(20))), views(20)
+    monkeypatch.setattr("sgsst_core.files.camera_files._load_json", lambda path: content)
+    assert_same(read_cameras(save(tmp_path / "transforms.json", {})), cameras, lambda name: f"images/{name}")
+    assert len(calls) < len(cameras)
+
+
 def test_instant_ngp_fisheyes_are_read(tmp_path: Path) -> None:
     content = nerfstudio(views(1)) | {"is_fisheye": True}
     del content["camera_model"]
