@@ -544,7 +544,8 @@ def _memory_besides_reading(request: dict[str, Any]) -> int:
     threads: int = request["threads"] * _THREAD_BYTES
     if request["work"] == "validate" and not JobParameters(**request["parameters"]).selects_by_images:
         return threads
-    return threads + (request["parameters"]["memory_limit"] or default_memory_limit())
+    default = default_memory_limit()
+    return threads + min(request["parameters"]["memory_limit"] or default, default)
 
 
 _TITLES = {

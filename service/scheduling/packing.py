@@ -135,15 +135,18 @@ class Capacity:
         return grant if together <= _MEMORY_FRACTION * self._machine.memory else None
 
     def _on_cores(self, job: QueuedJob, ranks: int, free: int) -> Grant | None:
-        if self._slots == 1 or self._machine.cluster:
+        if self._machine.cluster:
             return Grant(ranks)
-        portion = _MEMORY_FRACTION * self._machine.memory / self._slots
         requested = _requested(job, "memory_limit")
+        most = int(_JOB_FRACTION * self._machine.memory)
+        if self._slots == 1:
+            return Grant(ranks, memory=min(requested, most) if requested else None)
+        portion = _MEMORY_FRACTION * self._machine.memory / self._slots
         scene = _SCENE_COPIES * _scene_bytes(job)
         slots = min(math.ceil((scene + (requested or _MIN_MEMORY)) / portion), self._slots)
         if slots > free:
             return None
-        limit = max(int(min(_JOB_FRACTION * self._machine.memory, slots * portion - scene)), _MIN_MEMORY)
+        limit = max(min(most, int(slots * portion - scene)), _MIN_MEMORY)
         threads = max(1, self._machine.cores * slots // self._slots)
         return Grant(ranks, (), slots, threads, min(requested or limit, limit))
 

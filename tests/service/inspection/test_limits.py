@@ -16,7 +16,7 @@ from PIL import Image
 from service.errors import RefusedInputError
 from service.files.blobs import BlobFolder
 from service.inspection.inspector import InspectionProcess, Inspector, Show
-from service.inspection.process import WORK, _check_frames_have_sizes
+from service.inspection.process import WORK, _check_frames_have_sizes, _memory_besides_reading
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -111,6 +111,15 @@ def test_work_beyond_its_time_limit_is_refused(tmp_path: Path) -> None:
     request = {"folder": str(tmp_path), "staged": {}, "parameters": {}, "limits": {}, "seconds": 0, "bytes": 0}
     for work, answer in asyncio.run(ask_all()).items():
         assert answer["error"]["code"] == "inspection-limit", work
+
+
+@pytest.mark.parametrize(("requested", "limit"), [(None, 1000), (10, 10), (1 << 50, 1000)])
+def test_requested_memory_is_at_most_the_default(
+    requested: int | None, limit: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.inspection.process.default_memory_limit", lambda: 1000)
+    request = {"work": "plan", "threads": 0, "parameters": {"memory_limit": requested}}
+    assert _memory_besides_reading(request) == limit
 
 
 def test_sizes_of_many_frames_are_checked_in_a_file_of_many_values(tmp_path: Path) -> None:

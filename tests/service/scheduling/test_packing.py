@@ -327,6 +327,13 @@ def job(scene: int, **parameters: Any) -> QueuedJob:
     return QueuedJob("job", 0.0, parameters, [{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}])
 
 
+def test_memory_limit_of_a_single_job_is_at_most_its_fraction_of_the_machine() -> None:
+    capacity = Capacity(machine(0), None)
+    assert capacity.grant(job(GB, memory_limit=3 * GB), [], 1) == Grant(1, memory=3 * GB)
+    assert capacity.grant(job(GB, memory_limit=1 << 50), [], 1) == Grant(1, memory=40 * GB)
+    assert capacity.grant(job(GB), [], 1) == Grant(1)
+
+
 def test_memory_of_a_cluster_is_not_packed() -> None:
     assert Capacity(machine(0, cluster=True), 4).grant(job(50 * GB, workers=3), [], 1) == Grant(3)
 
