@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -186,6 +186,8 @@ def download(
     with _client(url, key) as client:
         digests = {entry["name"]: entry["sha256"] for entry in client.artifacts(job)}
         names = list(digests) if name == "all" else [name]
+        if name == "all":
+            _check_names(names)
         written = []
         for each in names:
             stored = _stored_name(each, format)
@@ -203,6 +205,17 @@ def download(
 def _stored_name(name: str, format: ExtraName | None) -> str:
     """Return the name under which the service stores an artifact in a compressed format, which only results have."""
     return result_name(name, by_name(format)) if format and name == "stylized.ply" else name
+
+
+def _check_names(names: Sequence[str]) -> None:
+    """Raise an OutputError if a name from the service leads out of the folder that it is appended to."""
+    for name in names:
+        path = PureWindowsPath(name)  # accepts the separators of all systems
+        if path.anchor or ".." in path.parts:
+            raise OutputError(
+                f"The service names a file {name!r}, which is outside of the download's folder. Check --url, "
+                "or download single files by name."
+            )
 
 
 def _check_format(out: Path, name: str) -> None:

@@ -180,6 +180,38 @@ def test_download_replaces_no_file_of_another_job(
     assert main(["download", ids[0], "all"]) == main(["download", ids[0], "all"]) == 0
 
 
+@pytest.mark.parametrize(
+    "name", ["{outside}", "../outside", "a/../../outside", r"..\outside", r"C:outside", r"\outside"]
+)
+def test_files_outside_of_the_folder_are_refused_before_the_download(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, name: str
+) -> None:
+    requested = []
+    artifacts = [{"name": each, "sha256": ""} for each in ("stylized.ply", name.format(outside=tmp_path / "outside"))]
+
+    class Hostile(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            requested.append(self.path)
+            body = json.dumps({"artifacts": artifacts}).encode()
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *arguments: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Hostile) as server:
+        serve(server)
+        url = f"http://127.0.0.1:{server.server_port}"
+        assert main(["download", MISSING, "all", "--out", str(tmp_path / "folder"), "--url", url]) == 2
+        server.shutdown()
+    assert "which is outside of the download's folder" in " ".join(capsys.readouterr().err.split())
+    assert requested == [f"/v1/jobs/{MISSING}/artifacts"]
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_outputs_are_checked_before_a_job_is_queued(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:
