@@ -26,7 +26,7 @@ from service.inspection.lanes import Lanes
 from service.parameters import stored_parameters
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.quotas import NO_QUOTAS, Quotas
+from service.store.quotas import Quotas
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import result_name
 from sgsst_core.files.formats.scene_format import SceneFormat
@@ -78,16 +78,17 @@ class DerivedFiles:
         self._folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self._folder)
 
-    async def compressed(self, job: JobRow, format: SceneFormat) -> ArtifactRow:
+    async def compressed(self, job: JobRow, format: SceneFormat, quotas: Quotas) -> ArtifactRow:
         """Return a job's result in a compressed format; the compression error is stored beside it as JSON.
 
         Raises:
             NotFoundError: If the job has no result yet, or the result is gone.
             RefusedInputError: If the format cannot represent the result, or compressing exceeds the limits.
+            QuotaError: If the files exceed the owner's quota of stored bytes.
             BusyError, NoSpaceError: If the result cannot be compressed now.
         """
         name = result_name(RESULT, format)
-        return await self._derived(job, name, lambda: self._compress(job, name))
+        return await self._derived(job, name, lambda: self._compress(job, name, quotas))
 
     async def blended(self, job: JobRow, blend: Blend, quotas: Quotas) -> ArtifactRow:
         """Return a blend of a job's scene and results. The owner of the job must also own the others.
@@ -126,7 +127,7 @@ class DerivedFiles:
 
     # --- compressed formats ---------------------------------------------------------------------------------------
 
-    async def _compress(self, job: JobRow, name: str) -> None:
+    async def _compress(self, job: JobRow, name: str, quotas: Quotas) -> None:
         """Compress the result, store the files, and make them visible."""
         async with self._turn(job) as (process, folder, result):
             self._blobs.ensure_space(3 * result.size)
@@ -136,7 +137,7 @@ class DerivedFiles:
             loss_file = folder / "loss.json"
             loss_file.write_text(json.dumps(findings_of(await process.ask(request)), indent=1) + "\n")
             files = {f"{name}.json": loss_file, name: folder / name}
-            await asyncio.to_thread(self._publish, job, result, files)
+            await asyncio.to_thread(self._publish, job, result, files, quotas)
 
     # --- blends ---------------------------------------------------------------------------------------------------
 
@@ -191,7 +192,7 @@ class DerivedFiles:
             "bytes": self._settings.inspection_bytes + MEMORY_PER_BYTE * size,
         }
 
-    def _publish(self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas = NO_QUOTAS) -> None:
+    def _publish(self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas) -> None:
         """Store files and make them visible.
 
         Raises:

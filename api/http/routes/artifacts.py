@@ -11,7 +11,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from api.http.context import CallerDep, Context, ContextDep
+from api.http.context import Caller, CallerDep, Context, ContextDep
 from api.http.documentation import Responses, invalid, links, problems
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import ArtifactList, artifact_view
@@ -25,6 +25,7 @@ from api.http.sending import (
 )
 from service.errors import (
     BusyError,
+    BytesQuotaError,
     DamagedFileError,
     InspectionLimitError,
     LostFileError,
@@ -92,6 +93,7 @@ _ANSWERS: Responses = {
             OutputError.code,
         ),
         InspectionLimitError("Compressing the result takes more time or memory than allowed."),
+        BytesQuotaError,
         BusyError,
         NoSpaceError,
         StoreError,
@@ -131,7 +133,7 @@ async def get_artifact(
 ) -> Response:
     """Download a file, whole or in ranges. Resume with `Range` and `If-Range`."""
     job = await asyncio.to_thread(find, context, caller, job_id)
-    row = await _find_artifact(context, job, name, format_)
+    row = await _find_artifact(context, caller, job, name, format_)
     kind = media_type(row.name)
     file = SentFile(
         sha256=row.sha256,
@@ -146,12 +148,14 @@ async def get_artifact(
     return await send_file(request, file, conditions)
 
 
-async def _find_artifact(context: Context, job: JobRow, name: str, format_: ResultName | None) -> ArtifactRow:
+async def _find_artifact(
+    context: Context, caller: Caller, job: JobRow, name: str, format_: ResultName | None
+) -> ArtifactRow:
     """Return the database row of a published file, or of the result in another format."""
     if format_ is not None and format_ != PLY.name:
         if name != RESULT:
             raise RefusedInputError(f"Only {RESULT} has other formats. Omit 'format'.", "invalid-request")
-        return await context.derived.compressed(job, by_name(format_))
+        return await context.derived.compressed(job, by_name(format_), caller.quotas)
     row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
     if row is None:
         raise NoArtifactError(job.id, name[:80])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import TooManyBlendsError
+from service.errors import QuotaError, TooManyBlendsError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.files.staging import RESULT
@@ -19,8 +19,9 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.leases import Published
-from service.store.quotas import NO_QUOTAS
+from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import JobRow
+from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.ply import PLY
 from tests.small_scenes import wall, write_files
 
@@ -101,3 +102,21 @@ def test_parallel_blends_cannot_pass_their_limit(stored: Stored, tmp_path: Path)
     outcomes = asyncio.run(blend_all())
     assert sum(isinstance(outcome, TooManyBlendsError) for outcome in outcomes) == 3
     assert sum(row.name.startswith("blends/") for row in stored.store.jobs.artifacts(job.id)) == MOST_BLENDS
+
+
+def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Path) -> None:
+    job = stored.finished("one", tmp_path)
+    before = {row.name for row in stored.store.jobs.artifacts(job.id)}
+
+    async def compress(quotas: Quotas) -> None:
+        derived = stored.derived()
+        try:
+            await derived.compressed(job, by_name("spz"), quotas)
+        finally:
+            await derived.close()
+
+    with pytest.raises(QuotaError):
+        asyncio.run(compress(Quotas(stored_bytes=1)))
+    assert {row.name for row in stored.store.jobs.artifacts(job.id)} == before
+    asyncio.run(compress(NO_QUOTAS))
+    assert {row.name for row in stored.store.jobs.artifacts(job.id)} == before | {"stylized.spz", "stylized.spz.json"}
