@@ -184,14 +184,14 @@ class Inspector:
         }
 
     def recall(
-        self, work: Work, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
+        self, work: Work, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
     ) -> dict[str, Any] | None:
-        """Return the stored finding of `inspect` for the same inputs; None if there is none.
+        """Return the stored finding of `inspect` for the same owner and inputs; None if there is none.
 
         Raises:
             RefusedInputError: If the stored finding is a rejection.
         """
-        known = self._store.inputs.inspection(self._key(work, inputs, parameters))
+        known = self._store.inputs.inspection(self._key(work, owner, inputs, parameters))
         return None if known is None else findings_of(known)
 
     async def inspect(
@@ -218,16 +218,16 @@ class Inspector:
             RefusedInputError: If the inputs cannot be used.
             BusyError: If the inputs cannot be checked now.
         """
-        recalled = await asyncio.to_thread(self.recall, work, inputs, parameters)
+        recalled = await asyncio.to_thread(self.recall, work, owner, inputs, parameters)
         if recalled is not None:
             return recalled
         if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
             self._warming = asyncio.create_task(self._validating.slots[1].warm())
         async with self._lanes(work, inputs).turn(owner) as process:
-            answer = await self._ask_process(process, work, inputs, rows, parameters, show)
+            answer = await self._ask_process(process, work, owner, inputs, rows, parameters, show)
         transient = answer.get("error", {}).get("code") in (InspectionLimitError.code, WeightsError.code)
         if not transient:  # a later check may succeed
-            key = self._key(work, inputs, parameters)
+            key = self._key(work, owner, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
         return findings_of(answer)
 
@@ -241,12 +241,13 @@ class Inspector:
         self,
         process: InspectionProcess,
         work: Work,
+        owner: str,
         inputs: Sequence[Mapping[str, Any]],
         rows: Mapping[str, BlobRow],
         parameters: JobParameters,
         show: Show,
     ) -> dict[str, Any]:
-        seconds = await asyncio.to_thread(self._seconds, work, _size(inputs), inputs, parameters)
+        seconds = await asyncio.to_thread(self._seconds, work, owner, inputs, parameters)
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
             paths = await asyncio.to_thread(self._blobs.fetch, rows, Path(folder))
             staged = await asyncio.to_thread(stage, Path(folder), inputs, paths)
@@ -261,12 +262,12 @@ class Inspector:
             }
             return await process.ask(request, show)
 
-    def _seconds(self, work: Work, size: int, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> float:
+    def _seconds(self, work: Work, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> float:
         """Return the CPU time limit of a task in seconds."""
-        reading = self._settings.inspection_seconds + _SECONDS_PER_BYTE * size
+        reading = self._settings.inspection_seconds + _SECONDS_PER_BYTE * _size(inputs)
         if work == "validate":
             return reading + (self._settings.dry_run_seconds if parameters.selects_by_images else 0)
-        known = self.recall("validate", inputs, parameters) or {"gaussians": 0, "views": 0, "pixels": 0}
+        known = self.recall("validate", owner, inputs, parameters) or {"gaussians": 0, "views": 0, "pixels": 0}
         surveying: float = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
         surveying += _PLAN_SECONDS_PER_PIXEL * known["pixels"]
         return self._settings.dry_run_seconds + reading + surveying
@@ -278,13 +279,14 @@ class Inspector:
         maximum = max(minimum, int(_MEMORY_FRACTION * psutil.virtual_memory().total))
         return min(minimum + MEMORY_PER_BYTE * size, maximum)
 
-    def _key(self, work: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
+    def _key(self, work: str, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
+        """Return the key of a finding. It includes the owner, so that no finding shows what others have inspected."""
         files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
         values = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
         # style weights are matched to styles by their order
         styles = [entry["name"] for entry in inputs if entry["role"] == "style"]
         order = styles if len(styles) > 1 else []
-        text = json.dumps([_VERSION, work, files, order, values, self._limits], sort_keys=True)
+        text = json.dumps([_VERSION, work, owner, files, order, values, self._limits], sort_keys=True)
         return f"{work}:{hashlib.sha256(text.encode()).hexdigest()}"
 
     async def close(self) -> None:

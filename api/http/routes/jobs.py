@@ -205,7 +205,7 @@ def _find_files(context: Context, caller: Caller, parts: Parts, fetched: Mapping
     """Find the files of a job, and run all checks that need no inspection process."""
     inputs, rows = _find_inputs(context, caller, parts, fetched)
     _, parameters, webhook = parts
-    checked = context.inspector.recall("validate", inputs, parameters) is not None
+    checked = context.inspector.recall("validate", caller.owner, inputs, parameters) is not None
     if not checked:
         with context.blobs.local_files(rows) as paths:
             for entry in inputs:

@@ -28,7 +28,7 @@ from tests.small_scenes import wall, write_files
 class Inspect(Protocol):
     """Function that inspects files and returns the findings; `show` receives progress."""
 
-    def __call__(self, files: dict[str, Path], show: Show = ...) -> dict[str, Any]: ...
+    def __call__(self, files: dict[str, Path], show: Show = ..., owner: str = ...) -> dict[str, Any]: ...
 
 
 @contextmanager
@@ -40,7 +40,7 @@ def inspecting(folder: Path, **limits: Any) -> Iterator[Inspect]:
     blobs = BlobFolder(settings.folder, store.inputs, 0)
     inspector = Inspector(settings, store, blobs)
 
-    def inspect(files: dict[str, Path], show: Show = lambda now: None) -> dict[str, Any]:
+    def inspect(files: dict[str, Path], show: Show = lambda now: None, owner: str = "local") -> dict[str, Any]:
         digests = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
         inputs = [
             {"role": role, "name": path.name, "sha256": digests[role], "size": path.stat().st_size}
@@ -50,7 +50,7 @@ def inspecting(folder: Path, **limits: Any) -> Iterator[Inspect]:
             blobs.add(path, link=True)
         rows = store.inputs.blobs(sorted(digests.values()))
         parameters = JobParameters(backbone="auto")
-        return runner.run(inspector.inspect("validate", "local", inputs, rows, parameters, show))
+        return runner.run(inspector.inspect("validate", owner, inputs, rows, parameters, show))
 
     with asyncio.Runner() as runner:
         try:
@@ -111,6 +111,22 @@ def test_work_beyond_its_time_limit_is_refused(tmp_path: Path) -> None:
     request = {"folder": str(tmp_path), "staged": {}, "parameters": {}, "limits": {}, "seconds": 0, "bytes": 0}
     for work, answer in asyncio.run(ask_all()).items():
         assert answer["error"]["code"] == "inspection-limit", work
+
+
+def test_findings_are_reused_for_the_same_owner_only(
+    files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    async def ask(*arguments: Any) -> dict[str, Any]:
+        asked.append(arguments)
+        return {"findings": {}}
+
+    monkeypatch.setattr(InspectionProcess, "ask", ask)
+    with inspecting(tmp_path) as inspect:
+        for owner, count in (("one", 1), ("one", 1), ("other", 2)):
+            inspect(files, owner=owner)
+            assert len(asked) == count
 
 
 @pytest.mark.parametrize(("requested", "limit"), [(None, 1000), (10, 10), (1 << 50, 1000)])
