@@ -259,7 +259,11 @@ class AsyncClient:
         return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/retry")).json())
 
     async def share(self, job_id: str, days: float = 7.0) -> dict[str, Any]:
-        """Create a read-only link to a result, which works for some days; `url` is its address."""
+        """Create a read-only link to a result; `url` is its address.
+
+        Args:
+            days: Lifetime of the link, from a minute (1 / 1440) to 90.
+        """
         response = await self._transport.call("POST", f"{_job_path(job_id)}/shares", json={"days": days})
         share: dict[str, Any] = response.json()
         return share | {"url": f"{self.url}{share['url']}"}

@@ -431,7 +431,14 @@ class NewShare(BaseModel):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"days": 7}]})
 
-    days: float = Field(7.0, gt=0, le=90, allow_inf_nan=False, description="Lifetime of the link in days.")
+    days: float = Field(
+        7.0,
+        ge=1 / (24 * 60),
+        le=90,
+        strict=True,
+        allow_inf_nan=False,
+        description="Lifetime of the link in days, at least a minute.",
+    )
 
 
 class ShareView(BaseModel):

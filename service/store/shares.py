@@ -58,7 +58,8 @@ class Shares:
                 raise ShareError(job.status)
             of_job = ShareRow.job_id == job_id
             session.execute(delete(ShareRow).where(of_job, ShareRow.expires_at <= expiry_time(session, now)))
-            if (session.scalar(select(func.count()).select_from(ShareRow).where(of_job)) or 0) >= MOST_SHARES:
+            valid = select(func.count()).select_from(ShareRow).where(of_job, ShareRow.expires_at > now)
+            if (session.scalar(valid) or 0) >= MOST_SHARES:
                 raise TooManySharesError(MOST_SHARES)
             row = ShareRow(id=new_id("shr", now), job_id=job_id, created_at=now, expires_at=now + seconds)
             token = f"{row.id}.{secrets.token_urlsafe(32)}"

@@ -9,13 +9,14 @@ from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import update
 
 from api.client import Client
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.shares import MOST_SHARES
-from service.store.tables import ShareRow
+from service.store.tables import CounterRow, ShareRow
 from tests.api.service import Service, check_documented
 from tests.small_scenes import wall, write_files
 
@@ -239,7 +240,7 @@ def test_only_results_of_ones_own_can_be_shared(
     refused = me.post(f"/v1/jobs/{waiting}/shares", json={})
     check_documented(refused)
     assert (refused.status_code, refused.json()["code"]) == (409, "conflict")
-    for days in (0, -1, 91, "x", None, 1e400):
+    for days in (0, -1, 91, "x", "7", True, None, 1e400, 1e-300, 0.0006):
         assert (
             me.post(
                 f"/v1/jobs/{job_id}/shares",
@@ -248,10 +249,26 @@ def test_only_results_of_ones_own_can_be_shared(
             ).status_code
             == 422
         )
-    for _ in range(MOST_SHARES - 1):
+    share(me, job_id, days=1 / 1440)
+    for _ in range(MOST_SHARES - 2):
         share(me, job_id)
     refused = me.post(f"/v1/jobs/{job_id}/shares", json={})
     assert (refused.status_code, refused.json()["code"]) == (409, "too-many-shares")
+
+
+def test_expired_links_do_not_count_toward_the_limit(
+    store: Store, service: Service, me: httpx.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    """A clock that runs ahead of the expiry time deletes no links, but they no longer work."""
+    job_id = finished(me, service, store, files, tmp_path)
+    for _ in range(MOST_SHARES):
+        share(me, job_id)
+    now = store.database.clock()
+    with store.database.writing() as session:
+        session.merge(CounterRow(name="sgsst_expiry_time", labels="", value=now - 10))
+        session.execute(update(ShareRow).where(ShareRow.job_id == job_id).values(expires_at=now - 5))
+    view, _ = share(me, job_id)
+    assert [each["id"] for each in me.get(f"/v1/jobs/{job_id}/shares").json()["shares"]] == [view["id"]]
 
 
 def test_stored_digest_is_no_token_and_logs_contain_none(
