@@ -34,7 +34,7 @@ from sgsst_core.quality.consistency import (
     shown,
     view_pairs,
 )
-from sgsst_core.quality.exact import rasterizer_beside
+from sgsst_core.quality.float32_reference import rasterizer_beside
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized

@@ -11,9 +11,9 @@ import sys
 import time
 
 from service.errors import DatabaseUnavailableError, StoreError
+from service.file_permissions import keep_private
 from service.files.objects import ObjectStore
 from service.logs import set_up
-from service.private import keep_private
 from service.settings import ServiceSettings
 from service.store import open_store
 

@@ -15,7 +15,7 @@ from sgsst_core.files.images import WHITE, Color
 from sgsst_core.files.photos import Photo, check_photos, photo_size, some_names
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
-from sgsst_core.planning.fit import compare_photos, frame_warnings, shown_by
+from sgsst_core.planning.capture_checks import compare_photos, frame_warnings, shown_by
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.lens import undistorted

@@ -33,7 +33,7 @@ from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job_styles import check_style_size
 from worker.capture import Capture, about_background, about_rendering, choose_axes, read_capture
-from worker.ranks.geometry import read_shared_scene
+from worker.ranks.shared_scene import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 from worker.selecting import select_regions
 from worker.styles import StyleFile

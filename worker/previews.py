@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.files.images import save_jpg
-from sgsst_core.planning.measuring import LOSS_VIEWS
+from sgsst_core.planning.measurement_choice import LOSS_VIEWS
 from sgsst_core.scene.camera import resized, spread
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.first_view import render_first_view

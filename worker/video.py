@@ -16,7 +16,7 @@ from sgsst_core.files.video import check_video_path, encoder, is_encoded, video_
 from sgsst_core.orbit.cameras import ELEVATION, turntable
 from sgsst_core.orbit.subject import find_subject
 from sgsst_core.orbit.up import find_up
-from sgsst_core.quality.exact import rasterizer_beside
+from sgsst_core.quality.float32_reference import rasterizer_beside
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.video import Layer, write_frames
 from sgsst_core.scene.camera import Camera

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import FrameType
 
-from service.private import keep_private
+from service.file_permissions import keep_private
 from service.settings import ServiceSettings
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError

@@ -17,8 +17,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.http.context import Context
 from api.http.documentation import complete
+from api.http.event_hub import Hub
 from api.http.fetching import Fetcher
-from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.problems import METHODS, Problem, add_handlers, logged_path, route_of
 from api.http.rates import Rates

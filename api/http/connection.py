@@ -12,12 +12,12 @@ from typing import Any
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from api.http.context import SESSION_COOKIE
-from api.http.memory import memory
 from api.http.problems import HeadTooLargeError, MalformedRequestError, TooManyConnectionsError, from_service
+from api.http.request_memory import memory
 from service.errors import ServiceError
 
 #: Maximum bytes of a request line and headers. The limit is lower while many connections are open; see
-#: `api.http.memory`.
+#: `api.http.request_memory`.
 MAX_HEAD_BYTES = 1 << 17
 #: Maximum number of headers: each takes far more memory than its bytes.
 MAX_HEADERS = 200

@@ -20,8 +20,8 @@ from urllib.parse import urlsplit
 from fastapi import Depends, Request
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
+from api.http.event_hub import Hub
 from api.http.fetching import Fetcher
-from api.http.hub import Hub
 from api.http.metrics import Metrics
 from api.http.rates import Rates
 from api.http.readiness import Readiness

@@ -17,9 +17,9 @@ from pathlib import PurePosixPath
 
 import httpx
 
-from api.http.memory import memory
 from api.http.multipart import check_file
 from api.http.receipts import Receipt
+from api.http.request_memory import memory
 from api.http.threads import OwnerLimit, OwnerThreads
 from service.errors import BusyError, FetchError, InvalidUrlError, TooLargeError, UrlsOffError
 from service.files.blobs import Blobs, Receiver

@@ -18,8 +18,8 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect
 
-from api.http.memory import memory
 from api.http.receipts import Receipt
+from api.http.request_memory import memory
 from api.http.threads import OwnerThreads
 from service.errors import (
     RefusedInputError,

@@ -12,7 +12,7 @@ from fastapi import Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel
 
-from api.http.hub import HEARTBEAT_SECONDS
+from api.http.event_hub import HEARTBEAT_SECONDS
 from api.http.problems import InternalError, from_service
 from api.http.schemas import ArtifactView, PlanView
 from service.errors import ServiceError

@@ -16,7 +16,7 @@ from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.documentation import Responses, headers
-from api.http.memory import memory
+from api.http.request_memory import memory
 from service.errors import NotFoundError, ServiceError
 from service.examples import SHA256
 

@@ -12,8 +12,8 @@ import uvicorn
 
 from api.http.app import create_app
 from api.http.connection import Connection, Reader
+from service.file_permissions import keep_private
 from service.logs import set_up
-from service.private import keep_private
 from service.settings import ServiceSettings
 
 #: Seconds that open requests have to finish at a shutdown.

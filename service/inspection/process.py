@@ -369,7 +369,7 @@ def _check_frames_have_sizes(path: Path) -> None:
             continue  # the reader reports the fault
         frames = content.get("frames") if isinstance(content, dict) else None
         for index, frame in enumerate(frames if isinstance(frames, list) else []):
-            if isinstance(frame, dict) and not all(key in frame or key in content for key in ("w", "h")):
+            if isinstance(frame, dict) and any(frame.get(side) is None and content.get(side) is None for side in "wh"):
                 raise CameraError(f"{file}: camera {index}: gives no size. Add the sizes of the images as 'w' and 'h'.")
 
 

@@ -17,10 +17,10 @@ import time
 from types import FrameType
 
 from service.errors import DamagedWeightsError, DatabaseUnavailableError, LeaseLostError
+from service.file_permissions import keep_private
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.logs import set_up
-from service.private import keep_private
 from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.housekeeping import Housekeeper
 from service.scheduling.lease_keeper import RENEW_FRACTION, LeaseKeeper

@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import DamagedFileError, LostFileError, StoreError
+from service.file_permissions import keep_private
 from service.files.artifacts import Artifacts
 from service.files.cache import file_digest
 from service.files.objects import ObjectStore
 from service.files.staging import CHECKPOINT, RESULT, stage
 from service.files.stored_blobs import open_cache
-from service.private import keep_private
 from service.scheduling.publishing import Outbox, put_patiently
 from service.settings import ServiceSettings
 from service.store.leases import Published

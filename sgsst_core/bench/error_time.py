@@ -27,8 +27,8 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import ratio
-from sgsst_core.planning.measuring import LOSS_VIEWS
-from sgsst_core.quality.exact import Float32Reference
+from sgsst_core.planning.measurement_choice import LOSS_VIEWS
+from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.judge import Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
 from sgsst_core.report.charts import (

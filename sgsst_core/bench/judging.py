@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sgsst_core.budget import measuring_memory
-from sgsst_core.quality.exact import ExactLoss, rasterizer_beside
+from sgsst_core.quality.float32_reference import ExactLoss, rasterizer_beside
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.novel_views import NovelViews

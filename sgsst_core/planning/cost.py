@@ -21,7 +21,7 @@ from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.tiling import RENDERING, Tiling
 from sgsst_core.parallel.division import Piece, loads
 from sgsst_core.planning.facts import Probe
-from sgsst_core.planning.measuring import (
+from sgsst_core.planning.measurement_choice import (
     LEVELS,
     LOSS_VIEWS,
     RENDERED,

@@ -11,7 +11,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.planning import choices
 from sgsst_core.planning.cost import CostModel, tiling_of
 from sgsst_core.planning.facts import Probe
-from sgsst_core.planning.measuring import LEAST_ALLOWED, LEVELS, allowed_seconds
+from sgsst_core.planning.measurement_choice import LEAST_ALLOWED, LEVELS, allowed_seconds
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.view_costs import RankPart
 from sgsst_core.settings import Settings

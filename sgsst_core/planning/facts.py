@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from sgsst_core.loss.difference import Difference
+from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.graphs import FIRST_VISITS
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.plan import Device

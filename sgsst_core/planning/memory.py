@@ -9,7 +9,7 @@ from sgsst_core.budget import least_intersection_memory, measuring_memory, memor
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.facts import Probe
-from sgsst_core.planning.measuring import LEVELS, RENDERED
+from sgsst_core.planning.measurement_choice import LEVELS, RENDERED
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.view_costs import COLOR_BYTES, RankPart, ViewCosts
 from sgsst_core.planning.work import matching_bytes

@@ -18,7 +18,7 @@ from torch import Tensor
 from sgsst_core.budget import memory_for
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.features.vgg import ALIGNMENT, CONTENT_LAYER, FeatureNetwork
-from sgsst_core.loss.difference import Difference
+from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.graphs import LossGraphs, graphs_problem
 from sgsst_core.loss.nearest import nearest_layers, search
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss

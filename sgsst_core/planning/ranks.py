@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from sgsst_core.features.partition import cached_tiles, choose_tile_size, computed_twice, partition
 from sgsst_core.parallel.collectives import TRAFFIC, Traffic
 from sgsst_core.parallel.division import Piece, Shares, divide, rounds
-from sgsst_core.parallel.shown import gaussians_sent
+from sgsst_core.parallel.visible_gaussians import gaussians_sent
 from sgsst_core.planning.facts import Link
 from sgsst_core.planning.view_costs import RankPart
 

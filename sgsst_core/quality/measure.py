@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sgsst_core.budget import measuring_memory
 from sgsst_core.loss.statistics_terms import has_statistics
-from sgsst_core.planning.measuring import (
+from sgsst_core.planning.measurement_choice import (
     LEVELS,
     NOTHING,
     Level,
@@ -20,7 +20,7 @@ from sgsst_core.planning.measuring import (
     choose_level,
     novel_view_seconds,
 )
-from sgsst_core.quality.exact import ExactLoss, Float32Reference, approximations, rasterizer_beside
+from sgsst_core.quality.float32_reference import ExactLoss, Float32Reference, approximations, rasterizer_beside
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViews

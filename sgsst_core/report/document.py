@@ -15,7 +15,7 @@ from sgsst_core.loss.convergence import ratio, smoothed
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.parallel.collectives import TRAFFIC
-from sgsst_core.planning.measuring import allowed_seconds
+from sgsst_core.planning.measurement_choice import allowed_seconds
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
 from sgsst_core.report.machine import machine, peak_memory, program_version

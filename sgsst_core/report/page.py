@@ -15,6 +15,7 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.report.figures import draw_figures
 from sgsst_core.report.history import AGAINST, BINS, round_length
+from sgsst_core.report.number_format import NOTHING, byte_count, duration, number, percent
 from sgsst_core.report.palette import ON_DARK, PAGE
 from sgsst_core.report.tables import (
     approximation_table,
@@ -25,7 +26,6 @@ from sgsst_core.report.tables import (
     novel_views_table,
     prediction_table,
 )
-from sgsst_core.report.wording import NOTHING, byte_count, duration, number, percent
 from sgsst_core.stylizing.state import BEFORE_STEPS
 
 #: Maximum number of list members shown in the collapsed section, followed by their total number.

@@ -35,8 +35,8 @@ from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras, spread
 from sgsst_core.scene.gaussians import Scene, checked_scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, image_of
-from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.job_styles import JobStyles
+from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.schedule import Phase, planned_phases
 from sgsst_core.stylizing.team import Team

@@ -20,8 +20,8 @@ from torch import Tensor
 from sgsst_core.budget import memory_for
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.difference import psnr
 from sgsst_core.loss.feature_scale import weights_for
+from sgsst_core.loss.gradient_error import psnr
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives

@@ -19,8 +19,8 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.loop import Callbacks, Progress, run
+from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.progress_bar import JobBar, job_bar
 from sgsst_core.stylizing.stylizer import Stylizer
 

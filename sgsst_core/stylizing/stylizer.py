@@ -28,7 +28,6 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.ahead import PhotoLoader
 from sgsst_core.stylizing.evaluation import (
     Evaluation,
     evaluate,
@@ -37,6 +36,7 @@ from sgsst_core.stylizing.evaluation import (
 )
 from sgsst_core.stylizing.job import StylizationJob, plan_job
 from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
+from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.result_colors import result_colors, transferred_colors
 from sgsst_core.stylizing.schedule import Phase, ViewOrder, drawn_views, phase_at
 from sgsst_core.stylizing.second_attempt import with_second_attempt

@@ -18,7 +18,7 @@ from sgsst_core.loss.view_images import ViewImages
 from sgsst_core.parallel.division import Piece
 from sgsst_core.regions.maps import ContentMaps, ViewMaps
 from sgsst_core.scene.camera import Camera
-from sgsst_core.stylizing.ahead import PhotoLoader, PhotosAhead
+from sgsst_core.stylizing.photo_prefetch import PhotoLoader, PhotosAhead
 from sgsst_core.stylizing.training_background import Color, replace_background
 from sgsst_core.stylizing.views import Views
 

@@ -13,7 +13,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.tiling import Divider
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import ImageExchange, Shares
-from sgsst_core.parallel.shown import ShownGaussians
+from sgsst_core.parallel.visible_gaussians import ShownGaussians
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene

@@ -20,7 +20,7 @@ from sgsst_core.features.statistics import (
     merge_all,
 )
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.difference import Difference
+from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.statistics_terms import style_loss
 from sgsst_core.loss.targets import LayerTarget

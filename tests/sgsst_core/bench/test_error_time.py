@@ -25,7 +25,7 @@ from sgsst_core.bench.error_time import (
 from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.quality.exact import Float32Reference
+from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import Evaluation
@@ -56,7 +56,7 @@ def test_variants_are_evaluated_at_equal_times(
         judgments = [point.judgment for point in curve.points]
         assert all(judgment is not None and judgment.content > 0 for judgment in judgments)
         assert judgments[-1] == judge.judge(curve.sh_dc)
-    assert curves[0].points[-1].relative < 0.9  # it optimizes the loss it is evaluated with
+    assert (curves[0].points[-1].relative or 1) < 0.9  # it optimizes the loss it is evaluated with
     write_plot(tmp_path / "p.png", curves, "a wall")
     assert Image.open(tmp_path / "p.png").width > 800
     values = json.loads(json.dumps(as_dict(curves)))

@@ -12,7 +12,7 @@ import torch
 
 from sgsst_core.decision import Decision
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.loss.difference import Difference
+from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.nearest import MOST_VECTORS
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import LaunchCost, Link, Machine, NetworkFacts, Probe, RasterCost, Rate, SceneFacts

@@ -10,7 +10,7 @@ import pytest
 from sgsst_core.budget import content_fraction, least_intersection_memory, measuring_memory, memory_for
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import RasterCost
-from sgsst_core.planning.measuring import LEVELS
+from sgsst_core.planning.measurement_choice import LEVELS
 from sgsst_core.planning.memory import (
     BUILDING_BYTES,
     MEASURING_BYTES,

@@ -10,7 +10,7 @@ import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.difference import Difference
+from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning import context as module
 from sgsst_core.planning.context import convolution_ratio, equip, precision_ratio, seconds_of

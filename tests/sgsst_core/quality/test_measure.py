@@ -10,7 +10,7 @@ import torch
 
 from sgsst_core import Stylizer, make_settings, run
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.planning.measuring import NOTHING
+from sgsst_core.planning.measurement_choice import NOTHING
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.stylizing.loop import Callbacks

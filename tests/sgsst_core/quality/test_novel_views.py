@@ -22,7 +22,7 @@ from sgsst_core.files.scene_file import read_scene
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.sos_reference import box_average_reference, features_reference
 from sgsst_core.loss.statistics_terms import GRAM_WEIGHT
-from sgsst_core.planning.measuring import LEVELS
+from sgsst_core.planning.measurement_choice import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.novel_cameras import neighbors

@@ -14,7 +14,7 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.quality.exact import Float32Reference
+from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.report.contact_sheet import write_contact_sheet

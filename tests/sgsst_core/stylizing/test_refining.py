@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.difference import psnr
+from sgsst_core.loss.gradient_error import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import choice

@@ -9,7 +9,7 @@ import torch
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.quality.exact import Float32Reference
+from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import mean_loss

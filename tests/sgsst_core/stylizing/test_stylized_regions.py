@@ -14,7 +14,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.targets import ViewTarget
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.quality.exact import Float32Reference
+from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.regions.maps import RegionMaps

@@ -39,7 +39,7 @@ def test_extreme_values_leave_the_others_their_entries() -> None:
     usual = value_codebook(values)
     usual_error = error(values, usual[nearest_entries(values, usual)])
     for extremes in ([1e3], [1e7], [-1e7], [1e3, 1e7, -1e5]):
-        extreme = np.concatenate([values, np.float32(extremes)])
+        extreme = np.concatenate([values, np.array(extremes, np.float32)])
         codebook = value_codebook(extreme)
         nearest = codebook[nearest_entries(extreme, codebook)]
         assert error(values, nearest[: len(values)]) < 1.2 * usual_error

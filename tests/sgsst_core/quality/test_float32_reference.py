@@ -10,7 +10,7 @@ import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.quality.exact import Float32Reference, approximations
+from sgsst_core.quality.float32_reference import Float32Reference, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job

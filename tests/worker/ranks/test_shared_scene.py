@@ -24,8 +24,8 @@ from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
 from tests.worker.ranks.spawn import on_ranks
-from worker.ranks import geometry
-from worker.ranks.geometry import read_shared_scene
+from worker.ranks import shared_scene
+from worker.ranks.shared_scene import read_shared_scene
 
 linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory files are looked for in Linux's /proc")
 
@@ -89,7 +89,7 @@ def test_compressed_scene_needs_memory_of_its_floats(tmp_path: Path) -> None:
     path = tmp_path / "scene"
     for format in EXTRA_FORMATS:
         write_scene(path, wall(sh_degree=3), format)
-        little = patch.object(geometry, "available_memory", return_value=616 * 4 * 59)
+        little = patch.object(shared_scene, "available_memory", return_value=616 * 4 * 59)
         with little, pytest.raises(SceneTooLargeError, match="616 Gaussians need"):
             read_shared_scene(path, ALONE)
 

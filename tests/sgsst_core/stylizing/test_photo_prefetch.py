@@ -19,8 +19,8 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.images import save_png
 from sgsst_core.files.photos import Photo, load_photo
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.ahead import PhotosAhead
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.photo_prefetch import PhotosAhead
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.device import DEVICE, PretendTensor

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.difference import Difference
+from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.rasterizer import Rasterizer

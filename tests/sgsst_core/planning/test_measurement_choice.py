@@ -10,7 +10,7 @@ import pytest
 
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import RasterCost
-from sgsst_core.planning.measuring import (
+from sgsst_core.planning.measurement_choice import (
     LEAST_ALLOWED,
     LEVELS,
     NOTHING,
