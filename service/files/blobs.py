@@ -276,7 +276,11 @@ class BlobFolder(Blobs):
             final.unlink()
             raise
         known = self._blobs / location
-        if known != final:  # replace the earlier file of the same content, which may be lost or damaged
+        if known == final:
+            return sha256
+        if self.objects.fault(f"{BLOBS}/{location}", sha256) is None:
+            final.unlink()  # an intact file stays: a confined process may open only the file that it was given
+        else:
             known.parent.mkdir(exist_ok=True)
             final.replace(known)
             final.unlink(missing_ok=True)  # renaming one of two hard links to the other is a no-op

@@ -702,6 +702,27 @@ def test_partial_files_of_dead_process_are_removed(tmp_path: Path, monkeypatch: 
     store.close()
 
 
+def test_only_damaged_blobs_are_replaced(tmp_path: Path) -> None:
+    """A confined process that was given an intact file may open only that one."""
+    store = open_store(ServiceSettings(data=tmp_path))
+    blobs = BlobFolder(tmp_path, store.inputs, 0)
+
+    def add() -> Path:
+        (received := blobs.incoming / "received").write_bytes(b"the same")
+        sha256 = blobs.add(received)
+        (path,) = blobs.fetch(store.inputs.blobs([sha256]), tmp_path).values()
+        return path
+
+    path = add()
+    first = path.stat().st_ino
+    assert add().stat().st_ino == first
+    assert len(list(path.parent.iterdir())) == 1
+    path.chmod(0o600)
+    path.write_bytes(b"damaged!")
+    assert add().read_bytes() == b"the same"
+    store.close()
+
+
 @pytest.mark.slow
 def test_job_limit_and_full_disk_reject_requests(tmp_path: Path, files: dict[str, bytes]) -> None:
     with Service(tmp_path / "data", alone=True, SGSST_MAX_JOBS_PER_KEY="1") as service, service.client() as client:
