@@ -151,6 +151,11 @@ def about_rendering(file: SceneFile) -> list[Decision]:
     return [*lines, *(Decision("rendering", f"warning: drawn {drawn}", reason) for drawn, reason in tag.warnings)]
 
 
+def about_notes(file: SceneFile) -> list[Decision]:
+    """Return warnings about contents of a scene file that were not read, or not read as stored."""
+    return [Decision("scene", "warning", note) for note in file.notes]
+
+
 def about_background(scene: Path, background: Color) -> list[Decision]:
     """Return a warning if the original 3DGS code trained a scene on white, but the job's background is not white.
 

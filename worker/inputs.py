@@ -32,7 +32,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job_styles import check_style_size
-from worker.capture import Capture, about_background, about_rendering, choose_axes, read_capture
+from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.ranks.shared_scene import read_shared_scene
 from worker.request import SceneRequest, StylizeRequest
 from worker.selecting import select_regions
@@ -111,7 +111,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
     own = None
     if reader:
         own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps, regions)
-    decisions = (*about_axes, *about_rendering(scene_file), *about_color, *capture.decisions)
+    decisions = (*about_notes(scene_file), *about_axes, *about_rendering(scene_file), *about_color, *capture.decisions)
     same = _same_fingerprint(own, collectives)
     return Inputs(weights, style, scene_file, cameras, capture.orbit, photos, decisions, regions, same)
 

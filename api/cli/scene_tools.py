@@ -41,7 +41,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.refining import refine, refined
-from worker.capture import about_rendering, choose_axes, read_capture
+from worker.capture import about_notes, about_rendering, choose_axes, read_capture
 from worker.description import describe_scene
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
 from worker.outputs import check_folder, check_is_not_input, result_format
@@ -98,7 +98,7 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
         measured=True,
         show=show_planning,
         orbit=capture.orbit,
-        about_inputs=capture.decisions,
+        about_inputs=(*about_notes(file), *capture.decisions),
         style=style,
         regions=regions and regions.refined(refinement),
         refinement=refinement,

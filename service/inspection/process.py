@@ -66,7 +66,7 @@ from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job_styles import check_style_size
 from sgsst_core.stylizing.refining import refine, refined
-from worker.capture import Capture, about_rendering, choose_axes, read_capture
+from worker.capture import Capture, about_notes, about_rendering, choose_axes, read_capture
 from worker.inputs import check_something_in_view, load_styles, read_regions
 from worker.options import JobVideo
 from worker.processes import die_with_parent
@@ -174,7 +174,8 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
             _check_pixel_count(path, limits)
     with _errors_of("regions"):
         regions = read_regions(job, file, capture.cameras)
-    capture = replace(capture, decisions=(*about_axes, *about_rendering(file), *capture.decisions))
+    decisions = (*about_notes(file), *about_axes, *about_rendering(file), *capture.decisions)
+    capture = replace(capture, decisions=decisions)
     return findings, _Inputs(file.scene, capture, style, regions)
 
 

@@ -20,7 +20,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
 from tests.small_scenes import ball, cameras, wall, write_files
-from worker.capture import Capture, about_background, about_rendering, choose_axes, read_capture
+from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.description import describe_scene
 from worker.inputs import read_scene_and_capture
 from worker.request import SceneRequest
@@ -168,6 +168,7 @@ def test_scene_that_cameras_see_under_both_axes_gets_a_note(tmp_path: Path) -> N
     assert describe_axes(source) == note
     assert describe_axes(source.model_copy(update={"cameras": None, "orbit": 3})) == note
     assert not describe_axes(source.model_copy(update={"spz_axes": "rdf"}))
+    assert [line.item for line in about_notes(read_scene(path))] == ["scene"], "plans say it too"
 
 
 def describe_axes(source: SceneRequest) -> str:
