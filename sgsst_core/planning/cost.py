@@ -45,10 +45,10 @@ _SAMPLED_VIEWS = 3
 #: Time from the last step to the last file written: constant seconds for images and report, and seconds per Gaussian
 #: for the neighbor search and for writing (measured with 4 million Gaussians on two cores; an estimate elsewhere).
 _ENDING_SECONDS = 1.5
-_ENDING_SECONDS_A_GAUSSIAN = 4e-6
-#: Portion of `_ENDING_SECONDS_A_GAUSSIAN` for the neighbor search. If some Gaussians are unseen, the search is repeated
-#: at every measurement.
-_NEIGHBORS_SECONDS_A_GAUSSIAN = 1.5e-6
+_ENDING_SECONDS_PER_GAUSSIAN = 4e-6
+#: Portion of `_ENDING_SECONDS_PER_GAUSSIAN` for the neighbor search. If some Gaussians are unseen, the search is
+#: repeated at every measurement.
+_NEIGHBORS_SECONDS_PER_GAUSSIAN = 1.5e-6
 #: Renders needed to compute the depth of a novel view.
 _DEPTH_RENDERS = 2
 
@@ -195,37 +195,63 @@ class CostModel:
         Returns:
             Prediction, level of measurements (see `Plan.measuring`), and number of views for the loss.
         """
-        plan, settings, network, work = self._plan, self._settings, self._probe.network, self.work
         views = self.views.of_rank(part)
+        expected = self._with_first_visits(steps, views)
+        level, loss_views = self._plan.measuring, min(LOSS_VIEWS[0], len(self._plan.covered))
+        if self._plan.measured:
+            expected, level, loss_views = self._with_measurements(expected, views, part)
+        memory = PeakMemory(
+            self.tiling,
+            self.sizes,
+            views,
+            part,
+            self._plan,
+            self._probe,
+            self._settings,
+            level,
+            loss_views,
+            activations,
+        )
+        process, device = memory.bytes()
+        return replace(expected, peak_bytes=process, device_bytes=device), level, loss_views
+
+    def _with_first_visits(self, steps: Prediction, views: ViewCosts) -> Prediction:
+        """Add the time of the style and of every view's first visit to a prediction of the steps."""
         expected = replace(
             steps,
             first_visit=views.first(coarse=False),
             first_visit_coarse=views.first(coarse=True),
-            style=self._probe.styles * work.without_region * network.rate.forward,
+            style=self._probe.styles * self.work.without_region * self._probe.network.rate.forward,
         )
-        seconds = self._steps_seconds(expected)
-        expected = replace(expected, job=seconds)
-        count = len(plan.covered)
-        level, loss_views = plan.measuring, min(LOSS_VIEWS[0], count)
-        if plan.measured:
-            once = RENDER * views.rasterized() + views.later(coarse=False) + part.seconds(work.evaluation(network))
-            unvisited = max(1 - settings.steps_sos * settings.views_per_step / count, 0.0)
-            price = once + unvisited * expected.first_visit
-            # `target_loss` is relative to the initial loss on these views. Their number must not depend on timings, or
-            # timings would determine the step at which the job ends.
-            if not settings.target_loss:
-                loss_views = choose_loss_views(settings.measure, seconds, price, count)
-            ending = _ENDING_SECONDS + _ENDING_SECONDS_A_GAUSSIAN * self._probe.scene.gaussians
-            expected = replace(expected, evaluation=loss_views * once, losses=loss_views * price, ending=ending)
-            prices, total = self._prices(expected), plan.steps_coarse + settings.steps_sos
-            level = choose_level(prices, novel_view_seconds(settings.measure, expected), total)
-            measuring = expected.losses + prices.of(LEVELS[level], len(LEVELS[level].moments(total)))
-            expected = replace(expected, measuring=measuring, job=seconds + measuring)
-        memory = PeakMemory(
-            self.tiling, self.sizes, views, part, plan, self._probe, settings, level, loss_views, activations
+        return replace(expected, job=self._steps_seconds(expected))
+
+    def _with_measurements(self, expected: Prediction, views: ViewCosts, part: RankPart) -> tuple[Prediction, int, int]:
+        """Choose the measurements of a job, and add their time to its prediction.
+
+        Returns what `whole_job` returns.
+        """
+        plan, settings, count = self._plan, self._settings, len(self._plan.covered)
+        evaluation = RENDER * views.rasterized() + views.later(coarse=False)
+        evaluation += part.seconds(self.work.evaluation(self._probe.network))
+        unvisited = max(1 - settings.steps_sos * settings.views_per_step / count, 0.0)
+        before_and_after = evaluation + unvisited * expected.first_visit
+        # `target_loss` is relative to the initial loss on these views. Their number must not depend on timings, or
+        # timings would determine the step at which the job ends.
+        loss_views = (
+            min(LOSS_VIEWS[0], count)
+            if settings.target_loss
+            else choose_loss_views(settings.measure, expected.job, before_and_after, count)
         )
-        process, device = memory.bytes()
-        return replace(expected, peak_bytes=process, device_bytes=device), level, loss_views
+        expected = replace(
+            expected,
+            evaluation=loss_views * evaluation,
+            losses=loss_views * before_and_after,
+            ending=_ENDING_SECONDS + _ENDING_SECONDS_PER_GAUSSIAN * self._probe.scene.gaussians,
+        )
+        prices, total = self._prices(expected), plan.steps_coarse + settings.steps_sos
+        level = choose_level(prices, novel_view_seconds(settings.measure, expected), total)
+        measuring = expected.losses + prices.of(LEVELS[level], len(LEVELS[level].moments(total)))
+        return replace(expected, measuring=measuring, job=expected.job + measuring), level, loss_views
 
     def _steps_seconds(self, expected: Prediction) -> float:
         """Return the time in seconds of all steps, including first visits and style."""
@@ -245,7 +271,7 @@ class CostModel:
         raster, gaussians = self._probe.raster, self._probe.scene.gaussians
         render = RENDER * raster.seconds
         neighbors = (
-            _NEIGHBORS_SECONDS_A_GAUSSIAN * gaussians if neighbors_are_searched(self._plan, self._settings) else 0.0
+            _NEIGHBORS_SECONDS_PER_GAUSSIAN * gaussians if neighbors_are_searched(self._plan, self._settings) else 0.0
         )
         return Prices(
             setup=RENDERED * (raster.first_seconds + raster.colors_seconds + _DEPTH_RENDERS * render),

@@ -19,7 +19,7 @@ from sgsst_core.planning.decide import decide
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import measure, probe_link
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
-from sgsst_core.planning.view_costs import MAP_BYTES, MAPS_OF_A_RENDER
+from sgsst_core.planning.view_costs import MAP_BYTES, MAPS_PER_RENDER
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions
@@ -176,7 +176,7 @@ def _about_regions(regions: Regions, resolved: Regions, plan: Plan, cameras: Seq
         return lines
     count = len(resolved.active)
     pixels = sum(cameras[index].width * cameras[index].height for index in plan.covered)
-    renders = 1 + -(-count // MAPS_OF_A_RENDER)  # plus one for the background
+    renders = 1 + -(-count // MAPS_PER_RENDER)  # plus one for the background
     decision = (
         f"statistics of {count} region{'' if count == 1 else 's'} are weighted by each region's fraction of a pixel's "
         f"blend weights; {renders} renders at a view's first visit, {int(MAP_BYTES * count * pixels) / 1e6:.1f} MB for "

@@ -24,7 +24,7 @@ COLOR_BYTES = 12
 #: step.
 _IMAGE_BYTES = 16
 #: Bytes per pixel of coverage or of a region's map at all scales, float32, and number of maps computed by one render.
-MAP_BYTES, MAPS_OF_A_RENDER = 16 / 3, 3
+MAP_BYTES, MAPS_PER_RENDER = 16 / 3, 3
 
 
 @dataclass(frozen=True)
@@ -141,48 +141,29 @@ class ViewCosts:
             coarse: Work of an iteration on the coarsest scale.
             content: Size in bytes of the content features of all views.
         """
-        raster, memory, views = probe.raster, probe.machine.memory, len(plan.covered)
-        view_budget, raster_budget = view_memory(plan, memory), memory_for("rasterizer", memory)
-        # Ranks have surveyed different views.
-        surveyed = ViewData(0.0, len(probe.sizes) * raster.intersection_bytes / probe.machine.ranks, raster_budget)
-        budget = raster_budget if plan.cached_weights == "none" else least_intersection_memory(memory)
-        intersections = ViewData(raster.first_seconds, views * raster.intersection_bytes, budget)
-        colors = views * int(plan.seen.sum()) * COLOR_BYTES if probe.scene.used_degree else 0
-        weights = None
-        if plan.cached_weights != "none":
-            size = (raster.bytes if plan.cached_weights == "float32" else raster.half_bytes) or 0
-            seconds = _CACHING_RENDERS * raster.seconds if raster.caching_seconds is None else raster.caching_seconds
-            weights = ViewData(seconds, size, raster_budget, views)
-        rendered = RENDER * raster.seconds if settings.content_weight else 0.0
-        features = [each.features(probe.network) if settings.content_weight else 0.0 for each in (work, coarse)]
-        fraction = content_fraction(probe.machine.device, weighted=plan.weighted, has_maps=bool(probe.maps))
-        content_budget = 0 if "content" in settings.keep else view_budget * fraction
+        raster = probe.raster
+        budget = view_memory(plan, probe.machine.memory)
         pixels = sum(height * width for height, width in (probe.sizes[index] for index in plan.covered))
-        images = ViewData(0.0)
-        if plan.training_background != "background" and settings.content_weight:
-            # Features depend on the step's background color, so images are cached in their place.
-            images, rendered = ViewData(rendered, _IMAGE_BYTES * pixels, content_budget / 2), 0.0
-            content_budget = 0
+        surveyed, intersections, reused = _intersections(plan, probe)
+        features, features_coarse, images = _content(plan, probe, settings, (work, coarse), content, pixels, budget)
         coverage = maps = ViewData(0.0)
         if plan.weighted:
-            coverage = ViewData(RENDER * raster.seconds, MAP_BYTES * pixels, view_budget / 4)
+            coverage = ViewData(RENDER * raster.seconds, MAP_BYTES * pixels, budget / 4)
         if probe.maps:
-            renders = 1 + -(-probe.maps // MAPS_OF_A_RENDER)  # plus one for the background
-            maps = ViewData(RENDER * renders * raster.seconds, MAP_BYTES * probe.maps * pixels, view_budget / 4)
-        coarse_content = content * (coarse.pixels / work.pixels)  # bytes are in proportion to pixels
+            renders = 1 + -(-probe.maps // MAPS_PER_RENDER)  # plus one for the background
+            maps = ViewData(RENDER * renders * raster.seconds, MAP_BYTES * probe.maps * pixels, budget / 4)
+        colors = len(plan.covered) * int(plan.seen.sum()) * COLOR_BYTES if probe.scene.used_degree else 0
         return ViewCosts(
-            coverage=coverage,
-            maps=maps,
             intersections=intersections,
             surveyed=surveyed,
-            reused=min(surveyed.cached / intersections.cached, 1.0)
-            / probe.machine.ranks
-            * (1 if plan.seen.all() else 1 - _RESTRICTING),
-            colors=ViewData(raster.colors_seconds, colors, view_budget / 4),
-            weights=weights,
-            content=ViewData(rendered + features[0], content, content_budget),
-            content_coarse=ViewData(rendered + features[1], coarse_content, content_budget),
+            reused=reused,
+            colors=ViewData(raster.colors_seconds, colors, budget / 4),
+            weights=_weights(plan, probe),
+            content=features,
+            content_coarse=features_coarse,
             images=images,
+            coverage=coverage,
+            maps=maps,
             raster=raster.seconds,
             raster_cached=raster.seconds if raster.cached_seconds is None else raster.cached_seconds,
             fixed=(raster.fixed, raster.first_fixed),
@@ -228,6 +209,55 @@ class ViewCosts:
         maps = self.coverage.once + self.maps.once
         intersections = (1 - self.reused) * self.intersections.once + self.colors.once
         return content + maps + intersections + (self.weights.once if self.weights else 0.0)
+
+
+def _intersections(plan: Plan, probe: Probe) -> tuple[ViewData, ViewData, float]:
+    """Return `surveyed`, `intersections` and `reused` of `ViewCosts`."""
+    raster, memory, views = probe.raster, probe.machine.memory, len(plan.covered)
+    most = memory_for("rasterizer", memory)
+    # Ranks have surveyed different views.
+    surveyed = ViewData(0.0, len(probe.sizes) * raster.intersection_bytes / probe.machine.ranks, most)
+    budget = most if plan.cached_weights == "none" else least_intersection_memory(memory)
+    intersections = ViewData(raster.first_seconds, views * raster.intersection_bytes, budget)
+    reused = min(surveyed.cached / intersections.cached, 1.0) / probe.machine.ranks
+    return surveyed, intersections, reused * (1 if plan.seen.all() else 1 - _RESTRICTING)
+
+
+def _weights(plan: Plan, probe: Probe) -> ViewData | None:
+    """Return the cached weights of all views; None if there are none."""
+    raster = probe.raster
+    if plan.cached_weights == "none":
+        return None
+    size = (raster.bytes if plan.cached_weights == "float32" else raster.half_bytes) or 0
+    seconds = _CACHING_RENDERS * raster.seconds if raster.caching_seconds is None else raster.caching_seconds
+    return ViewData(seconds, size, memory_for("rasterizer", probe.machine.memory), len(plan.covered))
+
+
+def _content(
+    plan: Plan, probe: Probe, settings: Settings, works: tuple[Work, Work], size: int, pixels: int, budget: float
+) -> tuple[ViewData, ViewData, ViewData]:
+    """Return `content`, `content_coarse` and `images` of `ViewCosts`.
+
+    Args:
+        plan: Plan under construction.
+        probe: Measured facts.
+        settings: Settings of the job.
+        works: Work of an iteration on all scales, and on the coarsest one.
+        size: Size in bytes of the content features of all views.
+        pixels: Number of pixels of all views.
+        budget: Budget in bytes for data of the views.
+    """
+    work, coarse = works
+    render = RENDER * probe.raster.seconds if settings.content_weight else 0.0
+    seconds = [each.features(probe.network) if settings.content_weight else 0.0 for each in works]
+    fraction = content_fraction(probe.machine.device, weighted=plan.weighted, has_maps=bool(probe.maps))
+    budget = 0 if "content" in settings.keep else budget * fraction
+    images = ViewData(0.0)
+    if plan.training_background != "background" and settings.content_weight:
+        # Features depend on the step's background color, so images are cached in their place.
+        images, render, budget = ViewData(render, _IMAGE_BYTES * pixels, budget / 2), 0.0, 0
+    coarse_size = size * (coarse.pixels / work.pixels)  # bytes are in proportion to pixels
+    return ViewData(render + seconds[0], size, budget), ViewData(render + seconds[1], coarse_size, budget), images
 
 
 def proportional(seconds: float) -> Callable[[RankPart], float]:
