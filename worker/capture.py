@@ -36,7 +36,7 @@ class Capture:
         orbit: Orbit that generated the cameras; None if they come from a file.
         photo_sizes: Width and height of each camera's photo in the camera file.
         photos: Photo of each camera; None if the job uses unstylized renders.
-        decisions: Lines about cameras and photos for the plan.
+        decisions: Decisions about cameras and photos for the plan.
     """
 
     cameras: list[Camera]
@@ -185,7 +185,7 @@ def orbit_request(source: SceneRequest) -> OrbitRequest:
 
 
 def _about_pinholes(cameras: Sequence[Camera]) -> list[Decision]:
-    """Return the line about lens distortion without photos."""
+    """Return the decision about lens distortion without photos."""
     models = _models(cameras)
     if not models:
         return []
@@ -201,7 +201,7 @@ def _models(cameras: Sequence[Camera]) -> str:
 
 
 def _about_undistorted(cameras: Sequence[Camera], width_fraction: float) -> list[Decision]:
-    """Return the line about undistorted photos, given the least fraction of their width that views show."""
+    """Return the decision about undistorted photos, given the least fraction of their width that views show."""
     models = _models(cameras)
     if not models:
         return []
@@ -214,7 +214,7 @@ def _about_undistorted(cameras: Sequence[Camera], width_fraction: float) -> list
 
 
 def _about_photos(sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]) -> list[Decision]:
-    """Return the lines about missing, resized and rotated photos."""
+    """Return the decisions about missing, resized and rotated photos."""
     lines = []
     if missing:
         left_out = f"warning: {len(missing)} of {len(missing) + len(photos)} views are left out"

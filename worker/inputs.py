@@ -52,7 +52,7 @@ class Inputs:
         cameras: Cameras at the sizes at which the scene is stylized.
         orbit: Orbit that generated the cameras; None if they come from a file.
         photos: Photo of each camera for the content term; None if it uses unstylized renders.
-        decisions: Lines about cameras and photos for the plan.
+        decisions: Decisions about cameras and photos for the plan.
         regions: Regions of the scene; None if the job has none.
         fingerprint: Hash of all inputs and settings; equal for equal jobs.
     """

@@ -202,7 +202,7 @@ class Converted:
 
     Attributes:
         scene: Text about the scene, with contents that were not read, or not read as stored.
-        decisions: Lines about the scene's axes and the cameras.
+        decisions: Decisions about the scene's axes and the cameras.
         loss: Difference of the written scene; None if it was not measured.
     """
 

@@ -128,7 +128,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
 
 
 def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence[float] | None) -> list[Decision]:
-    """Return the plan's lines about an orbit.
+    """Return the decisions about an orbit.
 
     Args:
         orbit: Chosen orbit.

@@ -56,7 +56,7 @@ def rendered_gaussians(survey: Survey, settings: Settings) -> Tensor:
 
 
 def about_gaussians(probe: Probe, rendered: Tensor, settings: Settings) -> list[Decision]:
-    """Return the lines about Gaussians that are not rendered, and about spherical harmonics."""
+    """Return the decisions about Gaussians that are not rendered, and about spherical harmonics."""
     unseen = int((~rendered).sum())
     harmonics = _about_harmonics(probe, settings)
     if not unseen:
@@ -117,7 +117,7 @@ def _about_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
 
 
 def about_views(probe: Probe) -> list[Decision]:
-    """Return the line about views that show nothing."""
+    """Return the decision about views that show nothing."""
     total = len(probe.sizes)
     blind = total - len(probe.survey.covered)
     return [Decision(VIEWS, f"{blind} of {total} are skipped", "they see no Gaussian")] if blind else []
@@ -133,7 +133,7 @@ def position_weights(survey: Survey, settings: Settings) -> tuple[bool, list[Dec
 
 
 def about_uncovered_pixels(model: CostModel, probe: Probe) -> list[Decision]:
-    """Return the line about uncovered pixels that skip the network."""
+    """Return the decision about uncovered pixels that skip the network."""
     work = model.work
     if work.pixels >= work.without_region:
         return []
@@ -166,7 +166,7 @@ def training_background(settings: Settings, *, scan: bool) -> PlannedBackground:
 def about_training_background(
     background: PlannedBackground, survey: Survey, settings: Settings, model: CostModel
 ) -> list[Decision]:
-    """Return the line about the training background, unless it is the job's own background."""
+    """Return the decision about the training background, unless it is the job's own background."""
     if background == "background":
         return []
     color = {"random": "a random color", "palette": "the color of a random pixel of the style"}[background]
@@ -214,7 +214,7 @@ def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
 
 
 def about_colors(settings: Settings) -> list[Decision]:
-    """Return the line about color preservation, if luminance alone is stylized."""
+    """Return the decision about color preservation, if luminance alone is stylized."""
     if settings.preserve_colors != "luminance":
         return []
     line = "only luminance is compared and optimized; each Gaussian keeps its chroma"
@@ -242,7 +242,7 @@ def steps_coarse(scales: Sequence[int], settings: Settings) -> tuple[int, list[D
 
 
 def about_scales(counts: Sequence[int], settings: Settings) -> list[Decision]:
-    """Return the lines about scales and their weights, given the number of scales of each view."""
+    """Return the decisions about scales and their weights, given the number of scales of each view."""
     scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
     reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
     lines = [Decision("scales", scales, reason)]
@@ -260,7 +260,7 @@ def about_scales(counts: Sequence[int], settings: Settings) -> list[Decision]:
 
 
 def about_early_stop(background: PlannedBackground, views: int, settings: Settings) -> list[Decision]:
-    """Return the line about the condition to stop early. `views` is the number of views of the job."""
+    """Return the decision about the condition to stop early. `views` is the number of views of the job."""
     if not settings.early_stop:
         return []
     if background != "background":
@@ -305,7 +305,7 @@ class Visits:
 
 
 def about_network(model: CostModel, probe: Probe, settings: Settings) -> list[Decision]:
-    """Return the lines about layers, style loss, content, partition and forward passes."""
+    """Return the decisions about layers, style loss, content, partition and forward passes."""
     network, work = probe.network, model.work
     layers = f"up to {network.deepest}, the deepest one used"
     lines = [Decision("network layers", layers, "the loss reads no deeper layer")]
@@ -456,7 +456,7 @@ def _weight_times(raster: RasterCost) -> str:
 
 
 def about_rasterizer(probe: Probe, *, cached: bool) -> list[Decision]:
-    """Return the line about the rasterizer on a GPU; on the CPU there is no choice.
+    """Return the decision about the rasterizer on a GPU; on the CPU there is no choice.
 
     Args:
         probe: Measured facts.
@@ -476,7 +476,7 @@ def about_rasterizer(probe: Probe, *, cached: bool) -> list[Decision]:
 
 
 def about_shared_gpus(probe: Probe) -> list[Decision]:
-    """Return the line about ranks that share a GPU, if there are any."""
+    """Return the decision about ranks that share a GPU, if there are any."""
     if probe.machine.device == "cpu" or probe.machine.sharing == 1:
         return []
     reason = f"{probe.machine.sharing} of them share a GPU, which NCCL does not support; give each a GPU of its own"
@@ -484,7 +484,7 @@ def about_shared_gpus(probe: Probe) -> list[Decision]:
 
 
 def about_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
-    """Return the line about the number of ranks."""
+    """Return the decision about the number of ranks."""
     speed = f"{choice.speed_up:.2f} times as fast as one"
     measured = f"{link.bandwidth / 1e9:.2g} GB/s and {link.latency * 1e6:.0f} microseconds between ranks were measured"
     if choice.ranks == available:

@@ -92,7 +92,7 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
 
 
 def _about_measuring(plan: Plan, expected: Prediction, settings: Settings) -> Decision:
-    """Return the line about measurements outside the steps and their cost."""
+    """Return the decision about measurements outside the steps and their cost."""
     steps = expected.job - expected.measuring
     cost = f"about {expected.measuring:.2g} s in addition to {steps:.3g} s of steps"
     losses = f"the initial loss on {_count(plan.loss_views, 'view')}"

@@ -63,7 +63,7 @@ def make_plan(
         show: Callback for the progress of the survey.
         timer: Timer that records the survey as "survey", and everything else as "planning".
         orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
-        about_inputs: Lines about cameras and photos that start the plan.
+        about_inputs: Decisions about cameras and photos that start the plan.
         style: Style mixture, for the plan to report its images; None for one image.
         regions: Regions of the scene; None if there are none.
         refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
@@ -122,7 +122,7 @@ def _style_count(style: Style | None, regions: Regions | None) -> int:
 
 
 def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> list[Decision]:
-    """Return the lines about unused parts of style images, the color subspace, and the mixture of several images."""
+    """Return the decisions about unused parts of style images, the color subspace, and the mixture of several images."""
     own = [region.style for region in regions.every if region.style] if regions else []
     lines = [Decision("style", "warning", note) for each in (style, *own) for note in each.notes]
     if subspace := color_subspace_of((style, *own), settings):
@@ -140,7 +140,7 @@ def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> 
 
 
 def _about_regions(regions: Regions, resolved: Regions, plan: Plan, cameras: Sequence[Camera]) -> list[Decision]:
-    """Return the lines about the regions and the cost of their maps.
+    """Return the decisions about the regions and the cost of their maps.
 
     Args:
         regions: Regions as requested.
