@@ -205,7 +205,7 @@ def video_cameras(
 
 
 def _read(source: SceneRequest) -> tuple[Scene, list[Decision]]:
-    """Read a scene with the axes that its cameras suggest and the requested render mode; add the decisions about both."""
+    """Read a scene with the axes that its cameras suggest and the requested render mode; add decisions about both."""
     axes, decisions = choose_axes(source)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = file.rendered(source.render_mode, source.eps2d)

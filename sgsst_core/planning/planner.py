@@ -122,7 +122,7 @@ def _style_count(style: Style | None, regions: Regions | None) -> int:
 
 
 def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> list[Decision]:
-    """Return the decisions about unused parts of style images, the color subspace, and the mixture of several images."""
+    """Return the decisions about unused parts of style images, the color subspace, and the mixture of images."""
     own = [region.style for region in regions.every if region.style] if regions else []
     lines = [Decision("style", "warning", note) for each in (style, *own) for note in each.notes]
     if subspace := color_subspace_of((style, *own), settings):

@@ -152,19 +152,17 @@ def strain(situation: Situation) -> CaseResult:
     colors, moved = job.stylized(), _moved(job, start)
     judged = job.job.plan.training_background == "background"  # other backgrounds change the loss of the steps
     most = job.job.total_steps * job.job.settings.learning_rate * LONGEST_STEP
-    broken = [
-        what
-        for what, holds in {
-            "colors are not finite": bool(torch.isfinite(colors).all()) and math.isfinite(moved),
-            "the loss is not finite": math.isfinite(before) and math.isfinite(after),
-            f"colors moved by {moved:.3g} in {job.job.total_steps} steps": moved
-            <= most + 1e-5 * float(start.abs().max()),
-            "a repeated run is not bit-identical": torch.equal(colors, jobs[1].stylized()),
-            f"the loss rose from {before:.6g} to {after:.6g}": not (situation.falls and judged)
-            or after <= max((1 + RISE) * before, NO_LOSS),
-        }.items()
-        if not holds
-    ]
+    broken = []
+    if not (torch.isfinite(colors).all() and math.isfinite(moved)):
+        broken.append("colors are not finite")
+    if not (math.isfinite(before) and math.isfinite(after)):
+        broken.append("the loss is not finite")
+    if not moved <= most + 1e-5 * float(start.abs().max()):
+        broken.append(f"colors moved by {moved:.3g} in {job.job.total_steps} steps")
+    if not torch.equal(colors, jobs[1].stylized()):
+        broken.append("a repeated run is not bit-identical")
+    if situation.falls and judged and not after <= max((1 + RISE) * before, NO_LOSS):
+        broken.append(f"the loss rose from {before:.6g} to {after:.6g}")
     error, bound, flips = reference_error(job)
     note = "; ".join(broken) or f"loss {before:.3g} to {after:.3g}; {flips} ReLU and pool decisions flipped"
     return CaseResult(math.inf if broken else error, bound, note)
