@@ -208,18 +208,16 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     round_length, weights = stylizer.job.round_length, stylizer.job.loss.weights
     after = round_evaluation(stylizer.history, round_length, weights) if stylizer.history else measure.evaluate()
     error = _write_reports(job, stopped, before, after, compressed) if first else None
-    over_time = loss_over_time(stylizer, before)
-    problem = str(error) if error else None
     return Result(
-        stopped,
-        stylizer.step,
-        stylizer.job.total_steps,
-        before,
-        after,
-        over_time,
-        problem,
-        compressed,
-        weights,
+        stopped=stopped,
+        step=stylizer.step,
+        total=stylizer.job.total_steps,
+        before=before,
+        after=after,
+        loss_over_time=loss_over_time(stylizer, before),
+        report_error=str(error) if error else None,
+        compressed=compressed,
+        weights=weights,
     )
 
 

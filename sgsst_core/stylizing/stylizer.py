@@ -190,16 +190,16 @@ class Stylizer:
         for name, seconds in self.job.timer.seconds.items():
             self.seconds_by_part[name] = self.seconds_by_part.get(name, 0.0) + seconds
         record = StepRecord(
-            self.step,
-            phase.stage,
-            views[0],
-            self.seconds,
-            mean_loss(terms, self.job.loss.weights),
-            terms,
-            dict(self.job.timer.seconds),
-            psutil.Process().memory_info().rss,
-            {kind: total - sent[kind] for kind, total in self.job.collectives.sent.items() if total > sent[kind]},
-            device_peak(self.job.network.device),
+            step=self.step,
+            stage=phase.stage,
+            view=views[0],
+            seconds=self.seconds,
+            loss=mean_loss(terms, self.job.loss.weights),
+            terms=terms,
+            parts=dict(self.job.timer.seconds),
+            memory=psutil.Process().memory_info().rss,
+            sent={kind: total - sent[kind] for kind, total in self.job.collectives.sent.items() if total > sent[kind]},
+            device_memory=device_peak(self.job.network.device),
         )
         self.history.append(record)
         return record
