@@ -1,4 +1,4 @@
-"""Memory budget of all connections of a process, for request bytes that are received but not processed yet."""
+"""Memory budget of all connections of a process: for bytes that are received but not processed, or read to be sent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error of an approximate gradient relative to the exact one."""
+"""Error of an approximate gradient relative to the exact one, and PSNR."""
 
 from __future__ import annotations
 
