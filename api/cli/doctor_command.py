@@ -15,7 +15,7 @@ WARNING = 3
 _MARKS = {"works": "ok", "warning": "WARNING", "problem": "PROBLEM"}
 
 
-def doctor(json_: JsonOption = False) -> None:
+def doctor(as_json: JsonOption = False) -> None:
     """Examine this machine within 30 seconds: GPU, driver, precision, memory, weights, caches, and correct results.
 
     Exit code: 0 if everything works, 3 if jobs run but slower than they could, 1 if they fail or are wrong.
@@ -25,9 +25,9 @@ def doctor(json_: JsonOption = False) -> None:
     findings = []
     for finding in examine():
         findings.append(finding)
-        if not json_:
+        if not as_json:
             out_console.print(f"{_MARKS[finding.state]:<9}{finding.topic:<12}{finding.text}")
-    if json_:
+    if as_json:
         out_console.print(json.dumps([asdict(finding) for finding in findings], indent=2))
     states = {finding.state for finding in findings}
     if "problem" in states:

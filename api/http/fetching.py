@@ -30,7 +30,7 @@ from service.settings import ServiceSettings
 _REDIRECTS = (301, 302, 303, 307, 308)
 _MAX_REDIRECTS = 5
 #: Maximum number of requests of one owner that fetch inputs at the same time.
-_OF_AN_OWNER = 4
+_REQUESTS_PER_OWNER = 4
 #: Maximum length of a reason, which may contain text from a server.
 _MAX_REASON = 200
 _INVALID_REDIRECT = "the server redirects to an invalid URL"
@@ -83,7 +83,7 @@ class Fetcher:
     ) -> None:
         self._settings, self._blobs, self._threads, self._given_tls = settings, blobs, threads, tls
         self._allowed = parse_origins(settings.url_hosts)
-        self._limit = OwnerLimit(_OF_AN_OWNER)
+        self._limit = OwnerLimit(_REQUESTS_PER_OWNER)
 
     def urls(self, references: Iterable[tuple[int, str, str]]) -> dict[str, str]:
         """Return the URLs among the references of a request, with their roles, after checking that they are allowed.

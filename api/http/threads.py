@@ -8,7 +8,7 @@ from typing import ParamSpec, TypeVar
 from weakref import WeakValueDictionary
 
 #: Maximum number of threads per owner. Threads mostly wait for the disk.
-_OF_AN_OWNER = 2
+_THREADS_PER_OWNER = 2
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -33,7 +33,7 @@ class OwnerThreads:
     """Access to the threads of the event loop's executor, which limits how many each owner occupies at once."""
 
     def __init__(self) -> None:
-        self._limit = OwnerLimit(_OF_AN_OWNER)
+        self._limit = OwnerLimit(_THREADS_PER_OWNER)
 
     async def run(
         self, owner: str, function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
