@@ -1475,18 +1475,20 @@ def test_unread_responses_take_little_memory_and_end(service: Service, done: str
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             connection.sendall(lines(f"GET /v1/jobs/{done}/artifacts/colors.f16 HTTP/1.1"))
         process = api_of(service)
-        wait_for(lambda: len(process.net_connections("tcp")) > 60, "the connections to be accepted")
+        for connection in unread:
+            with contextlib.suppress(ConnectionResetError):  # the first ones may be closed already
+                connection.recv(1)
         wait_for(lambda: len(process.net_connections("tcp")) < 10, "unread connections to be closed")
         assert len(closed(unread[0])) < LARGE
 
 
 def test_quoted_cookies_take_linear_time(service: Service) -> None:
-    """Python's parser of quoted cookies takes quadratic time: ten seconds for 60 kB."""
+    """Python's parser of quoted cookies takes quadratic time: about half a minute for 110 kB."""
     with connect(service) as connection:
-        connection.settimeout(5)
         for name in ("other", SESSION_COOKIE):
             connection.sendall(b'GET /v1/session HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: %s="' % name.encode())
-            connection.sendall(b'\\"' * 30_000 + b'"\r\n\r\n')
+            connection.sendall(b'\\"' * 55_000 + b'"\r\n\r\n')
+            assert select.select([connection], [], [], 15)[0]
             assert answer_on(connection)[0].startswith(b"HTTP/1.1 200 ")
 
 
