@@ -23,9 +23,9 @@ class RequestMemory:
         self.connections = 0
         self._json_bytes = 0
 
-    def share(self) -> int:
-        """Return the bytes that one connection may hold: 128 kB, less if there are many connections, at least 8 kB."""
-        return max(_LEAST, min(_MOST, _TOTAL // max(1, self.connections)))
+    def share(self, most: int = _MOST) -> int:
+        """Return the bytes that one connection may hold: `most`, less if there are many connections, at least 8 kB."""
+        return max(_LEAST, min(most, _TOTAL // max(1, self.connections)))
 
     def take(self, size: int, held: int) -> None:
         """Count bytes of a JSON body.
