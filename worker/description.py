@@ -50,12 +50,11 @@ def describe(job: Job) -> Prepared:
 
 
 def describe_scene(file: SceneFile) -> str:
-    """Return a text about the Gaussians of a file, and what of it was not read, or not as stored."""
+    """Return a text about the Gaussians of a file; `about_notes` has what was not read, or not as stored."""
     notes = f", {file.dropped:,} invalid ones dropped" if file.dropped else ""
     if file.clamped:
         notes += f", {file.clamped:,} infinite opacities read as almost 0 or 1"
-    more = "".join(f"; {note}" for note in file.notes)
-    return f"{len(file.scene):,} Gaussians{notes}, SH degree {file.scene.sh_degree}{more}"
+    return f"{len(file.scene):,} Gaussians{notes}, SH degree {file.scene.sh_degree}"
 
 
 def _describe_views(job: Job) -> str:

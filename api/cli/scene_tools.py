@@ -232,7 +232,7 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
     loaded = load_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = loaded.scene_file() if isinstance(loaded, TrainerCheckpoint) else loaded
     file = file.rendered(source.render_mode, source.eps2d)
-    scene, decisions = file.scene, [*decisions, *about_rendering(file)]
+    scene, decisions = file.scene, [*about_notes(file), *decisions, *about_rendering(file)]
     cameras: list[Camera] = []
     if source.cameras or source.orbit:
         capture = read_capture(source, scene).checked(scene, source.near)
