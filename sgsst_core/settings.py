@@ -316,7 +316,7 @@ class Settings(BaseModel):
         return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** fraction)
 
 
-#: `paper` is the published schedule. The other presets reach the same loss sooner, with larger, decaying steps. Such
+#: `paper` is the published schedule. The other presets reach a given loss sooner, with larger, decaying steps. Such
 #: steps push many colors below 0, so these presets need `clamp_aware_gradient`. They start from the style's colors,
 #: which optimization alone reaches only slowly (docs/quality.md). Phase 1 pays off for large views.
 _PRESETS: dict[PresetName, dict[str, Any]] = {
