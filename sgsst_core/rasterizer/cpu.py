@@ -15,57 +15,37 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.compiled import kernel_threads
-from sgsst_core.constants import ALPHA_MAX
 from sgsst_core.rasterizer import kernels
-from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost
+from sgsst_core.rasterizer.base import CountedWeights, RenderCost
 from sgsst_core.rasterizer.projection import Shapes
 from sgsst_core.rasterizer.tile_intersections import (
     TileIntersections,
     build_tile_intersections,
     intersections_of_subset,
 )
+from sgsst_core.rasterizer.tiled import TiledRasterizer
 from sgsst_core.rasterizer.view_cache import ViewCache
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-#: Tile intersections take some 15 to 20 bytes per pair of Gaussian and tile: a few megabytes per view at 1280x720.
-DEFAULT_INTERSECTION_BYTES = 1 << 30
 
-
-class CpuRasterizer(Rasterizer):
+class CpuRasterizer(TiledRasterizer[TileIntersections]):
     """Rasterizer in compiled float32 code.
 
-    The order of summation is fixed, so results are bit-identical for any number of threads. Tile intersections are
-    cached within a budget (`ViewCache`).
+    The order of summation is fixed, so results are bit-identical for any number of threads.
 
     Args:
-        scene, background, near, device: As in `Rasterizer`.
-        alpha_max: Upper limit of alpha.
-        max_intersection_bytes: Memory budget for tile intersections in bytes.
+        scene, options: As in `TiledRasterizer`.
     """
 
     name = "cpu"
     title = "compiled code"
-    can_cache = True
     caches_exactly = True
+    default_intersection_bytes = 1 << 30  # 15 to 20 bytes per pair of Gaussian and tile
 
-    def __init__(
-        self,
-        scene: Scene,
-        *,
-        alpha_max: float = ALPHA_MAX,
-        max_intersection_bytes: int = DEFAULT_INTERSECTION_BYTES,
-        **common: Any,
-    ) -> None:
-        super().__init__(scene, alpha_max=alpha_max, max_intersection_bytes=max_intersection_bytes, **common)
-        self.alpha_max = alpha_max
+    def __init__(self, scene: Scene, **options: Any) -> None:
+        super().__init__(scene, **options)
         self._shapes: Shapes | None = None
-        self._intersections: ViewCache[TileIntersections] = ViewCache(self._build, max_intersection_bytes)
-
-    @classmethod
-    def options(cls, memory: int) -> dict[str, Any]:
-        """Return constructor options for a memory budget in bytes, which cached weights share."""
-        return {"max_intersection_bytes": memory}
 
     def for_subset(self, scene: Scene, rows: Tensor, memory: int) -> CpuRasterizer:
         """Return a rasterizer of a subset of the Gaussians, see `Rasterizer.for_subset`.
@@ -86,37 +66,10 @@ class CpuRasterizer(Rasterizer):
         self._shapes = None
         return subset
 
-    def beside(self, scene: Scene) -> CpuRasterizer:
-        """Return a rasterizer of another scene that shares the budget for tile intersections, with lower priority."""
-        other = self.for_scene(scene)
-        other._intersections = ViewCache(other._build, 0, host=self._intersections)
-        return other
-
     def _build(self, camera: Camera) -> TileIntersections:
         if self._shapes is None:
             self._shapes = Shapes.of(self.scene)
         return build_tile_intersections(self.scene, camera, near=self.near, shapes=self._shapes)
-
-    def intersections(self, camera: Camera) -> TileIntersections:
-        """Return the tile intersections of a view, cached or newly built.
-
-        Raises:
-            TooManyIntersectionsError: See `build_tile_intersections`.
-        """
-        return self._intersections.of(camera)
-
-    def has_intersections(self, camera: Camera) -> bool:
-        """Return whether the view's tile intersections are cached, so it needs no projection and no sorting."""
-        return self._intersections.holds(camera)
-
-    def release_view(self, camera: Camera, budget: int) -> None:
-        """Drop the view's tile intersections, and set the budget for those of all other views to `budget` bytes."""
-        self._intersections.take(camera)
-        self._intersections.limit(budget)
-
-    def forget_views(self) -> None:
-        """Drop the tile intersections of all views."""
-        self._intersections.clear()
 
     def count_weights(self, camera: Camera) -> CountedWeights:
         """Count a view's weights without storing them; takes about as long as one render."""

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import (
-    ALPHA_MAX,
     ALPHA_MIN,
     LOG2_ALPHA_MIN,
     TO_POWER_OF_TWO,
@@ -26,15 +25,11 @@ from sgsst_core.constants import (
 )
 from sgsst_core.devices import on_device
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.base import CountedWeights, Rasterizer, RenderCost
+from sgsst_core.rasterizer.base import CountedWeights, RenderCost
 from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
-from sgsst_core.rasterizer.view_cache import ViewCache
+from sgsst_core.rasterizer.tiled import TiledRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-
-#: Default budget for tile intersections in bytes. They take about 80 bytes per visible Gaussian and 8 bytes per pair of
-#: Gaussian and tile.
-DEFAULT_INTERSECTION_BYTES = 4 << 30
 
 
 @dataclass(frozen=True)
@@ -66,18 +61,15 @@ class DeviceIntersections:
         )
 
 
-class TritonRasterizer(Rasterizer):
+class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
     """Rasterizer in float32 Triton kernels.
 
     Color gradients are reproducible bit for bit on one machine: every pair of Gaussian and tile has a separate slot,
-    and slots are added in a fixed order. Tile intersections are cached within a budget (`ViewCache`).
+    and slots are added in a fixed order.
 
     Args:
-        scene, background, near: As in `Rasterizer`.
-        device: GPU, or the CPU if Triton's interpreter is enabled (TRITON_INTERPRET=1). None for the current GPU; if
-            there is no GPU and the interpreter is enabled, the CPU.
-        alpha_max: Upper limit of alpha.
-        max_intersection_bytes: Memory budget for tile intersections in bytes.
+        scene, options: As in `TiledRasterizer`. `device` is a GPU, or the CPU if Triton's interpreter is enabled
+            (TRITON_INTERPRET=1); None for the current GPU, or without a GPU for the interpreter.
 
     Raises:
         SettingsError: If Triton is missing or cannot run on the device.
@@ -86,31 +78,14 @@ class TritonRasterizer(Rasterizer):
     name = "triton"
     title = "Triton"
     on_gpu = True
-    can_cache = True
+    default_intersection_bytes = 4 << 30  # 80 bytes per visible Gaussian, and 8 per pair of Gaussian and tile
 
-    def __init__(
-        self,
-        scene: Scene,
-        *,
-        alpha_max: float = ALPHA_MAX,
-        max_intersection_bytes: int = DEFAULT_INTERSECTION_BYTES,
-        **common: Any,
-    ) -> None:
-        super().__init__(scene, alpha_max=alpha_max, max_intersection_bytes=max_intersection_bytes, **common)
-        self.alpha_max = alpha_max
+    def __init__(self, scene: Scene, **options: Any) -> None:
+        super().__init__(scene, **options)
         self._geometry = [
             tensor.to(self.device).float().contiguous()
             for tensor in (scene.means, scene.quats, scene.scales, scene.opacities)
         ]
-        self._intersections: ViewCache[DeviceIntersections] = ViewCache(self._build, max_intersection_bytes)
-
-    @classmethod
-    def options(cls, memory: int) -> dict[str, Any]:
-        """Return constructor options for a memory budget in bytes.
-
-        Tile intersections share the budget with cached weights.
-        """
-        return {"max_intersection_bytes": memory}
 
     @classmethod
     def usable_device(cls, device: torch.device | str | None) -> torch.device:
@@ -141,34 +116,11 @@ class TritonRasterizer(Rasterizer):
             )
         return chosen
 
-    def beside(self, scene: Scene) -> TritonRasterizer:
-        """Return a rasterizer of another scene that shares the budget for tile intersections, with lower priority."""
-        other = self.for_scene(scene)
-        other._intersections = ViewCache(other._build, 0, host=self._intersections)
-        return other
-
-    def intersections(self, camera: Camera) -> DeviceIntersections:
-        """Return the tile intersections of a view, cached or newly built.
-
-        Raises:
-            TooManyIntersectionsError: If there are more pairs of Gaussian and tile than 32-bit positions can address.
-        """
-        return self._intersections.of(camera)
-
-    def release_view(self, camera: Camera, budget: int) -> None:
-        """Drop the view's tile intersections, and set the budget for those of all other views to `budget` bytes."""
-        self._intersections.take(camera)
-        self._intersections.limit(budget)
-
     def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
         """Measure the cost of rendering some views with gradient, and the size of their tile intersections."""
         cost, built = super().probe_cost(cameras), [self.intersections(camera) for camera in cameras]
         pairs = max(len(isects.ranks) for isects in built)
         return replace(cost, preparation_bytes=sum(isects.nbytes for isects in built) // len(built), most_pairs=pairs)
-
-    def forget_views(self) -> None:
-        """Drop the tile intersections of all views."""
-        self._intersections.clear()
 
     def count_weights(self, camera: Camera) -> CountedWeights:
         """Count a view's weights without storing them; takes about as long as one render."""
