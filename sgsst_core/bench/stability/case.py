@@ -280,9 +280,7 @@ def compare_losses(
     content: Tensor,
     *,
     content_weight: float = 1.0,
-    coverage: Tensor | None = None,
     untiled: bool = True,
-    bound: float = LOSS_BOUND,
 ) -> CaseResult:
     """Return the relative error of float32 loss and pixel gradient against float64, with equal ReLU and pool decisions.
 
@@ -291,28 +289,26 @@ def compare_losses(
         style: Style image [H', W', 3], downscaled to the view as usual.
         content: Content image [H, W, 3].
         content_weight: Weight of the content term.
-        coverage: Position weights [H, W]; None for equal weights.
         untiled: Whether to compare the loss with the untiled autograd reference instead of the float64 `SosLoss`;
             requires at least 16 x 16 pixels.
-        bound: Maximum allowed error.
     """
     style = resize_area(style, style_size((style.shape[0], style.shape[1]), (image.shape[0], image.shape[1])))
     single = FeatureNetwork(vgg16())
     double = DecisionsOf(vgg16(), single)
 
     def evaluated(network: FeatureNetwork) -> SosResult:
-        return evaluate(SosLoss(network, content_weight=content_weight), image, Style.of(style), content, coverage)
+        return evaluate(SosLoss(network, content_weight=content_weight), image, Style.of(style), content)
 
     actual, expected = double.beside(evaluated)
     loss = expected.loss
     if untiled:
-        loss, _ = sos_reference(vgg16(), image, style, content, content_weight=content_weight, coverage=coverage)
+        loss, _ = sos_reference(vgg16(), image, style, content, content_weight=content_weight)
     # The floor of 1 is far below any visible loss. It only prevents a division by zero for a perfect match.
     error = max(abs(actual.loss - loss) / max(abs(loss), 1.0), gradient_error(actual, expected))
-    return CaseResult(error, bound, f"loss {actual.loss:.3g}, {double.flips} ReLU and pool decisions flipped")
+    return CaseResult(error, LOSS_BOUND, f"loss {actual.loss:.3g}, {double.flips} ReLU and pool decisions flipped")
 
 
-def evaluate(loss: SosLoss, image: Tensor, style: Style, content: Tensor, coverage: Tensor | None) -> SosResult:
+def evaluate(loss: SosLoss, image: Tensor, style: Style, content: Tensor, coverage: Tensor | None = None) -> SosResult:
     """Return loss and gradient of an image [H, W, 3], in the precision of the loss's network."""
     dtype = loss.network.dtype
     targets = loss.targets.of_style(style.map(lambda own: own.to(dtype)), (image.shape[0], image.shape[1]))
