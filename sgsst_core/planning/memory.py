@@ -33,8 +33,8 @@ _SLOTS_FRACTION = 0.25
 #: Bytes per pair of Gaussian and raster tile on a GPU: while the pairs of a view are sorted (keys, values and the
 #: sort's own buffers), and for its slot in the color gradient.
 SORTING_BYTES, _SLOT_BYTES = 36, 12
-#: Estimated workspace of cuDNN, and buffers of NCCL, in bytes. Steps in bfloat16 and TF32 took 0.77 to 1.07 times
-#: the planned memory of an H100; in float32 at 980x545, cuDNN took 4 GB more, which were free. NCCL was not measured.
+#: Estimated workspace of cuDNN, and buffers of NCCL, in bytes. Steps in bfloat16 and TF32 took 0.73 to 1.07 times
+#: the planned memory of an H200; in float32 at 980x545, cuDNN took 4 GB more, which were free. NCCL was not measured.
 CUDNN_BYTES, NCCL_BYTES = 512 << 20, 512 << 20
 #: Bytes per pixel of a novel view: its coverage, and its two warps.
 _COVERAGE_BYTES, _WARP_BYTES = 4, 2 * 40
