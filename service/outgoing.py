@@ -15,6 +15,7 @@ import threading
 from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import Future
 from contextlib import asynccontextmanager
+from functools import cache
 
 import httpx
 
@@ -126,12 +127,18 @@ def parse_origins(text: str) -> frozenset[tuple[str, str, int]]:
     return frozenset(origins)
 
 
+@cache
+def public_authorities() -> ssl.SSLContext:
+    """Return the settings that verify servers by the public certificate authorities, which are read from a file."""
+    return httpx.create_ssl_context(trust_env=False)
+
+
 @asynccontextmanager
 async def send(
     method: str,
     url: httpx.URL,
     headers: Mapping[str, str],
-    tls: ssl.SSLContext,
+    tls: ssl.SSLContext | None,
     *,
     private_allowed: bool,
     content: bytes | None = None,
@@ -142,6 +149,7 @@ async def send(
 
     Args:
         url: Address from `parse_url`.
+        tls: SSL context for verifying the server; None for the public certificate authorities.
         private_allowed: Whether the host may have addresses that are not public.
 
     Raises:
@@ -151,9 +159,10 @@ async def send(
     """
     _, host, port = origin(url)
     address = await checked_address(host, port, private_allowed=private_allowed)
+    verify = await asyncio.to_thread(public_authorities) if tls is None else tls
     async with (
         # one client per request: a pooled connection to an address would be reused for other names
-        httpx.AsyncClient(verify=tls, timeout=None, follow_redirects=False, trust_env=False) as client,
+        httpx.AsyncClient(verify=verify, timeout=None, follow_redirects=False, trust_env=False) as client,
         client.stream(
             method,
             url.copy_with(host=address, port=port),

@@ -12,7 +12,6 @@ import ssl
 from collections.abc import AsyncIterator, Iterable, Iterator
 from contextlib import AsyncExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import PurePosixPath
 
 import httpx
@@ -81,7 +80,7 @@ class Fetcher:
     def __init__(
         self, settings: ServiceSettings, blobs: Blobs, threads: OwnerThreads, tls: ssl.SSLContext | None = None
     ) -> None:
-        self._settings, self._blobs, self._threads, self._given_tls = settings, blobs, threads, tls
+        self._settings, self._blobs, self._threads, self._tls = settings, blobs, threads, tls
         self._allowed = parse_origins(settings.url_hosts)
         self._limit = OwnerLimit(_REQUESTS_PER_OWNER)
 
@@ -154,9 +153,8 @@ class Fetcher:
     async def _open(self, source: _Input, state: _Fetch, stack: AsyncExitStack) -> AsyncIterator[bytes]:
         """Follow redirects to the file, and return its chunks. The stack closes the connection."""
         url = self._parse(source.url, source)
-        tls = await asyncio.to_thread(lambda: self._tls)
         for _ in range(1 + _MAX_REDIRECTS):
-            answer = send("GET", url, _HEADERS, tls, private_allowed=self._settings.url_private_addresses)
+            answer = send("GET", url, _HEADERS, self._tls, private_allowed=self._settings.url_private_addresses)
             with self._failures(source):
                 async with asyncio.timeout_at(state.deadline):
                     response = await stack.enter_async_context(answer)
@@ -211,10 +209,6 @@ class Fetcher:
         except (httpx.HTTPError, OSError) as error:
             reason = (str(error) or type(error).__name__)[:_MAX_REASON].rstrip(".")
             raise FetchError(source.url, reason, source.role) from error
-
-    @cached_property
-    def _tls(self) -> ssl.SSLContext:
-        return self._given_tls or httpx.create_ssl_context(trust_env=False)
 
 
 def _write(chunk: bytes, file: Receiver, receipt: Receipt) -> None:

@@ -21,25 +21,25 @@ class Rates:
         self._clock = clock
         self._left: dict[str, tuple[float, float]] = {}
 
-    def take(self, owner: str, a_second: float | None) -> None:
+    def take(self, owner: str, rate: float | None) -> None:
         """Take one token from the owner's bucket.
 
         Args:
             owner: Owner of the request's key.
-            a_second: Requests per second that the owner may send on average; None for no limit.
+            rate: Requests per second that the owner may send on average; None for no limit.
 
         Raises:
             RateLimitError: If the owner's bucket is empty.
         """
-        if a_second is None:
+        if rate is None:
             return
-        most = max(1.0, a_second * _BURST_SECONDS)
+        most = max(1.0, rate * _BURST_SECONDS)
         now = self._clock()
         left, seen = self._left.pop(owner, (most, now))
-        left = min(most, left + (now - seen) * a_second)
+        left = min(most, left + (now - seen) * rate)
         allowed = left >= 1
         self._left[owner] = (left - 1 if allowed else left), now
         if len(self._left) > _REMEMBERED:
             del self._left[next(iter(self._left))]  # the owner with the oldest last request
         if not allowed:
-            raise RateLimitError(a_second, math.ceil((1 - left) / a_second))
+            raise RateLimitError(rate, math.ceil((1 - left) / rate))

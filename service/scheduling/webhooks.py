@@ -17,8 +17,6 @@ import threading
 import time
 from functools import cached_property
 
-import httpx
-
 from service.errors import InvalidWebhookError, WebhooksOffError
 from service.outgoing import parse_url, send
 from service.settings import ServiceSettings
@@ -71,7 +69,7 @@ class Deliverer:
 
     def __init__(self, settings: ServiceSettings, store: Store, tls: ssl.SSLContext | None = None) -> None:
         self._settings, self._store = settings, store
-        self._given_tls = tls
+        self._tls = tls
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="webhooks", daemon=True)
 
@@ -145,10 +143,6 @@ class Deliverer:
         private_allowed = self._settings.webhook_private_addresses
         async with send("POST", url, headers, self._tls, private_allowed=private_allowed, content=body) as answer:
             return None if answer.is_success else f"answered {answer.status_code}"
-
-    @cached_property
-    def _tls(self) -> ssl.SSLContext:
-        return self._given_tls or httpx.create_ssl_context(trust_env=False)
 
     @cached_property
     def _secret(self) -> str:
