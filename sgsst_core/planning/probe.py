@@ -51,7 +51,8 @@ from sgsst_core.style import Style
 from sgsst_core.timing import Timer, wait_for
 
 #: Maximum side of the image for timing the network: large enough for the rate of a partition tile. A GPU needs more
-#: work before launch times become negligible (on an H100 in bfloat16, 1024 pixels overestimated a step 2.4 times).
+#: work before launch times become negligible: in bfloat16, a step was overestimated 2.4 times with 1024 pixels on an
+#: H100, and 1.4 times with 2048 pixels on an H200.
 PROBE_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 2048}
 #: Minimum visits per view size for which a CUDA graph of the loss is considered at all.
 LEAST_GRAPH_VISITS = 20
