@@ -138,10 +138,10 @@ async def send(
     method: str,
     url: httpx.URL,
     headers: Mapping[str, str],
-    tls: ssl.SSLContext | None,
     *,
     private_allowed: bool,
     content: bytes | None = None,
+    tls: ssl.SSLContext | None = None,
 ) -> AsyncIterator[httpx.Response]:
     """Send a request to a checked address, and provide the response, whose body has not been read.
 
@@ -149,8 +149,8 @@ async def send(
 
     Args:
         url: Address from `parse_url`.
-        tls: SSL context for verifying the server; None for the public certificate authorities.
         private_allowed: Whether the host may have addresses that are not public.
+        tls: SSL context for verifying the server; None for the public certificate authorities.
 
     Raises:
         PermissionError: If an address of the host is not allowed.

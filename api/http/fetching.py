@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import ssl
 from collections.abc import AsyncIterator, Iterable, Iterator
 from contextlib import AsyncExitStack, contextmanager
 from dataclasses import dataclass
@@ -71,16 +70,10 @@ class _Input:
 
 
 class Fetcher:
-    """Fetcher of inputs by URL.
+    """Fetcher of inputs by URL."""
 
-    Args:
-        tls: SSL context for verifying servers; None for the public certificate authorities.
-    """
-
-    def __init__(
-        self, settings: ServiceSettings, blobs: Blobs, threads: OwnerThreads, tls: ssl.SSLContext | None = None
-    ) -> None:
-        self._settings, self._blobs, self._threads, self._tls = settings, blobs, threads, tls
+    def __init__(self, settings: ServiceSettings, blobs: Blobs, threads: OwnerThreads) -> None:
+        self._settings, self._blobs, self._threads = settings, blobs, threads
         self._allowed = parse_origins(settings.url_hosts)
         self._limit = OwnerLimit(_REQUESTS_PER_OWNER)
 
@@ -154,7 +147,7 @@ class Fetcher:
         """Follow redirects to the file, and return its chunks. The stack closes the connection."""
         url = self._parse(source.url, source)
         for _ in range(1 + _MAX_REDIRECTS):
-            answer = send("GET", url, _HEADERS, self._tls, private_allowed=self._settings.url_private_addresses)
+            answer = send("GET", url, _HEADERS, private_allowed=self._settings.url_private_addresses)
             with self._failures(source):
                 async with asyncio.timeout_at(state.deadline):
                     response = await stack.enter_async_context(answer)

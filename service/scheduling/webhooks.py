@@ -141,7 +141,7 @@ class Deliverer:
             "webhook-signature": signature(await asyncio.to_thread(lambda: self._secret), delivery.id, timestamp, body),
         }
         private_allowed = self._settings.webhook_private_addresses
-        async with send("POST", url, headers, self._tls, private_allowed=private_allowed, content=body) as answer:
+        async with send("POST", url, headers, private_allowed=private_allowed, content=body, tls=self._tls) as answer:
             return None if answer.is_success else f"answered {answer.status_code}"
 
     @cached_property

@@ -7,7 +7,6 @@ import hashlib
 import ipaddress
 import json
 import socket
-import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -45,8 +44,6 @@ PATIENCE = 60.0
 ENDLESS = 64 << 20
 FILE = b"a file\n" * 1000
 PUBLIC = "8.8.8.8"
-#: Created once, because reading all certificates takes time.
-TLS = ssl.create_default_context()
 METADATA = "169.254.169.254"
 
 Answer = Callable[[BaseHTTPRequestHandler], object]
@@ -173,7 +170,7 @@ def fetch(stored: Stored, *urls: str, requests: int = 1, bytes_quota: int | None
             return [digests[url] for url in urls]
 
     async def all_requests() -> list[list[str]]:
-        fetcher = Fetcher(settings, stored.blobs, OwnerThreads(), TLS)
+        fetcher = Fetcher(settings, stored.blobs, OwnerThreads())
         return await asyncio.gather(*(request(fetcher) for _ in range(requests)))
 
     try:

@@ -438,6 +438,15 @@ def test_certificate_is_verified_for_the_host_name(
     assert _tries(store) == [1] * (not delivered)
 
 
+def test_certificate_of_an_unknown_authority_is_refused(tmp_path: Path, store: Store, start: Start) -> None:
+    receiver = start(certificate=_certificate(tmp_path, "localhost"))
+    _end_job(store, f"https://localhost:{receiver.port}/hook")
+    _deliver(store, tmp_path)
+    assert receiver.names == ["localhost"]
+    assert not receiver.received
+    assert _tries(store) == [1]
+
+
 def _certificate(folder: Path, name: str) -> Path:
     """Write a self-signed certificate for a host name, with its key."""
     key = ec.generate_private_key(ec.SECP256R1())
