@@ -47,9 +47,9 @@ LIST_LAUNCHES = 40
 #: Instructions per pixel for a pair of Gaussian and raster tile in render and gradient (compute capability 9.0), as
 #: counted by `triton_targets`, and float64 instructions for each pair.
 PIXEL_INSTRUCTIONS, PAIR_INSTRUCTIONS = (20.5, 22.2), 20
-#: Fraction of the scene's Gaussians that are visible in a view. `Job.pairs_each` in `JOBS` was counted on the biker
-#: scene (152,605 Gaussians) at widths of 980 and 5187 pixels. Most of its Gaussians are a few pixels wide, as in large
-#: scenes. The Gaussians of the plush toy are larger and have 12.8 and 236 pairs each.
+#: Fraction of the scene's Gaussians that are visible in a view. `Job.pairs_each` in `JOBS` assumes Gaussians of a few
+#: pixels, as in large scenes. At widths of 980 and 5187 pixels, those of a comb (129,929 Gaussians, `orbit` of eight
+#: views) have 3.3 and 22 pairs each in the first view, and the larger ones of the plush toy 12.8 and 236.
 VISIBLE_SHARE = 0.5
 #: Bytes of tile intersections per visible Gaussian, and per pair.
 LIST_BYTES = (80, 8)

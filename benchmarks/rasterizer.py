@@ -101,7 +101,7 @@ def scenes(arguments: argparse.Namespace) -> dict[str, tuple[Scene, Camera]]:
         cameras = read_cameras(arguments.cameras) if arguments.cameras else orbit(scene, 8)
         return {arguments.scene.stem: (scene, with_size(cameras[0], WIDTH, HEIGHT))}
     by_name: dict[str, tuple[Scene, Camera]] = {}
-    for name in ("snowmiku_plush", "biker"):
+    for name in ("snowmiku_plush", "playbot_synthetic_sh2"):
         if (DATA / name / "point_cloud.ply").is_file():
             scene = read_scene(DATA / name / "point_cloud.ply").scene
             file = DATA / name / "cameras.json"

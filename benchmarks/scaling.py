@@ -32,8 +32,8 @@ LINKS = {
     "PCIe 4.0 x16": Link(0.8 * 32e9, 10e-6),
     "25 Gb/s Ethernet": Link(0.8 * 25e9 / 8, 30e-6),
 }
-#: Fraction of the optimized Gaussians that a view shows: 65 % for the plush toy scene with its real cameras, 68 % for
-#: the biker scene in an orbit. Views of walk-through scenes show fewer.
+#: Fraction of the optimized Gaussians that a view shows: 65 % for the plush toy scene with its real cameras. Views of
+#: walk-through scenes show fewer.
 SHOWN_SHARE = 0.65
 #: Scales at which `LOSS_LAUNCHES` was counted, each with one partition tile.
 COUNTED_SCALES = 3

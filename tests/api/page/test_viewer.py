@@ -26,6 +26,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.page.browser import Watched, decoded, psnr, rendered, serve_files, view_script
+from tests.real_scenes import scene_path
 from tests.sgsst_core.files.test_filtered_and_flat_scenes import with_filter, without_thickness
 from tests.small_scenes import cameras, wall, write_files
 
@@ -49,14 +50,14 @@ def shown(watched: Watched, folder: Path, name: str, size: tuple[int, int], step
 
 
 def real_scene(shared_data: Path, name: str) -> tuple[Scene, list[Camera]]:
-    scene = read_scene(shared_data / "scenes" / name / "point_cloud.ply").scene
+    scene = read_scene(scene_path(shared_data, name)).scene
     file = shared_data / "scenes" / name / "cameras.json"
     if file.exists():
         return scene, [resized(camera, 240) for camera in read_cameras(file)[::33]]
     return scene, orbit(scene, 3, width=240, height=180)
 
 
-@pytest.mark.parametrize(("name", "degree"), [("biker", 0), ("playbot_synthetic_sh2", 2), ("snowmiku_plush", 3)])
+@pytest.mark.parametrize(("name", "degree"), [("broche", 0), ("playbot_synthetic_sh2", 2), ("snowmiku_plush", 3)])
 def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path: Path, name: str, degree: int) -> None:
     scene, views = real_scene(shared_data, name)
     assert scene.sh_degree == degree
@@ -75,7 +76,7 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
         ("spz", "snowmiku_plush"),
         ("v4.spz", "snowmiku_plush"),
         ("glb", "snowmiku_plush"),
-        ("splat", "biker"),
+        ("splat", "broche"),
     ],
 )
 def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path, form: str, name: str) -> None:

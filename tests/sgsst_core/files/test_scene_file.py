@@ -503,7 +503,7 @@ def test_written_scene_round_trips(tmp_path: Path, degree: int) -> None:
         assert torch.equal(getattr(back, name), getattr(scene, name))
 
 
-@pytest.mark.parametrize("name", ["biker", "snowmiku_plush", "playbot_synthetic_sh2"])
+@pytest.mark.parametrize("name", ["snowmiku_plush", "playbot_synthetic_sh2"])
 def test_stylized_real_scenes_differ_only_in_colors(shared_data: Path, tmp_path: Path, name: str) -> None:
     path = shared_data / "scenes" / name / "point_cloud.ply"
     source = read_scene(path)

@@ -152,9 +152,11 @@ def test_automatic_orbits_are_deterministic() -> None:
         assert (one.width, one.height, one.fx) == (other.width, other.height, other.fx)
 
 
-@pytest.mark.parametrize(("name", "reason"), [("biker", "foot"), ("playbot_synthetic_sh2", "flat layer")])
+@pytest.mark.parametrize(
+    ("name", "reason"), [("statues/narcissus.sog", "foot"), ("playbot_synthetic_sh2/point_cloud.ply", "flat layer")]
+)
 def test_real_object_scans_stand_upright(shared_data: Path, name: str, reason: str) -> None:
-    scene = read_scene(shared_data / "scenes" / name / "point_cloud.ply").scene
+    scene = read_scene(shared_data / "scenes" / name).scene
     orbit = make_orbit(scene, OrbitRequest(count=12))
     assert orbit.up.name == "-y"
     assert orbit.up.sure

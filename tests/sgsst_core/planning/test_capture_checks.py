@@ -23,6 +23,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from tests.real_scenes import scene_path
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import ball, blind_camera, cameras, wall
 
@@ -87,14 +88,12 @@ def test_real_cameras_are_reported_only_in_other_frames(shared_data: Path) -> No
 @pytest.mark.parametrize(
     ("name", "away"),
     [
-        ("biker", ["x90", "x180", "z90", "z180"]),
         ("broche", ["x90", "x180", "z90", "z180"]),
         ("playbot_synthetic_sh2", []),  # around the origin, every rotation shows it
     ],
 )
 def test_orbits_of_scans_give_no_warning(shared_data: Path, name: str, away: list[str]) -> None:
-    (path,) = (shared_data / "scenes" / name).iterdir()
-    scene = read_scene(path, drop_invalid=True).scene
+    scene = read_scene(scene_path(shared_data, name), drop_invalid=True).scene
     views = make_orbit(scene, OrbitRequest(24, None, None, None, NEAR)).cameras
     for count in (1, 3, 24):
         assert verdict(scene, spread(views, count)) == "fine"
@@ -160,11 +159,10 @@ def test_real_photos_are_reported_only_if_cropped(shared_data: Path, tmp_path: P
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["biker", "broche", "playbot_synthetic_sh2"])
+@pytest.mark.parametrize("name", ["broche", "playbot_synthetic_sh2"])
 def test_photos_of_scans_may_have_a_background(shared_data: Path, tmp_path: Path, name: str) -> None:
     """Photos are darker renders at 1024 pixels in front of an image, with noise."""
-    (path,) = (shared_data / "scenes" / name).iterdir()
-    scene = read_scene(path, drop_invalid=True).scene
+    scene = read_scene(scene_path(shared_data, name), drop_invalid=True).scene
     views = [resized(view, 1024) for view in make_orbit(scene, OrbitRequest(3, None, None, None, NEAR)).cameras]
     rasterizer = make_rasterizer("cpu", scene, near=NEAR)
     for view in views:

@@ -32,6 +32,7 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from tests.real_scenes import scene_path
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import (
     camera,
@@ -453,16 +454,16 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-REAL = [("snowmiku_plush", 160), ("biker", 120), ("playbot_synthetic_sh2", 120)]
+REAL = [("snowmiku_plush", 160), ("broche", 120), ("playbot_synthetic_sh2", 120)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "side"), REAL, ids=[name for name, _ in REAL])
 @pytest.mark.usefixtures("one_thread")
 def test_real_scenes_agree_with_the_reference(shared_data: Path, name: str, side: int) -> None:
-    folder = shared_data / "scenes" / name
-    scene = read_scene(folder / "point_cloud.ply").scene
-    file = folder / "cameras.json"
+    path = scene_path(shared_data, name)
+    scene = read_scene(path).scene
+    file = path.with_name("cameras.json")
     views = read_cameras(file) if file.is_file() else orbit(scene, 5)
     view = resized(views[2], side)
     background = BLACK if name == "snowmiku_plush" else (1.0, 1.0, 1.0)

@@ -8,6 +8,7 @@ from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.scene.camera import resized, spread
+from tests.real_scenes import scene_path
 
 SIDE = 200
 
@@ -15,15 +16,15 @@ SIDE = 200
 def cameras_of(folder, scene, count):
     if (folder / "cameras.json").exists():
         return [resized(camera, SIDE) for camera in spread(read_cameras(folder / "cameras.json"), count)]
-    return orbit(scene, count, width=150, height=SIDE)
+    return orbit(scene, count, width=SIDE, height=150)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["biker", "snowmiku_plush"])
+@pytest.mark.parametrize("name", ["broche", "snowmiku_plush"])
 def test_sos_loss_halves_at_every_scale_and_falls_on_novel_views(shared_data, vgg16_weights, name):
-    folder = shared_data / "scenes" / name
-    scene = read_scene(folder / "point_cloud.ply").scene
-    cameras = cameras_of(folder, scene, 12)
+    path = scene_path(shared_data, name)
+    scene = read_scene(path).scene
+    cameras = cameras_of(path.parent, scene, 12)
     style = load_image(shared_data / "styles" / "starry_night.jpg")
     # Starts from the scene's own colors, with the background that losses are measured on.
     settings = make_settings(
