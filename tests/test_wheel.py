@@ -39,8 +39,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp("source")
     for name in PACKAGES:
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, copy)
+    (copy / "docs").mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE", "docs/credits.md"):
+        shutil.copy(ROOT / name, copy / name)
     subprocess.run([sys.executable, "-m", "build", "--no-isolation", "--wheel", str(copy)], check=True)
     (built,) = (copy / "dist").glob("*.whl")
     return built
@@ -110,6 +111,13 @@ def test_wheel_contains_every_package_file(wheel: Path) -> None:
     paths = [path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()]
     assert packed == {path.relative_to(ROOT).as_posix() for path in paths if "__pycache__" not in path.parts}
     assert {f"{name}/py.typed" for name in PACKAGES} <= packed
+
+
+def test_wheel_contains_the_licenses_of_its_files(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        packed = {name.partition(".dist-info/licenses/")[2] for name in archive.namelist()}
+    vendored = {f"api/static/vendor/{name}" for name in ("fzstd/LICENSE", "swagger-ui/LICENSE", "swagger-ui/NOTICE")}
+    assert {"LICENSE", "docs/credits.md"} | vendored <= packed
 
 
 def test_packages_are_imported_from_the_wheel(installed: Path, tmp_path: Path) -> None:
