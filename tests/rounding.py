@@ -34,10 +34,10 @@ class RoundedToTf32(FeatureNetwork):
         super().__init__(*arguments, tf32=True)
         self._decisions = decisions
 
-    def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
-        activations = super().forward(rgb, cache=cache)
+    def forward(self, rgb: Tensor, *, cache: bool = True, until: str | None = None) -> Activations:
+        activations = super().forward(rgb, cache=cache, until=until)
         if self._decisions:
-            activations.outputs = self._decisions.forward(rgb, cache=cache).outputs
+            activations.outputs = self._decisions.forward(rgb, cache=cache, until=until).outputs
         return activations
 
     def _convolve(self, x: Tensor, step: vgg._Convolution) -> Tensor:

@@ -310,13 +310,14 @@ class FeatureNetwork:
         return self._channels[layer]
 
     @torch.no_grad()
-    def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
+    def forward(self, rgb: Tensor, *, cache: bool = True, until: str | None = None) -> Activations:
         """Compute the features of an image.
 
         Args:
             rgb: [h, w, 3], values 0..1 (not clamped), any float dtype.
             cache: Whether to store the activations that `backward` needs; if False, only the requested features are
                 returned.
+            until: Deepest layer to compute; deeper ones are left out. None for all requested layers.
 
         Returns:
             Activations. A layer whose stride exceeds the image has zero cells (a dimension of size 0).
@@ -329,15 +330,15 @@ class FeatureNetwork:
         # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
         x = self._input.normalized(pixels).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         with convolutions(self.device, tf32=self.tf32):
-            self._forward_steps(x, activations, cache)
+            self._forward_steps(x, activations, cache, until)
         for layer in self.layers:
-            if layer not in activations.features:
-                stride = layer_stride(layer)
+            stride = layer_stride(layer)
+            if layer not in activations.features and min(height, width) < stride:
                 activations.features[layer] = x.new_empty((height // stride, width // stride, self.channels(layer)))
         return activations
 
-    def _forward_steps(self, x: Tensor, activations: Activations, cache: bool) -> None:
-        """Run the steps on the pixels [1, 3, h, w], up to the last layer that has cells."""
+    def _forward_steps(self, x: Tensor, activations: Activations, cache: bool, until: str | None) -> None:
+        """Run the steps on the pixels [1, 3, h, w], up to the last layer that has cells, or `until`."""
         for step in self._steps:
             if isinstance(step, _Pool):
                 if min(x.shape[2:]) < 2:
@@ -351,6 +352,8 @@ class FeatureNetwork:
                 activations.outputs.append(x)
             if step.layer in self.layers:
                 activations.features[step.layer] = x[0].permute(1, 2, 0)
+            if step.layer == until:
+                break
 
     def _convolve(self, x: Tensor, step: _Convolution) -> Tensor:
         """Apply convolution, bias and ReLU to x [1, in, h, w]."""

@@ -23,7 +23,12 @@ def window_length(round_length: int) -> int:
 def smoothed(losses: Sequence[float], window: int) -> float:
     """Return the geometric mean of the last `window` losses, or of all losses if there are fewer."""
     last = losses[-window:]
-    return math.exp(sum(math.log(max(loss, 1e-300)) for loss in last) / len(last))
+    return math.exp(sum(map(log_loss, last)) / len(last))
+
+
+def log_loss(loss: float) -> float:
+    """Return the logarithm of a loss; that of the smallest normal numbers for 0."""
+    return math.log(max(loss, 1e-300))
 
 
 def ratio(after: float, before: float) -> float | None:

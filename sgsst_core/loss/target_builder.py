@@ -214,7 +214,7 @@ class TargetBuilder:
         result = {}
         for tile in tiles:
             cells = tile.owned_cells(CONTENT_LAYER, content.size)[1]
-            features = self._forward(content.pixels(tile.outer)).features[CONTENT_LAYER]
+            features = self._forward(content.pixels(tile.outer), CONTENT_LAYER).features[CONTENT_LAYER]
             result[tile] = features[cells.slices].clone()  # a slice would keep the features of the halo alive too
         return result
 
@@ -227,9 +227,9 @@ class TargetBuilder:
         value = torch.finfo(self._network.dtype).bits // 8 * self._network.channels(CONTENT_LAYER)
         return max(sum(piece.cells(CONTENT_LAYER) for piece in own) for own in pieces) * value
 
-    def _forward(self, pixels: Tensor) -> Activations:
+    def _forward(self, pixels: Tensor, until: str | None = None) -> Activations:
         with self._timer("vgg_forward"):
-            return self._network.forward(pixels, cache=False)
+            return self._network.forward(pixels, cache=False, until=until)
 
 
 def _size(image: Tensor) -> Size:

@@ -124,7 +124,7 @@ def survey_views(
     Raises:
         CameraError: If no camera sees a Gaussian.
     """
-    weights = torch.zeros(len(scene), dtype=torch.float64)
+    weights = torch.zeros(len(scene), dtype=torch.float64, device=rasterizer.device)
     views: dict[int, _ViewSurvey] = {}
     indices = range(collectives.rank, len(cameras), collectives.size)
     started = time.perf_counter()
@@ -139,7 +139,7 @@ def survey_views(
     covered = [index for index in range(len(cameras)) if views[index].covered]
     if not covered:
         raise nothing_seen(len(cameras))
-    weights = collectives.all_reduce(weights.to(rasterizer.device)).cpu()
+    weights = collectives.all_reduce(weights).cpu()
     uncovered_fraction = sum(views[index].uncovered for index in covered) / sum(
         views[index].pixels for index in covered
     )
@@ -157,7 +157,6 @@ def _survey_view(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _Vi
     uncovered = float((1 - coverage).sum(dtype=torch.float64))
     shown = 0
     if seen:
-        of_view = summed.cpu()
-        weights += of_view.double()
-        shown = int((of_view > 0).sum())
+        weights += summed.double()
+        shown = int((summed > 0).sum())
     return _ViewSurvey(covered_region(coverage), uncovered, coverage.numel(), seen, shown)

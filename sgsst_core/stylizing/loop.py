@@ -7,13 +7,13 @@ loop, and the first rank decides when it stops.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from sgsst_core.loss.convergence import has_converged, has_reached
+from sgsst_core.loss.convergence import has_converged, has_reached, window_length
 from sgsst_core.planning.plan import Prediction
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, round_evaluation, round_loss
+from sgsst_core.stylizing.evaluation import RunningRound, mean_loss
 from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
 
@@ -117,6 +117,7 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
     """Do the work of `run`, without its cleanup."""
     last_checkpoint = last_preview = time.perf_counter()
     pace = _pace(stylizer)
+    running = RunningRound(stylizer.job.round_length, stylizer.job.loss.weights, stylizer.history)
     if callbacks.preview and not stylizer.step:
         callbacks.preview(stylizer)
     _measure(stylizer, callbacks)  # a resumed job may have been stopped before this measurement
@@ -127,7 +128,8 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
         _step(stylizer, pace)
         now = time.perf_counter()
         if callbacks.progress:
-            callbacks.progress(_progress(stylizer, callbacks, pace))
+            running.add(stylizer.history[-1])
+            callbacks.progress(_progress(stylizer, callbacks, pace, running))
         if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
             _checkpoint(stylizer, callbacks.checkpoint)
             last_checkpoint = time.perf_counter()
@@ -154,7 +156,8 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
     settings = stylizer.job.settings
     if not (settings.target_loss or settings.early_stop):
         return None
-    losses = [record.loss for record in stylizer.history if record.stage == "sos"]
+    windows = 2 * window_length(stylizer.job.round_length)  # what `has_converged` compares
+    losses = [record.loss for record in stylizer.history[-windows:] if record.stage == "sos"]
     if settings.target_loss and len(losses) >= stylizer.job.round_length:  # all views have been visited at this point
         target = settings.target_loss * mean_loss(stylizer.start(), stylizer.job.loss.weights)
         if stylizer.job.plan.training_background != "background":
@@ -213,7 +216,7 @@ def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
     pace.add_step(record.stage, stylizer.latest, seconds, prepared)
 
 
-def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Progress:
+def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft, running: RunningRound) -> Progress:
     record, most, measure = stylizer.history[-1], stylizer.job.settings.max_seconds, callbacks.measure
     expected = stylizer.job.plan.prediction
     left = pace.left(
@@ -225,7 +228,6 @@ def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Pr
     stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
     if expected:
         left += expected.ending
-    round_mean = round_evaluation(stylizer.history, stylizer.job.round_length, stylizer.job.loss.weights)
     return Progress(
         stage,
         record.step,
@@ -233,17 +235,15 @@ def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> Pr
         record.loss,
         stylizer.seconds,
         left,
-        _by_scale(record.terms),
-        round_loss(stylizer.history, stylizer.job.round_length),
-        _by_scale(round_mean),
+        _by_scale({scale: terms.total for scale, terms in record.terms.items()}),
+        running.loss,
+        _by_scale(running.scales()),
     )
 
 
-def _by_scale(evaluation: Evaluation) -> tuple[float | None, ...]:
-    """Return the loss by scale, full size first; None for skipped scales."""
-    return tuple(
-        evaluation[scale].total if scale in evaluation else None for scale in range(max(evaluation, default=-1) + 1)
-    )
+def _by_scale(losses: Mapping[int, float]) -> tuple[float | None, ...]:
+    """Return losses by scale, full size first; None for skipped scales."""
+    return tuple(losses.get(scale) for scale in range(max(losses, default=-1) + 1))
 
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:

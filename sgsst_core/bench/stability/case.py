@@ -264,9 +264,9 @@ class DecisionsOf(FeatureNetwork):
         """
         return self.other.rounding_of(layer)
 
-    def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
+    def forward(self, rgb: Tensor, *, cache: bool = True, until: str | None = None) -> Activations:
         """Run `FeatureNetwork.forward`; store the decisions of the next recorded pass for `backward`."""
-        own = super().forward(rgb, cache=cache)
+        own = super().forward(rgb, cache=cache, until=until)
         theirs = Activations({}, self._recorded.popleft())
         for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
             self.flips += int((mine != other).sum())

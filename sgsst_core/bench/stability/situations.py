@@ -231,8 +231,8 @@ class _Rounded(DecisionsOf):
     Images are rounded too, because the pixels of coarser scales are averages.
     """
 
-    def forward(self, rgb: Tensor, *, cache: bool = True) -> Activations:
-        return super().forward(rgb.float(), cache=cache)
+    def forward(self, rgb: Tensor, *, cache: bool = True, until: str | None = None) -> Activations:
+        return super().forward(rgb.float(), cache=cache, until=until)
 
     def _convolve(self, x: Tensor, step: Any) -> Tensor:
         features = super()._convolve(x, step)

@@ -36,6 +36,14 @@ def pixel_gradient(network: FeatureNetwork) -> Tensor:
     return network.backward(network.forward(synthetic_image()), add)
 
 
+def test_pass_that_ends_early_returns_the_same_features(tiny_weights: BackboneWeights) -> None:
+    network = FeatureNetwork(tiny_weights)
+    whole = network.forward(synthetic_image(), cache=False).features
+    some = network.forward(synthetic_image(), cache=False, until="relu4_2").features
+    assert whole.keys() - some.keys() == {"relu5_1"}
+    assert all(torch.equal(whole[layer], features) for layer, features in some.items())
+
+
 class Watched(FeatureNetwork):
     """Network that records PyTorch's flags and the memory formats during its convolutions."""
 

@@ -128,9 +128,9 @@ class DecisionsOf(FeatureNetwork):
         self.flips = 0
         self.decisions = 0
 
-    def forward(self, rgb, *, cache=True) -> Activations:
-        own = super().forward(rgb, cache=cache)
-        theirs = self.other.forward(rgb.float(), cache=cache)
+    def forward(self, rgb, *, cache=True, until=None) -> Activations:
+        own = super().forward(rgb, cache=cache, until=until)
+        theirs = self.other.forward(rgb.float(), cache=cache, until=until)
         for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
             self.flips += int((mine != other).sum())
             self.decisions += mine.numel()

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+import random
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from PIL import Image
 from api.cli.console import loss_text
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.json_files import write_json
+from sgsst_core.loss.scale_weights import EVEN
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.report.contact_sheet import write_contact_sheet
@@ -21,7 +23,7 @@ from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, lo
 from sgsst_core.report.history import history_of, running_mean
 from sgsst_core.report.page import render_page
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, round_evaluation, round_loss
+from sgsst_core.stylizing.evaluation import Evaluation, RunningRound, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -169,6 +171,21 @@ def test_loss_after_is_the_mean_of_the_last_round_everywhere(
     coarse = [StepRecord(1, "coarse", 0, 0.1, 4.0, {1: LossTerms(gram=4.0)}, {}, 0)]
     steps = [StepRecord(n, "sos", 0, 0.1, loss, {0: LossTerms(gram=loss)}, {}, 0) for n, loss in ((2, 1.0), (3, 4.0))]
     assert round_loss(coarse + steps, 5) == pytest.approx(2), "of the current phase only"
+
+
+def test_running_round_is_the_mean_of_the_last_round() -> None:
+    """Over a change of phase, of scales and of magnitudes, and more steps than a round has."""
+    draw = random.Random(0)
+    running, history = RunningRound(7, EVEN), []
+    for step in range(60):
+        scales = (2,) if step < 20 else ((0, 1, 2), (1, 2))[step % 2]
+        terms = {scale: LossTerms(gram=10 ** draw.uniform(-6, 6), content=draw.random()) for scale in scales}
+        history.append(StepRecord(step, "coarse" if step < 20 else "sos", 0, 0.0, mean_loss(terms), terms, {}, 0))
+        running.add(history[-1])
+        assert running.loss == pytest.approx(round_loss(history, 7), rel=1e-12)
+        wanted = {scale: terms.total for scale, terms in round_evaluation(history, 7).items()}
+        assert running.scales() == pytest.approx(wanted, rel=1e-9)
+    assert RunningRound(7, EVEN, history).scales() == pytest.approx(wanted, rel=1e-9)
 
 
 def test_loss_over_time_is_reported(finished: tuple[Stylizer, Evaluation, Evaluation]) -> None:
