@@ -20,6 +20,7 @@ class Sizes:
         view: (width, height) of their views.
         steps: (width, height, Gaussians) for timed SOS steps.
         step_repeats: Number of timed steps.
+        jobs: (views, width, height, Gaussians) of whole jobs.
         rank_steps: Number of steps after which two ranks are compared with one.
         parity: (Gaussians, width, height) for the comparison with `reference`.
         network: Side in pixels of the square image for the feature network.
@@ -32,6 +33,7 @@ class Sizes:
     view: tuple[int, int] = (980, 545)
     steps: tuple[tuple[int, int, int], ...] = ((980, 545, 2_500_000), (5187, 3361, 5_800_000))
     step_repeats: int = 5
+    jobs: tuple[tuple[int, int, int, int], ...] = ((300, 980, 545, 1_000_000), (185, 5187, 3361, 5_800_000))
     rank_steps: int = 3
     parity: tuple[int, int, int] = (20_000, 320, 200)
     network: int = 1024
@@ -46,6 +48,7 @@ QUICK = Sizes(
     view=(32, 16),
     steps=((32, 32, 60),),
     step_repeats=1,
+    jobs=((3, 32, 32, 60),),
     rank_steps=1,
     parity=(120, 40, 33),
     network=48,

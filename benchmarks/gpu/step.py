@@ -17,7 +17,7 @@ from sgsst_core.stylizing.stylizer import Stylizer
 #: Warm-up steps, in which views are prepared and libraries choose their algorithms.
 _WARM = 2
 #: Zoom with which the ball covers whole views, as a captured room does.
-_ZOOM = 2.1
+ZOOM = 2.1
 
 
 def run(sizes: Sizes, findings: Findings) -> None:
@@ -40,7 +40,7 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     )  # fmt: skip
     stylizer = Stylizer.planned(
         scene,
-        views(_WARM, width, height, _ZOOM),
+        views(_WARM, width, height, ZOOM),
         texture(height, height, seed=3),
         settings,
         weights=small_weights() if quick else network_weights(),

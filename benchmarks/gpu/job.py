@@ -1,0 +1,95 @@
+"""Whole jobs as a user runs them: `sgsst stylize` as a process, with its seconds by part and the plan's prediction."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from PIL import Image
+
+from benchmarks.gpu.part import QUICK, Findings, Sizes, device
+from benchmarks.gpu.step import ZOOM
+from sgsst_core.bench.synthetic import random_weights, surface_scene, texture, views
+from sgsst_core.features.weight_files import digest_of_bytes, weights_file
+from sgsst_core.files.library import save
+from sgsst_core.scene.camera import Camera
+
+#: Seconds after which a job is asked to stop, as by Ctrl-C.
+_PATIENCE = 230
+
+
+def run(sizes: Sizes, findings: Findings) -> None:
+    """Run all jobs with the preset `standard`; on a GPU in bfloat16."""
+    precision = "bfloat16" if device().type == "cuda" else "float32"
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        _install_weights(folder)
+        for count, width, height, gaussians in sizes.jobs:
+            save(folder / "scene.ply", surface_scene(gaussians, degree=3))
+            cameras = views(count, width, height, ZOOM)
+            (folder / "cameras.json").write_text(json.dumps([_entry(camera) for camera in cameras]))
+            image = (255 * texture(height, height, seed=3)).byte().numpy()
+            Image.fromarray(image).save(folder / "style.png")
+            options = ["--precision", precision, *(["--steps-sos", "2"] if sizes == QUICK else [])]
+            name, figures = f"{count}x{width}x{height}/{precision}", _run(folder, options)
+            findings.add(name, {"gaussians": gaussians, **figures})
+            if "steps" not in figures:
+                findings.broken.append(f"{name}: {figures['printed'][-500:]}")
+
+
+def _install_weights(folder: Path) -> None:
+    """Install random weights of VGG19, which take the time of trained ones, in a folder for `SGSST_CACHE`."""
+    weights = random_weights()
+    tensors = {
+        f"{name}.{kind}": tensor.contiguous()
+        for name, pair in weights.convolutions.items()
+        for kind, tensor in zip(("weight", "bias"), pair, strict=True)
+    }
+    tensors |= {"input_scale": weights.input_scale, "input_shift": weights.input_shift}
+    metadata = {"name": "vgg19", "source": "random", "source_sha256": ""}
+    metadata["sha256"] = digest_of_bytes(safetensors.torch.save(tensors, metadata))
+    weights_file(folder, "vgg19").write_bytes(safetensors.torch.save(tensors, metadata))
+
+
+def _entry(camera: Camera) -> dict[str, Any]:
+    """Return a camera as an entry of an INRIA cameras.json."""
+    pose = torch.linalg.inv(camera.world_to_camera.double())
+    return {
+        "img_name": camera.name, "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
+        "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist(),
+    }  # fmt: skip
+
+
+def _run(folder: Path, options: list[str]) -> dict[str, Any]:
+    """Run a job, and return its seconds and parts; if it was stopped or failed, the end of what it printed."""
+    out = folder / "stylized.ply"
+    command = [sys.executable, "-m", "api.cli", "stylize", "scene.ply", "--cameras", "cameras.json", "--style"]
+    command += ["style.png", "--out", out.name, *options]
+    path = os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "SGSST_CACHE": str(folder), "PYTHONPATH": path}
+    started = time.perf_counter()
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, cwd=folder, env=environment, stdout=pipe, stderr=subprocess.STDOUT, text=True)
+    try:
+        printed, _ = process.communicate(timeout=_PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
+        printed, _ = process.communicate()
+    seconds = time.perf_counter() - started
+    report = out.with_suffix(".report.json")
+    if not report.is_file():
+        return {"seconds": seconds, "status": process.returncode, "printed": printed[-3000:]}
+    content = json.loads(report.read_text())
+    report.unlink()
+    parts = content["seconds_by_part"]
+    figures = {"seconds": seconds, "steps": len(content["history"]), "seconds_by_part": parts}
+    return {**figures, "other": seconds - sum(parts.values()), "printed": printed[-3000:]}
