@@ -242,8 +242,8 @@ class DecisionsOf(FeatureNetwork):
         """Record the other network's forward passes in this block; later passes of this network use their decisions."""
         forward = self.other.forward
 
-        def recorded(rgb: Tensor, *, cache: bool = True) -> Activations:
-            activations = forward(rgb, cache=cache)
+        def recorded(rgb: Tensor, *, cache: bool = True, until: str | None = None) -> Activations:
+            activations = forward(rgb, cache=cache, until=until)
             self._recorded.append(list(activations.outputs))
             return activations
 
