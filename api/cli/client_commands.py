@@ -12,12 +12,11 @@ from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, TextColumn
+from rich.progress import BarColumn, ProgressColumn, TextColumn
 from rich.table import Table
 
 from api.cli.arguments import JobInputs, JsonOption
-from api.cli.console import INTERRUPTED, JOB_FAILED, error_console, loss_text, out_console
+from api.cli.console import INTERRUPTED, JOB_FAILED, PlainConsole, error_console, loss_text, out_console
 from api.cli.options import with_arguments, with_options
 from api.cli.progress_bars import transfer_bar
 from api.client.inputs import different_names, path_or_url
@@ -282,7 +281,7 @@ def jobs(
     if as_json:
         out_console.print(json.dumps([job.data for job in page]))
         return
-    console = Console(highlight=False, markup=False, emoji=False)
+    console = PlainConsole()
     widths = {"id": 35, "name": 0, "status": 13, "created": 11}
     widths["name"] = max(console.width - sum(widths.values()) - 2 * (len(widths) - 1), len("name"))
     table = Table(box=None, pad_edge=False)
@@ -343,8 +342,7 @@ def _parse_parameters(text: str) -> dict[str, Any]:
 @contextmanager
 def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
     """Show a progress bar of the sent bytes, then of the surveyed views; only on a terminal."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
-    with live_bar(error_console, *columns) as bar:
+    with live_bar(error_console, *_text_columns()) as bar:
         task = bar.add_task("checking", total=None, text="")
 
         def sent(done: int, total: int) -> None:
@@ -356,6 +354,11 @@ def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
             bar.update(task, description="planning", completed=done, total=total, text=f"view {done} of {total}")
 
         yield sent, planned
+
+
+def _text_columns() -> tuple[ProgressColumn, ...]:
+    """Return the columns of a bar between a description and a text, which may be the service's."""
+    return TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[text]}", markup=False)
 
 
 def _follow(client: Client, job_id: str, as_json: bool) -> Job:
@@ -371,9 +374,8 @@ def _follow(client: Client, job_id: str, as_json: bool) -> Job:
 
 def _show_events(client: Client, job_id: str, as_json: bool) -> Job:
     """Show events until the job has ended: as a live bar on a terminal, as lines elsewhere, or as JSON lines."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
     live = error_console.is_terminal and not as_json
-    with live_bar(error_console, *columns, enabled=not as_json) as bar:
+    with live_bar(error_console, *_text_columns(), enabled=not as_json) as bar:
         task = bar.add_task("waiting", total=1.0, text="")
         for event in client.watch(job_id):
             if as_json:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 
 from sgsst_core.loss.convergence import ratio
 
@@ -17,8 +18,24 @@ NOT_FOUND, CONFLICT, JOB_FAILED = 3, 4, 5
 #: Exit code after Ctrl-C, as in shells.
 INTERRUPTED = 130
 
-out_console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
-error_console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
+#: Characters that are not printed: control characters, which terminals obey, and marks that reorder a line.
+_CONTROLS = dict.fromkeys({*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A)} - {9, 10})
+
+
+class PlainConsole(Console):
+    """Console that prints texts as they are, but without control characters: a service could send any."""
+
+    def __init__(self, *, stderr: bool = False, soft_wrap: bool = False) -> None:
+        super().__init__(stderr=stderr, soft_wrap=soft_wrap, highlight=False, markup=False, emoji=False)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield the segments of a text, table or progress bar; those with control codes are the console's own."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=segment.text.translate(_CONTROLS))
+
+
+out_console = PlainConsole(soft_wrap=True)
+error_console = PlainConsole(stderr=True, soft_wrap=True)
 
 
 def loss_text(before: float, after: float) -> str:

@@ -19,6 +19,7 @@ from api.cli.study_commands import study_app
 from api.cli.stylize_commands import demo, stylize
 from api.cli.weights_commands import weights_app
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_out_of_memory
+from sgsst_core.files.atomic import DISK_FULL
 from sgsst_core.options import renamed_hint
 
 #: Base of errors in the arguments, which typer does not export.
@@ -106,10 +107,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except BrokenPipeError:  # for example `sgsst weights list | head`
         return FAILURE
-    except OSError as error:  # such as a name that is too long, or a folder that denies access
-        if error.filename is None:
+    except OSError as error:  # such as a name that is too long, a folder that denies access, or a full disk
+        full = error.errno in DISK_FULL
+        if error.filename is None and not full:
             raise
-        problem = f"{error.filename}: {error.strerror}. Check the path."
+        where = error.filename or "The standard output or a temporary file"
+        problem = f"{where}: {error.strerror}. {'Free some space' if full else 'Check the path'}."
         if "--json" in arguments:
             _print_json("path", problem)
         else:

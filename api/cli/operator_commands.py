@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from api.cli.arguments import JsonOption
-from api.cli.console import error_console, out_console
+from api.cli.console import PlainConsole, error_console, out_console
 
 if TYPE_CHECKING:
     from service.settings import ServiceSettings
@@ -142,7 +141,7 @@ def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
     table = Table("id", "name", "priority", "state")
     for row in rows:
         table.add_row(row.id, row.name, str(row.priority), "revoked" if row.revoked_at else "valid")
-    Console(highlight=False, markup=False, emoji=False).print(table)
+    PlainConsole().print(table)
 
 
 @keys_app.command("revoke")

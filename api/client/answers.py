@@ -113,8 +113,3 @@ def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
 def is_temporary(error: Exception) -> bool:
     """Return whether the same request may succeed later: there was no response, or it reports a temporary failure."""
     return isinstance(error, httpx.TransportError) or (isinstance(error, ApiError) and error.status in _TEMPORARY)
-
-
-def unreachable(base: str, error: Exception) -> ApiError:
-    """Return the error for a service that did not respond."""
-    return ApiError(f"{base} cannot be reached ({error}). Is `sgsst serve` running? --url names another address.")

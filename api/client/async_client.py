@@ -13,7 +13,7 @@ import httpx
 from httpx_sse import aconnect_sse
 
 from api.client import uploads
-from api.client.answers import Event, Job, RequestError, checked, unreachable
+from api.client.answers import Event, Job, RequestError, checked
 from api.client.downloads import Download, Progress
 from api.client.inputs import JobFiles, path_or_url
 from api.client.transport import TRIES, Transport, in_thread
@@ -43,6 +43,9 @@ class AsyncClient:
         url: Address of the service. None uses the environment variable SGSST_URL, or port 8000 of this machine if the
             variable is not set.
         key: API key; None uses the environment variable SGSST_KEY.
+
+    Raises:
+        RequestError: If address, key, or a proxy or certificate file that the environment names cannot be used.
 
     Attributes:
         url: Address of the service.
@@ -164,7 +167,7 @@ class AsyncClient:
                 # stamina cannot do this: each event resets the count of failures
                 failures += 1
                 if failures >= TRIES or self._transport.gives_up(error):
-                    raise unreachable(self.url, error) from None
+                    raise self._transport.unreachable(error) from None
                 await anyio.sleep(FIRST_WAIT * 2.0 ** (failures - 1))
                 continue
             if (await self.job(job_id)).finished:

@@ -66,14 +66,17 @@ class Client:
             variable is not set.
         key: API key; None uses the environment variable SGSST_KEY.
 
+    Raises:
+        RequestError: If address, key, or a proxy or certificate file that the environment names cannot be used.
+
     Attributes:
         url: Address of the service.
     """
 
     def __init__(self, url: str | None = None, key: str | None = None) -> None:
+        self._client = AsyncClient(url, key)  # first: if it raises, no thread may be left running
         self._stack = ExitStack()
         self._portal = self._stack.enter_context(start_blocking_portal())
-        self._client = AsyncClient(url, key)
         self._stack.callback(self._stop)
         self._stack.callback(self._portal.call, self._client.close)
         self.url = self._client.url

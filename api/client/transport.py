@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import urllib.request
 from collections.abc import Awaitable, Callable
 from typing import Any, ParamSpec, TypeVar
 
@@ -12,13 +14,16 @@ import httpx
 import stamina
 from httpx_sse import ServerSentEvent, aconnect_sse
 
-from api.client.answers import ApiError, RequestError, checked, is_temporary, refusal, unreachable
+from api.client.answers import ApiError, RequestError, checked, is_temporary, refusal
 from api.client.downloads import BLOCK, Download, Progress
+from sgsst_core.errors import OutputError
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
 TRIES = 6
 
+#: Variables of the environment that name proxies, and hosts to reach without them.
+_PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
 #: Methods of requests that change nothing.
 _READS = ("GET", "HEAD")
 
@@ -34,7 +39,8 @@ class Transport:
         key: API key; None for the environment variable SGSST_KEY.
 
     Raises:
-        RequestError: If the address is neither an http nor an https URL, or the key cannot be one.
+        RequestError: If the address is neither an http nor an https URL, or the key cannot be one, or a proxy or
+            certificate file that the environment names cannot be used.
 
     Attributes:
         http: HTTP client for requests without retries.
@@ -49,11 +55,7 @@ class Transport:
             raise RequestError(f"{url}: not an address of a service. Give one such as {DEFAULT_URL}.")
         if not (key.isascii() and key.isprintable()):
             raise RequestError("The API key contains characters that no key has. Copy it again.")
-        self.http = httpx.AsyncClient(
-            base_url=url,
-            headers={"Authorization": f"Bearer {key}"} if key else {},
-            timeout=httpx.Timeout(30.0, read=900.0, write=120.0),
-        )
+        self.http = _http_client(url, {"Authorization": f"Bearer {key}"} if key else {})
         self.url = str(self.http.base_url)
         self.reached = False
         self._retrying = stamina.AsyncRetryingCaller(
@@ -143,6 +145,7 @@ class Transport:
 
         Raises:
             RequestError, ApiError: As for `call`.
+            OutputError: If the disk is full. Nothing of the file remains.
         """
 
         async def once() -> None:
@@ -159,11 +162,23 @@ class Transport:
                         download.report()
             await in_thread(download.finish)
 
-        await self._retry(once, reading=True)
+        try:
+            await self._retry(once, reading=True)
+        except OutputError:
+            await in_thread(download.discard)
+            raise
 
     def gives_up(self, error: Exception) -> bool:
         """Return whether a read error means that there is no service, rather than that it is restarting."""
         return isinstance(error, httpx.ConnectError) and not self.reached
+
+    def unreachable(self, error: Exception) -> ApiError:
+        """Return the error for a service that did not respond."""
+        proxy = _proxy_for(self.url)
+        through = f" through the proxy {_without_password(proxy)} (NO_PROXY excludes hosts)" if proxy else ""
+        return ApiError(
+            f"{self.url} cannot be reached{through}: {error}. Is `sgsst serve` running? --url names another address."
+        )
 
     async def _retry(self, once: Callable[[], Awaitable[T]], *, reading: bool = False) -> T:
         def may_pass(error: Exception) -> bool:
@@ -172,16 +187,49 @@ class Transport:
         try:
             return await self._retrying(may_pass, once)
         except httpx.TransportError as error:
-            raise unreachable(self.url, error) from None
+            raise self.unreachable(error) from None
 
 
 def _is_address(url: str) -> bool:
-    """Return whether a text is an http or https URL with a host."""
+    """Return whether a text is an http or https URL with a host and a port that can exist."""
     try:
         parsed = httpx.URL(url)
-    except httpx.InvalidURL:
+        parsed.host.encode("idna")
+    except (httpx.InvalidURL, UnicodeError):
         return False
-    return parsed.scheme in ("http", "https") and bool(parsed.host)
+    return parsed.scheme in ("http", "https") and bool(parsed.host) and (parsed.port or 0) < 1 << 16
+
+
+def _http_client(url: str, headers: dict[str, str]) -> httpx.AsyncClient:
+    """Return an HTTP client, which takes proxies and certificate authorities from the environment.
+
+    Raises:
+        RequestError: If one of these cannot be used.
+    """
+    try:
+        proxy = _proxy_for(url)
+        if proxy.startswith("http") and not _is_address(proxy):
+            raise ValueError(f"{_without_password(proxy)} is no address")
+        return httpx.AsyncClient(base_url=url, headers=headers, timeout=httpx.Timeout(30.0, read=900.0, write=120.0))
+    except Exception as error:  # httpx raises errors of many types here, some of them built-in
+        names = ("SSL_CERT_FILE",) if isinstance(error, OSError) else _PROXIES
+        given = {name: value for name, value in sorted(os.environ.items()) if name.upper() in names and value}
+        shown = " or ".join(f"{name}={_without_password(value)}" for name, value in given.items())
+        raise RequestError(f"{shown} cannot be used: {str(error).rstrip('.')}. Correct or unset it.") from error
+
+
+def _proxy_for(url: str) -> str:
+    """Return the address of the proxy that the environment names for a URL; empty for none."""
+    parsed, proxies = httpx.URL(url), urllib.request.getproxies()
+    proxy = proxies.get(parsed.scheme) or proxies.get("all")
+    if not proxy or urllib.request.proxy_bypass(parsed.host):
+        return ""
+    return proxy if "://" in proxy else f"http://{proxy}"
+
+
+def _without_password(address: str) -> str:
+    """Return the address of a proxy without its user and password."""
+    return re.sub(r"^(\w+://)?.*@", r"\1", address)
 
 
 def json_text(value: object) -> str:

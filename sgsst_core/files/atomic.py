@@ -13,8 +13,8 @@ from pathlib import Path
 
 from sgsst_core.errors import OutputError
 
-#: Error numbers of a full disk. Other errors in an `atomic_path` block are raised unchanged.
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+#: Error numbers of a full disk, of an exhausted quota and of a file that may not grow further.
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -35,22 +35,43 @@ def atomic_path(target: Path) -> Iterator[Path]:
         raise OutputError(f"{final}: is a folder. Name a file.")
     temporary = _reserve(final)
     try:
-        yield temporary
-        if final.exists():
-            shutil.copymode(final, temporary)
-        _flush(temporary)
-        temporary.replace(final)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        if error.errno in _DISK_FULL:
-            raise OutputError(
-                f"{target}: cannot be written: {error.strerror}. Free some space and run again."
-            ) from error
-        raise
+        with disk_errors(target, temporary):
+            yield temporary
+            if final.exists():
+                shutil.copymode(final, temporary)
+            _flush(temporary)
+            temporary.replace(final)
     except BaseException:  # includes KeyboardInterrupt: no partial file may remain
         temporary.unlink(missing_ok=True)
         raise
     _flush_folder(final.parent)
+
+
+@contextmanager
+def disk_errors(target: Path, temporary: Path, size: int = 0) -> Iterator[None]:
+    """Report a full disk in the block as an OutputError, with the needed and the available space if they are known.
+
+    Args:
+        target: File or folder that is named.
+        temporary: File or folder that is written in its place; the space that it takes counts as available.
+        size: Size of the complete file in bytes; 0 if it is unknown.
+
+    Raises:
+        OutputError: If the disk is full. Other errors are raised unchanged.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            raise
+        files = [temporary] if temporary.is_file() else temporary.rglob("*")
+        written = sum(path.stat().st_size for path in files)
+        needed = f"{size / 1e6:.2f} MB" if size else f"more than {written / 1e6:.2f} MB"
+        free = (shutil.disk_usage(temporary.parent).free + written) / 1e6
+        space = f" It takes {needed}, and {free:.2f} MB is free." if error.errno == errno.ENOSPC else ""
+        raise OutputError(
+            f"{target}: cannot be written: {error.strerror}.{space} Free some space, or write to another disk."
+        ) from error
 
 
 def remove_leftovers(target: Path) -> None:

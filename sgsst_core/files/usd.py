@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 from pathlib import Path
 
 import numpy as np
 
 from sgsst_core.errors import OutputError
-from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.atomic import DISK_FULL, atomic_path
 from sgsst_core.files.formats.frame import Y_UP, Frame
 from sgsst_core.files.scene_file import arrays_of
 from sgsst_core.scene.gaussians import Scene
@@ -73,6 +74,9 @@ def write_usd(path: Path, scene: Scene) -> None:
         try:
             written = stage.GetRootLayer().Export(str(temporary))
         except Tf.ErrorException as error:
+            full = next((code for code in DISK_FULL if os.strerror(code) in str(error)), None)
+            if full:  # reported by `atomic_path`
+                raise OSError(full, os.strerror(full)) from error
             raise OutputError(f"{path}: cannot be written: {error}. Free some space, or name another file.") from error
         if not written:
             raise OutputError(f"{path}: cannot be written. Free some space, or name another file.")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.errors import OutputError
-from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, remove_leftovers
+from sgsst_core.files.atomic import atomic_path, disk_errors, ensure_writable_folder, remove_leftovers
 
 #: Frame of a video: [height, width, 3 or 4] uint8, sRGB, with straight alpha.
 VideoFrame = NDArray[np.uint8]
@@ -149,7 +149,8 @@ def _image_sequence(folder: Path, name: str) -> Iterator[Callable[[VideoFrame], 
         count += 1
 
     try:
-        yield write
+        with disk_errors(folder, temporary):
+            yield write
         for index in range(count):
             (temporary / (name % index)).replace(folder / (name % index))
     finally:

@@ -161,9 +161,9 @@ def write_study(
     scale = min(1.0, _STYLE_SIDE / max(style.shape[:2]))
     small = resize_area(style, (max(1, round(style.shape[0] * scale)), max(1, round(style.shape[1] * scale))))
     text = environment.get_template("study.html").render(style=_data_uri(small), data=data, count=len(names))
-    write_json(key, Key(study=study, variants=list(names), views=tokens).model_dump())
     with atomic_path(page) as temporary:
         temporary.write_text(text, encoding="utf-8")
+        write_json(key, Key(study=study, variants=list(names), views=tokens).model_dump())  # no page without its key
 
 
 def count_votes(key: Path, files: Sequence[Path]) -> list[Share]:

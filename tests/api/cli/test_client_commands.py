@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -18,6 +20,8 @@ import pytest
 from PIL import Image
 
 from api.cli.main import main
+from api.client import Client
+from api.client.answers import RequestError
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -243,6 +247,22 @@ def test_download_names_a_target_that_cannot_be_written(
     assert (tmp_path / "new" / "out.ply").read_bytes() == b"result"
 
 
+def test_download_to_a_full_disk_leaves_nothing(
+    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+) -> None:
+    job_id = submit(files, capsys)
+    finish(service, job_id, bytes(200_000), tmp_path)
+    out = tmp_path / "new" / "out.ply"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        assert main(["download", job_id, "--out", str(out)]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert f"error: {out}: cannot be written: File too large." in capsys.readouterr().err
+    assert list(out.parent.iterdir()) == []
+
+
 def test_name_of_another_format_is_refused_before_the_download(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,6 +294,8 @@ def test_id_that_no_job_has_is_refused(command: str, job_id: str, capsys: pytest
     [
         ("--url", "http://127.0.0.1:abc", "not an address of a service"),
         ("--url", "http://", "not an address of a service"),
+        ("--url", "http://127.0.0.1:65536", "not an address of a service"),
+        ("--url", "http://a..b", "not an address of a service"),
         ("--key", "kéy", "Copy it again"),
         ("--key", "a\nb", "Copy it again"),
     ],
@@ -283,6 +305,96 @@ def test_address_or_key_that_cannot_be_used_is_refused(
 ) -> None:
     assert main(["jobs", option, value]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "message"),
+    [
+        ("ALL_PROXY", "socks5://user:secret@127.0.0.1:9", "ALL_PROXY=socks5://127.0.0.1:9 cannot be used"),
+        ("http_proxy", "socks9://127.0.0.1:9", "http_proxy=socks9://127.0.0.1:9 cannot be used"),
+        ("HTTP_PROXY", "127.0.0.1:65536", "HTTP_PROXY=127.0.0.1:65536 cannot be used"),
+        ("HTTPS_PROXY", "http://[::1", "HTTPS_PROXY=http://[::1 cannot be used"),
+        ("SSL_CERT_FILE", "/nonexistent", "SSL_CERT_FILE=/nonexistent cannot be used"),
+        ("SSL_CERT_FILE", os.devnull, f"SSL_CERT_FILE={os.devnull} cannot be used"),
+    ],
+)
+def test_environment_that_cannot_be_used_is_reported(
+    variable: str, value: str, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No thread is left that would keep the process running."""
+    monkeypatch.setenv("no_proxy", "elsewhere.example")
+    monkeypatch.setenv(variable, value)
+    before = threading.enumerate()
+    assert main(["jobs"]) == 2
+    assert threading.enumerate() == before
+    shown = capsys.readouterr().err
+    assert message in shown.replace(" or no_proxy=elsewhere.example", "")
+    assert "Correct or unset it." in shown
+    assert "secret" not in shown
+    with pytest.raises(RequestError, match="cannot be used"):
+        Client()
+
+
+def test_proxy_is_named_if_the_service_cannot_be_reached(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("http_proxy", "http://user:secret@127.0.0.1:9")
+    assert main(["jobs", "--url", "http://service.example"]) == 1
+    shown = capsys.readouterr().err
+    assert "cannot be reached through the proxy http://127.0.0.1:9 (NO_PROXY excludes hosts)" in shown
+    assert "secret" not in shown
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    assert main(["jobs", "--url", "http://127.0.0.1:9"]) == 1
+    assert "proxy" not in capsys.readouterr().err
+
+
+class Painter(BaseHTTPRequestHandler):
+    """Service whose texts contain escape sequences."""
+
+    EVIL = "\x1b]0;title\x07\x1b[2J\x9b2J\u202e[/red]"
+
+    def do_GET(self) -> None:
+        """Answer a request for a job, for all jobs or for events."""
+        job = {"id": "job_1" + self.EVIL, "status": "running" + self.EVIL, "name": "name" + self.EVIL}
+        job |= {"created_at": "2026-01-01T00:00:00Z", "result": None, "error": {"message": "error" + self.EVIL}}
+        progress = {"stage": "stage" + self.EVIL, "step": 1, "total": 2, "fraction": 0.5}
+        if self.path.endswith("/events"):
+            body = f"id: 1\nevent: progress\ndata: {json.dumps(progress)}\n\n"
+        elif self.path.startswith("/v1/jobs?"):
+            body = json.dumps({"jobs": [{**job, "progress": progress}], "next_cursor": None})
+        elif self.path.endswith(MISSING):
+            body = json.dumps({**job, "status": "failed"})
+        else:
+            body = json.dumps({"detail": "refused" + self.EVIL})
+        self.send_response(404 if "detail" in body else 200)
+        self.send_header("Content-Type", "text/event-stream" if body.startswith("id") else "application/json")
+        self.end_headers()
+        self.wfile.write(body.encode())
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Print nothing."""
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_escape_sequences_of_a_service_are_not_printed(
+    terminal: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if terminal:
+        monkeypatch.setenv("FORCE_COLOR", "1")
+    with ThreadingHTTPServer(("127.0.0.1", 0), Painter) as server:
+        serve(server)
+        monkeypatch.setenv("SGSST_URL", f"http://127.0.0.1:{server.server_port}")
+        for command, code, text in (
+            (["status", MISSING], 0, "error]0;title[2J2J[/red]"),
+            (["jobs"], 0, "running]0;"),
+            (["watch", MISSING], 5, "stage]0;"),
+            (["status", "job_2"], 3, "refused]0;"),
+        ):
+            assert main(command) == code
+            shown = "".join(capsys.readouterr())
+            assert not any(evil in shown for evil in ("\x1b]", "\x07", "\x1b[2J", "\x9b", "\u202e"))
+            assert text in shown or terminal
+        server.shutdown()
 
 
 class Stranger(BaseHTTPRequestHandler):

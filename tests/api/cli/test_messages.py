@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import resource
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -61,6 +63,45 @@ def test_ctrl_c_while_writing_leaves_no_file(command: str, tmp_path: Path, capsy
     assert not INTERRUPTED_AT
     assert capsys.readouterr().err.splitlines()[-1] == "Aborted. Output files are complete or were not written."
     assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["convert", "usd", "blend", "render", "video", "frames", "study", "plan"])
+def test_full_disk_is_one_message_and_leaves_no_file(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The limit of a file's size stands for a full disk, which only root can make."""
+    scene, views, style = map(str, write_files(tmp_path, wall()))
+    out = tmp_path / "out"
+    seen = ["--cameras", views]
+    arguments = {
+        "convert": ["convert", scene, str(out / "scene.ply")],
+        "usd": ["convert", scene, str(out / "scene.usdc")],
+        "blend": ["blend", scene, scene, "--out", str(out / "scene.ply")],
+        "render": ["render", scene, *seen, "--out", str(out)],
+        "video": ["render", scene, *seen, "--video", str(out / "video.mp4"), "--fps", "2", "--seconds", "1"],
+        "frames": ["render", scene, *seen, "--video", str(out), "--fps", "2", "--seconds", "1"],
+        "plan": ["plan", scene, *seen, "--style", style, "--out", str(out / "plan.json")],
+        "study": ["study", "make", f"a={scene}", f"b={scene}", "--style", style, *seen, "--out", str(out / "a.html")],
+    }[command]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        assert main(arguments) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert errors[0].startswith(f"error: {out}")
+    assert "cannot be written: File too large. Free some space" in errors[0]
+    assert not out.exists() or list(out.iterdir()) == []
+
+
+def test_full_standard_output_is_one_message() -> None:
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "api.cli", "--help"]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr == "error: The standard output or a temporary file: No space left on device. Free some space.\n"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import hashlib
 import inspect
 import math
@@ -10,6 +11,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,8 @@ from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from tests.api.service import Service
+from tests.http_servers import serve
+from tests.nginx import Nginx
 from tests.small_scenes import wall, write_files
 
 
@@ -389,6 +393,40 @@ def test_download_resumes_after_lost_connection(
         assert relay.cuts == 3
     assert {size for _, size in reported} == {len(content)}
     assert [done for done, _ in reported] == sorted({done for done, _ in reported}), "nothing was sent twice"
+
+
+@both
+def test_download_through_compressing_proxies(
+    connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
+) -> None:
+    """nginx makes ETags weak when it compresses; another proxy compresses although it is asked not to."""
+    with connect(service.url) as client:
+        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+    content = finish(store, service, job_id, b"content" * 10_000, tmp_path)
+
+    class Compressing(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            body = gzip.compress(content)
+            self.send_response(200)
+            self.send_header("ETag", f'W/"{hashlib.sha256(content).hexdigest()}-gzip"')
+            self.send_header("Content-Encoding", "gzip")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *arguments: Any) -> None:
+            pass
+
+    upstream = int(service.environment["SGSST_PORT"])
+    with (
+        Nginx(tmp_path / "nginx", upstream, directives=["gzip_types *;"]) as nginx,
+        ThreadingHTTPServer(("127.0.0.1", 0), Compressing) as other,
+    ):
+        serve(other)
+        for url in (nginx.url, f"http://127.0.0.1:{other.server_port}"):
+            with connect(url) as client:
+                assert client.download(job_id, tmp_path / "out.ply").read_bytes() == content
+        other.shutdown()
 
 
 @both
