@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from service.files.staging import RESULT, Staged, clean_name, region_mask, region_styles
+from service.files.staging import RESULT, Staged, region_mask, region_styles, staged_name
 from service.parameters import JobParameters
 from worker.region_requests import RegionRequest
 from worker.request import SceneRequest, StylizeRequest
@@ -30,7 +30,7 @@ def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, 
     paths = {path.name: path for path in staged.styles}
 
     def staged_file(file: StyleFile) -> StyleFile:
-        return replace(file, path=paths[clean_name("style", str(file.path), 0)])
+        return replace(file, path=paths[staged_name("style", str(file.path))])
 
     def staged_region(region: RegionRequest) -> RegionRequest:
         selection = region.selection and replace(region.selection, path=region_mask(region))

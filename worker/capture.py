@@ -12,7 +12,7 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.images import WHITE, Color
-from sgsst_core.files.photos import Photo, check_photos, photo_size, some_names
+from sgsst_core.files.photos import Photo, PhotoFolder, check_photos, photo_size, some_names
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
 from sgsst_core.planning.capture_checks import compare_photos, frame_warnings, shown_by
@@ -34,6 +34,7 @@ class Capture:
     Attributes:
         cameras: Cameras at the requested resolution.
         orbit: Orbit that generated the cameras; None if they come from a file.
+        names: Names of all requested cameras, including those of views that are left out.
         photo_sizes: Width and height of each camera's photo in the camera file.
         photos: Photo of each camera; None if the job uses unstylized renders.
         decisions: Decisions about cameras and photos for the plan.
@@ -41,6 +42,7 @@ class Capture:
 
     cameras: list[Camera]
     orbit: Orbit | None
+    names: tuple[str, ...]
     photo_sizes: list[tuple[int, int]]
     photos: list[Photo] | None = None
     decisions: tuple[Decision, ...] = ()
@@ -69,7 +71,10 @@ class Capture:
         sizes = [self.photo_sizes[index] for index in used]
         widths = [new.width / self.cameras[i].width for new, i in zip(cameras, used, strict=True)]
         lines = [*_about_undistorted(cameras, min(widths, default=1.0)), *_about_photos(sizes, photos, missing)]
-        return Capture(cameras, self.orbit, sizes, photos, (*self.decisions, *lines))
+        if strangers := PhotoFolder(folder).strangers(self.names):
+            reason = f"they have the name of no camera: {some_names(strangers)}"
+            lines.append(Decision("photos", f"{len(strangers)} files are not used", reason))
+        return Capture(cameras, self.orbit, self.names, sizes, photos, (*self.decisions, *lines))
 
     def checked(self, scene: Scene, near: float) -> Capture:
         """Return the capture with warnings if it does not fit a scene, and with its photos in the right orientation.
@@ -105,12 +110,13 @@ def read_capture(source: SceneRequest, scene: Scene, images: Path | None = None)
         cameras = list(orbit.cameras)
     else:
         cameras = read_cameras(source.cameras, images)
+    names = tuple(camera.name for camera in cameras)
     if source.views is not None:
         cameras = spread(cameras, source.views)
     sizes = [photo_size(camera) for camera in cameras]
     if source.resolution is not None:
         cameras = [resized(camera, source.resolution) for camera in cameras]
-    return Capture(cameras, orbit, sizes)
+    return Capture(cameras, orbit, names, sizes)
 
 
 def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAxes, list[Decision]]:

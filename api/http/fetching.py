@@ -21,7 +21,7 @@ from api.http.request_memory import memory
 from api.http.threads import OwnerLimit, OwnerThreads
 from service.errors import BusyError, FetchError, InvalidUrlError, TooLargeError, UrlsOffError
 from service.files.blobs import Blobs, Receiver
-from service.files.staging import clean_name
+from service.files.staging import staged_name
 from service.outgoing import origin, parse_origins, parse_url, send
 from service.settings import ServiceSettings
 
@@ -183,7 +183,7 @@ class Fetcher:
     def _keep(self, source: _Input, file: Receiver, receipt: Receipt) -> str:
         """Turn a complete file into a blob that the receipt holds, and return its SHA-256."""
         file.close()
-        name = clean_name(source.role, file_name(source.url), 0)
+        name = staged_name(source.role, file_name(source.url))
         check_file(source.role, name, file.path, file.size, self._settings)
         return self._blobs.add(file.path, receipt.id)
 

@@ -1,10 +1,12 @@
-"""References to inputs of other jobs by their paths in the API, so that a new job needs no further upload."""
+"""References to files that a new job needs not send: inputs of other jobs by their paths in the API, and uploads."""
 
 from __future__ import annotations
 
+import base64
 import re
 from typing import Any
 
+from api.http.multipart import BadRequestError
 from service.store.states import JobStatus
 from service.store.tables import JobRow
 
@@ -27,3 +29,19 @@ def input_entry(job: JobRow, name: str) -> dict[str, Any] | None:
     entries = [entry for entry in job.inputs if entry["role"] == match[1]]
     index = int(match[2] or 0)
     return entries[index] if index < len(entries) else None
+
+
+def uploaded_name(metadata: str) -> str:
+    """Return the `filename` in an `Upload-Metadata` header, which has the format `key base64, key base64`.
+
+    Raises:
+        BadRequestError: If it is not base64 of UTF-8.
+    """
+    for pair in metadata.split(","):
+        key, _, value = pair.strip().partition(" ")
+        if key in ("filename", "name"):
+            try:
+                return base64.b64decode(value, validate=True).decode()
+            except ValueError as error:  # raised for non-ASCII characters too
+                raise BadRequestError(f"Upload-Metadata: {key!r} is not base64 of UTF-8.") from error
+    return ""

@@ -29,7 +29,7 @@ from service.errors import (
     TooManyGaussiansError,
 )
 from service.files.blobs import Blobs, Receiver
-from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, clean_name
+from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, staged_name
 from service.settings import ServiceSettings
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats import read_scene_header
@@ -323,7 +323,7 @@ class _Form:
         count = len(self.received.files)
         if count >= self._most_files:
             raise TooManyFilesError(count, "files")
-        self._name = clean_name(self._role, filename.decode("utf-8", "replace"), count)
+        self._name = staged_name(self._role, filename.decode("utf-8", "surrogateescape"), count)
         self._file = self._blobs.receive(self._settings.max_upload_bytes)
 
     def _data(self, data: bytes, start: int, end: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -28,7 +29,12 @@ MOST_STYLES = MOST_STYLE_IMAGES + MOST_REGIONS
 #: transforms.json may come with a dataparser_transforms.json.
 MAX_CAMERA_FILES = 8
 _CAMERA_SUFFIXES = {".json", ".bin", ".txt"}
-_MAX_NAME, _MAX_DEPTH = 120, 8  # bytes of a path component: file systems allow 255, and suffixes are added later
+#: Maximum bytes of a path component, as of file systems, and number of components.
+_MAX_NAME, _MAX_DEPTH = 255, 8
+#: Characters that no name keeps: control characters, separators of lines, marks that reorder text, and surrogates
+#: (bytes that are not UTF-8).
+_UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_FALLBACKS = {"scene": "scene.ply", "style": "style", "cameras": "cameras.json", "mask": "mask.bin"}
 
 
 @dataclass(frozen=True)
@@ -56,23 +62,41 @@ class Staged:
         return Staged(Path(values["scene"]), tuple(map(Path, values["styles"])), cameras, photos)
 
 
-def clean_name(role: str, name: str, number: int) -> str:
-    """Return a safe name for an input: inside its folder and without special characters.
+def staged_name(role: str, name: str, number: int = 0) -> str:
+    """Return the name under which an input is staged: its own, with composed accents, inside its folder.
 
-    Photos and masks keep their folders; other files keep only the last path component.
+    Cameras and regions refer to photos and masks by their names, so these keep all characters and their folders. Other
+    files keep only the last path component, and less of it if a file system may not hold it.
+
+    Args:
+        role: Role of the input.
+        name: Name that the user gave it, with slashes or backslashes between folders.
+        number: Number of the input, for one without a name.
+
+    Raises:
+        RefusedInputError: If a photo or mask cannot keep its name.
     """
-    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..", ".")]
-    stripped = [_last_bytes(re.sub(r"[^\w .+@,=()-]+", "_", part)).strip() for part in parts]
-    cleaned = [part if not part.startswith(".") else f"_{part[1:]}" for part in stripped if part]
+    parts = PurePosixPath(unicodedata.normalize("NFC", name).replace("\\", "/")).parts
+    given = [part for part in parts if part not in ("/", "..", ".")]
+    safe = [*filter(None, map(_safe, given))]
     if role not in _FOLDER_ROLES:
-        cleaned = cleaned[-1:]
-    fallbacks = {"scene": "scene.ply", "style": "style", "cameras": "cameras.json", "mask": "mask.bin"}
-    fallback = fallbacks.get(role, f"photo_{number}")
-    return "/".join(cleaned[-_MAX_DEPTH:]) or fallback
+        safe = safe[-1:]
+    elif safe != given or len(given) > _MAX_DEPTH:
+        raise RefusedInputError(
+            f"The name {ascii(name)[:200]} of {role!r} has more than {_MAX_DEPTH} parts, or a part that starts with a "
+            f"dot, has more than {_MAX_NAME} bytes, is not UTF-8 or holds control characters. Rename the file.",
+            "invalid-request",
+            input=role,
+        )
+    return "/".join(safe) or _FALLBACKS.get(role, f"photo_{number}")
 
 
-def _last_bytes(part: str) -> str:
-    return part.encode()[-_MAX_NAME:].decode(errors="ignore")
+def _safe(part: str) -> str:
+    """Return a path component itself if a file system can hold it and shows it, else plain characters from its end."""
+    if not part.startswith(".") and not _UNFIT.search(part) and len(part.encode()) <= _MAX_NAME:
+        return part
+    plain = re.sub(r"[^\w .+@,=()-]+", "_", part).encode()[-_MAX_NAME // 2 :].decode(errors="ignore").strip()
+    return f"_{plain[1:]}" if plain.startswith(".") else plain
 
 
 def default_job_name(inputs: Sequence[Mapping[str, Any]]) -> str:
@@ -85,14 +109,14 @@ def default_job_name(inputs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def region_styles(regions: Sequence[RegionRequest]) -> list[str]:
-    """Return the cleaned names of the style files of regions."""
-    return [clean_name("style", str(file.path), 0) for region in regions for file in region.styles]
+    """Return the staged names of the style files of regions."""
+    return [staged_name("style", str(file.path)) for region in regions for file in region.styles]
 
 
 def region_mask(region: RegionRequest) -> Path | None:
     """Return the staged path of a region's mask or folder of masks; None if it is selected in another way."""
     path = region.selection and region.selection.path
-    return Path("mask", clean_name("mask", str(path), 0)) if path else None
+    return Path("mask", staged_name("mask", str(path))) if path else None
 
 
 def check_roles(
@@ -237,7 +261,7 @@ def layout(inputs: Sequence[Mapping[str, Any]]) -> tuple[Staged, list[tuple[Path
     """Return the staged paths by role, and the path and SHA-256 of each file.
 
     Args:
-        inputs: Inputs with `role`, `name` (from `clean_name`) and `sha256`.
+        inputs: Inputs with `role`, `name` (from `staged_name`) and `sha256`.
     """
     scene = Path()
     styles: list[Path] = []

@@ -49,6 +49,7 @@ from sgsst_core.files.blending import blend_scenes, encode_blend
 from sgsst_core.files.cache_folder import cache_folder
 from sgsst_core.files.formats import format_of_name, read_scene_header
 from sgsst_core.files.images import image_size, load_image
+from sgsst_core.files.photos import check_names
 from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
@@ -161,6 +162,8 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     with _errors_of("style"):
         check_style_size(style, cameras, settings.style_scale)
     with _errors_of("photos"):
+        if staged.photos is not None:
+            check_names(staged.photos, capture.names)
         capture = capture.with_photos(staged.photos)
         for photo in capture.photos or []:
             _check_pixel_count(photo.path, limits)
@@ -170,8 +173,11 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         capture = capture.checked(file.scene, source.near)
         findings |= {"views": len(capture.cameras), "pixels": _pixels(capture.cameras)}
     with _errors_of("mask"):
-        for path in _mask_images(job.regions):
-            _check_pixel_count(path, limits)
+        for folder in _mask_folders(job.regions):
+            check_names(folder, capture.names, masks=True)
+            for path in sorted(folder.rglob("*")):
+                if path.is_file():
+                    _check_pixel_count(path, limits)
     with _errors_of("regions"):
         regions = read_regions(job, file, capture.cameras)
     decisions = (*about_notes(file), *about_axes, *about_rendering(file), *capture.decisions)
@@ -179,11 +185,10 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     return findings, _Inputs(file.scene, capture, style, regions)
 
 
-def _mask_images(regions: Sequence[RegionRequest]) -> list[Path]:
-    """Return the files in the mask folders of regions."""
+def _mask_folders(regions: Sequence[RegionRequest]) -> list[Path]:
+    """Return the folders of mask images of regions."""
     selections = [region.selection for region in regions if region.selection and region.selection.kind == "masks"]
-    folders = [selection.path for selection in selections if selection.path]
-    return [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
+    return [selection.path for selection in selections if selection.path]
 
 
 def _pixels(cameras: Sequence[Camera]) -> int:

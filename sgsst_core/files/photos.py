@@ -89,6 +89,17 @@ class PhotoFolder:
         paths = self._best(self._folded, PurePosixPath(str(stem).casefold()), wanted.suffix)
         return paths if len(paths) == 1 else []
 
+    def strangers(self, names: Collection[str]) -> list[str]:
+        """Return the paths of files with the name of no camera, in any folder and case; hidden files are left out."""
+        found: set[Path] = set()
+        for name in names:
+            wanted = PurePosixPath(name.replace("\\", "/")).name
+            stem = str(self._without_extension(PurePath(wanted)))
+            for index, key in ((self._folded, stem.casefold()), (self._masks, wanted), (self._masks, stem)):
+                found.update(index.get(_normalized(PurePath(key)).parts, ()))
+        others = (path for path in sorted(self._folder.rglob("*")) if path.is_file() and path not in found)
+        return [path.relative_to(self._folder).as_posix() for path in others if not path.name.startswith(".")]
+
     def unreadable(self, names: Collection[str]) -> list[str]:
         """Return the suffixes of files that have these names of cameras, but no suffix of an image."""
         stems = {self._without_extension(PurePosixPath(name.replace("\\", "/"))).name for name in names}
@@ -157,6 +168,22 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
             f"(such as {first}). {by_name}"
         )
     return [_fitting(paths[0], camera) if paths else None for camera, paths in zip(cameras, matches, strict=True)]
+
+
+def check_names(folder: Path, names: Sequence[str], *, masks: bool = False) -> None:
+    """Check that every file of a folder has the name of a camera (see `PhotoFolder`).
+
+    The command line reads what it needs of a folder. Who sends files to the service means all of them.
+
+    Raises:
+        ImageError: If a file belongs to no camera.
+    """
+    strangers = PhotoFolder(folder, masks=masks).strangers(names)
+    if strangers:
+        raise ImageError(
+            f"{some_names(strangers)}: {len(strangers)} of the {'masks' if masks else 'photos'} have the name of none "
+            f"of {len(names)} cameras: {some_names(names)}. Name them as the cameras do, or leave them out."
+        )
 
 
 def some_names(names: Sequence[str]) -> str:

@@ -77,6 +77,10 @@ def test_photos_of_another_size_and_missing_ones_are_reported(tmp_path: Path) ->
         "photos: warning: 1 of 3 views are left out: they have no photo: view_1",
         "photos: 2 are resized to their views: they have other sizes, such as 128x96 instead of 64x48",
     ]
+    (photos / "view_7.png").write_bytes((photos / "view_2.png").read_bytes())
+    assert "photos: 1 files are not used: they have the name of no camera: view_7.png" in lines(
+        capture.with_photos(photos)
+    )
     (photos / "view_2.png").unlink()
     with pytest.raises(ImageError, match="no photo for 2 of 3 views: view_1, view_2"):
         capture.with_photos(photos)

@@ -15,7 +15,7 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.fetching import file_name, is_url
-from api.http.input_references import input_entry, parse_reference
+from api.http.input_references import input_entry, parse_reference, uploaded_name
 from api.http.multipart import (
     BodyTypeError,
     NotUtf8Error,
@@ -65,7 +65,7 @@ from service.errors import (
     UnknownUploadError,
 )
 from service.examples import JOB_ID
-from service.files.staging import check_roles, clean_name, default_job_name
+from service.files.staging import check_roles, default_job_name, staged_name
 from service.inspection.inspector import Show
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
@@ -288,11 +288,11 @@ def _resolve_inputs(
         upload = uploads.get(text)
         if upload is None:
             raise UnknownUploadError(text, role)
-        resolved.append((upload.filename, _upload_digest(context, upload, role)))
+        resolved.append((uploaded_name(upload.metadata_header), _upload_digest(context, upload, role)))
     digests = {sha256 for _, sha256 in resolved} | {entry["sha256"] for entry in inputs}
     rows = context.store.inputs.hold(sorted(filter(None, digests)))
     for number, ((index, role, _), (filename, sha256)) in enumerate(zip(received.uploads, resolved, strict=True)):
-        name = clean_name(role, filename, number)
+        name = staged_name(role, filename, number)
         # Keep the order of the request: style weights follow the order of the styles.
         size = rows[sha256].size if sha256 else 0
         inputs.insert(index, {"role": role, "name": name, "sha256": sha256, "size": size})

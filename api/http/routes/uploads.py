@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from types import MappingProxyType
@@ -13,6 +12,7 @@ from fastapi import APIRouter, Depends, Header, Path, Request, Response
 
 from api.http.context import CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
+from api.http.input_references import uploaded_name
 from api.http.multipart import BadRequestError, BodyTypeError, TooSlowError, body_blocks, check_media_type
 from api.http.numbers import Digits
 from api.http.receiving import ALGORITHMS, ChecksumError, LongerThanDeclaredError, append_body, parse_checksum
@@ -32,7 +32,7 @@ from service.errors import (
     TooManyUploadsError,
 )
 from service.examples import UPLOAD_ID
-from service.files.staging import clean_name
+from service.files.staging import staged_name
 from service.store.inputs import check_offset
 from service.store.tables import UploadRow
 
@@ -174,7 +174,7 @@ def create_upload(
     if not length:
         raise EmptyFileError
     context.blobs.ensure_space(length)
-    name = clean_name("photos", _file_name(metadata), 0)[-200:]
+    name = staged_name("upload", uploaded_name(metadata))
     seconds = context.settings.upload_hours * 3600
     row = context.store.inputs.create_upload(
         caller.owner, length, name, metadata, seconds, idempotency_key, caller.quotas
@@ -326,18 +326,6 @@ def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
     if not is_id(upload_id):
         raise NoUploadError(upload_id[:60])
     return context.store.inputs.upload(upload_id, owner)
-
-
-def _file_name(metadata: str) -> str:
-    """Return the decoded `filename` of an `Upload-Metadata` header, which has the format `key base64, key base64`."""
-    for pair in metadata.split(","):
-        key, _, value = pair.strip().partition(" ")
-        if key in ("filename", "name"):
-            try:
-                return base64.b64decode(value, validate=True).decode()
-            except ValueError as error:  # raised for non-ASCII characters too
-                raise BadRequestError(f"Upload-Metadata: {key!r} is not base64 of UTF-8.") from error
-    return ""
 
 
 def _http_date(seconds: float) -> str:

@@ -10,6 +10,7 @@ import re
 import socket
 import struct
 import time
+import unicodedata
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -336,6 +337,52 @@ def test_masks_select_regions(client: httpx.Client, files: dict[str, bytes]) -> 
     assert (sent.content, sent.headers["content-type"]) == (LEFT, "application/octet-stream")
 
 
+#: Names that a plain form would change, two of which would then be the same, each as a camera and as a file has it.
+PHOTOS = {
+    "v#3.png": "v#3.png",
+    "v%3.png": "v%3.png",
+    "100%25 a b.jpg": "100%25 a b.png",
+    "cam;0/v&1.png": "images/cam;0/v&1.png",
+    "cam;1/v&1.png": "images/cam;1/v&1.png",
+    "caf\u00e9.png": "cafe\u0301.png",
+}
+
+
+def test_photos_and_masks_keep_the_names_of_cameras(client: httpx.Client, files: dict[str, bytes]) -> None:
+    """A dry run uses every photo and mask. One that belongs to no camera is refused, however it is sent."""
+    views = json.loads(files["cameras"])
+    named = [{**views[index % len(views)], "id": index, "img_name": name} for index, name in enumerate(PHOTOS)]
+    image = io.BytesIO()
+    Image.new("L", (64, 48), 255).save(image, "PNG")
+    parts = form({**files, "cameras": json.dumps(named).encode()})
+    photos = [("photos", (name, image.getvalue())) for name in PHOTOS.values()]
+    masks = [("mask", (f"m#1/{name}", image.getvalue())) for name in PHOTOS.values()]
+    regions = {"regions": [{"name": "a", "select": "masks=m#1", "weight": 2}], "preset": "preview"}
+    data = {"parameters": json.dumps(regions)}
+    good = client.post("/v1/jobs?dry_run=true", files=[*parts, *photos, *masks], data=data)
+    assert good.status_code == 200, good.text
+    assert good.json()["photos"] == len(PHOTOS)
+    assert "616 of 616 Gaussians" in good.text
+    job = client.post("/v1/jobs", files=[*parts, *photos, *masks], data=data).json()
+    listed = client.get(f"/v1/jobs/{job['id']}/inputs").json()["inputs"]
+    names = [unicodedata.normalize("NFC", name) for name in PHOTOS.values()]
+    assert [entry["name"] for entry in listed if entry["role"] == "photos"] == names
+
+    uploads = [upload(client, image.getvalue(), name) for name in PHOTOS.values()]
+    stored = {role: f"/v1/jobs/{job['id']}/inputs/{role}" for role in ("scene", "style", "cameras")}
+    body = {**stored, "cameras": [stored["cameras"]], "photos": uploads}
+    assert client.post("/v1/jobs", json=body).status_code == 202
+    stray = upload(client, image.getvalue(), "v_3.png")
+    problem = refused(client.post("/v1/jobs", json={**body, "photos": [*uploads, stray]}), 422, "invalid-image")
+    assert "v_3.png: 1 of the photos" in problem["detail"]
+    stray_mask = ("mask", ("m#1/v_3.png", image.getvalue()))
+    problem = refused(client.post("/v1/jobs", files=[*parts, *masks, stray_mask], data=data), 422, "invalid-image")
+    assert "v_3.png: 1 of the masks" in problem["detail"]
+    for name in ("a\x01.png", ".hidden.png", "a" * 300 + ".png", "d/" * 9 + "a.png"):
+        sent = client.post("/v1/jobs", json={**body, "photos": [upload(client, image.getvalue(), name)]})
+        assert "Rename the file" in refused(sent, 422, "invalid-request")["detail"]
+
+
 @pytest.mark.parametrize(
     ("select", "name", "content", "code", "detail"),
     [
@@ -349,7 +396,7 @@ def test_masks_select_regions(client: httpx.Client, files: dict[str, bytes]) -> 
         ("sphere=0,0,0,1", "m.bin", WHOLE, "invalid-request", "'m.bin' belongs to no region"),
         ("masks=m", "m/view_0.png", b"no image", "invalid-image", "m/view_0.png: is not an image"),
         ("masks=m", "m/view_0.png", png(2**31 - 1, 2**31 - 1, b""), "invalid-image", "m/view_0.png"),
-        ("masks=m", "m/nowhere.png", png(4, 3, zlib.compress(bytes(3 * 13))), "invalid-image", "holds no mask for any"),
+        ("masks=m", "m/nowhere.png", png(4, 3, zlib.compress(bytes(3 * 13))), "invalid-image", "none of 3 cameras"),
         ("masks=m", "m/view_0.png", png(4, 9, zlib.compress(bytes(9 * 13))), "invalid-image", "another aspect ratio"),
         ("mask=m.bin", "m.bin", WHOLE, "invalid-settings", "Every Gaussian is frozen (a)"),
     ],

@@ -43,7 +43,12 @@ VALUES = [
     Decision("ranks", "2", "measured", seconds=0.1),
     Outputs(Path("out/s.ply")),
     Capture(
-        [], None, [(640, 480)], [Photo(Path("a.jpg"), (640, 480), oriented=True)], (Decision("axes", "rub", "seen"),)
+        [],
+        None,
+        ("a",),
+        [(640, 480)],
+        [Photo(Path("a.jpg"), (640, 480), oriented=True)],
+        (Decision("axes", "rub", "seen"),),
     ),
     radial_lens("OPENCV", (0.1, -0.02), (640, 480), (500.0, 500.0, 320.0, 240.0)),
     Prediction(1.0, 2.0, 3),
