@@ -278,6 +278,12 @@ class ConflictError(ServiceError):
     code, status = "conflict", 409
 
 
+class ChangedMeanwhileError(ConflictError):
+    """Operation on rows that another request has deleted or created at the same time."""
+
+    message = "Another request has changed or deleted this meanwhile. Look at its state, and try again."
+
+
 class CancelError(ConflictError):
     """Job that has already ended in another way."""
 

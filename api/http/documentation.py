@@ -22,7 +22,14 @@ from api.http.problems import (
     TooManyConnectionsError,
     from_service,
 )
-from service.errors import DatabaseBusyError, DatabaseUnavailableError, RateLimitError, RefusedInputError, ServiceError
+from service.errors import (
+    ChangedMeanwhileError,
+    DatabaseBusyError,
+    DatabaseUnavailableError,
+    RateLimitError,
+    RefusedInputError,
+    ServiceError,
+)
 from service.examples import JOB_ID, SHA256
 
 Responses = dict[int | str, dict[str, Any]]
@@ -90,6 +97,7 @@ _ANYWHERE = (
     TooManyConnectionsError,
     DatabaseUnavailableError,
     DatabaseBusyError,
+    ChangedMeanwhileError,
 )
 _WITH_KEY = (RateLimitError, NoKeyError, ForeignSiteError, CrossOriginError)
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from service.errors import NoArtifactError, NotFoundError, TooManyBlendsError
+from service.errors import LostFileError, NoArtifactError, NotFoundError, TooManyBlendsError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
@@ -113,7 +113,11 @@ class DerivedFiles:
                 task = asyncio.ensure_future(derive())
                 self._tasks[job.id, name] = task
                 task.add_done_callback(lambda done: self._tasks.pop((job.id, name), None))
-            await asyncio.shield(task)
+            try:
+                await asyncio.shield(task)
+            except LostFileError:
+                await asyncio.to_thread(self._result, job.id)  # fails if the job was deleted meanwhile
+                raise
             row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
         if row is None:
             raise NotFoundError(f"The results of job {job.id} are gone.")
@@ -172,7 +176,7 @@ class DerivedFiles:
 
     def _stage(self, folder: Path, job: JobRow, results: list[ArtifactRow]) -> Staged:
         """Stage the job's inputs, with results beside them."""
-        rows = self._store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
+        rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in job.inputs}))
         staged = stage(folder, job.inputs, self._blobs.fetch(rows, folder))
         for result in results:
             self._artifacts.fetch(result.location, folder / _staged_name(job, result), result.sha256)

@@ -151,7 +151,7 @@ class VideoMaker:
 
     def _stage(self, folder: Path, job: JobRow, result: ArtifactRow) -> Staged:
         """Stage the job's inputs, with the result beside them."""
-        rows = self._store.inputs.blobs(sorted({entry["sha256"] for entry in job.inputs}))
+        rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in job.inputs}))
         staged = stage(folder, job.inputs, self._blobs.fetch(rows, folder))
         self._artifacts.fetch(result.location, folder / RESULT, result.sha256)
         return staged

@@ -1,6 +1,7 @@
 """Changes to a job's rows that both users and dispatchers make: its status, its events, and its end.
 
-All functions run within the caller's transaction.
+All functions run within the caller's transaction. Every transaction takes its locks in one order, so that no two wait
+for each other: the owner's limits, uploads by id, jobs by id, then the rows of each job, blobs by digest, counters.
 """
 
 from __future__ import annotations
@@ -10,12 +11,28 @@ from typing import Any
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
+from service.errors import NoJobError
 from service.store.clocks import retained_until
 from service.store.database import count, new_id
 from service.store.states import JobStatus, Transition, next_status
 from service.store.tables import Base, BlobRow, BlobUseRow, DeliveryRow, EventRow, JobRow
 
 _EVENTS = Base.metadata.tables[EventRow.__tablename__]
+
+
+def job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
+    """Return a job of this owner, or of any owner if None.
+
+    Args:
+        lock: Whether to lock the row. Whoever adds rows that refer to the job does so first; it is then not deleted.
+
+    Raises:
+        NoJobError: If there is no such job or it belongs to another owner.
+    """
+    job = session.get(JobRow, job_id, with_for_update=lock, populate_existing=lock)
+    if job is None or (owner is not None and job.owner != owner):
+        raise NoJobError(job_id)
+    return job
 
 
 def move(session: Session, job: JobRow, transition: Transition, now: float) -> None:

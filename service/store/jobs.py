@@ -11,7 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.errors import CancelError, DeleteError, FinishError, NoJobError, NotFoundError, QueueFullError, RetryError
-from service.store.changes import add_status_event, end, forget, holder_name, move
+from service.store.changes import add_status_event, end, forget, holder_name, job_of_owner, move
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import Point, points
 from service.store.inputs import close_receipt
@@ -148,7 +148,7 @@ class Jobs:
             NoJobError: If there is no such job or it belongs to another owner.
         """
         with self._database.reading() as session:
-            return _job_of_owner(session, job_id, owner)
+            return job_of_owner(session, job_id, owner)
 
     def detail(self, job_id: str, owner: str | None) -> tuple[JobRow, int | None, list[AttemptRow], str | None]:
         """Return a job, its queue position, its attempts, and the name of its newest preview, all in one snapshot.
@@ -199,7 +199,7 @@ class Jobs:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            job = _job_of_owner(session, job_id, owner, lock=True)
+            job = job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.FINISH):
                 raise FinishError(job.status)
             if job.status in ACTIONS[Transition.FINISH]:
@@ -217,7 +217,7 @@ class Jobs:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            job = _job_of_owner(session, job_id, owner, lock=True)
+            job = job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.CANCEL):
                 raise CancelError(job.status)
             if job.status in ACTIONS[Transition.CANCEL]:
@@ -239,8 +239,8 @@ class Jobs:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            lock_owner(session, _job_of_owner(session, job_id, owner).owner)
-            job = _job_of_owner(session, job_id, owner, lock=True)
+            lock_owner(session, job_of_owner(session, job_id, owner).owner)
+            job = job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.RETRY):
                 raise RetryError(job.status)
             _check_queue(session, job.owner, limit)
@@ -259,7 +259,7 @@ class Jobs:
             NoJobError: If there is no such job or it belongs to another owner.
         """
         with self._database.writing() as session:
-            _job_of_owner(session, job_id, owner, lock=True).name = name
+            job_of_owner(session, job_id, owner, lock=True).name = name
 
     def delete(self, job_id: str, owner: str | None) -> list[str]:
         """Delete an ended job and release its inputs; the caller removes its results afterwards.
@@ -271,7 +271,7 @@ class Jobs:
             DeleteError: If the job has not ended.
         """
         with self._database.writing() as session:
-            job = _job_of_owner(session, job_id, owner, lock=True)
+            job = job_of_owner(session, job_id, owner, lock=True)
             if job.status not in ENDED:
                 raise DeleteError(job.status)
             return forget(session, job)
@@ -314,7 +314,8 @@ class Jobs:
         unused = []
         with self._database.writing() as session:
             lock_owner(session, owner)
-            row = session.get(ArtifactRow, (source.job_id, source.name), with_for_update=True)
+            session.get(JobRow, source.job_id, with_for_update=True)  # before its files, as everybody else
+            row = session.get(ArtifactRow, (source.job_id, source.name))
             for file in files:
                 existing = session.get(ArtifactRow, (source.job_id, file.name))
                 if row is None or row.location != source.location or (existing is not None and not replace):
@@ -376,13 +377,6 @@ def _check_queue(session: Session, owner: str, limit: int) -> None:
     """Raise QueueFullError if an owner has `limit` unfinished jobs."""
     if session.execute(_UNFINISHED_OF, {"owner": owner}).scalar_one() >= limit:
         raise QueueFullError(limit)
-
-
-def _job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
-    job = session.get(JobRow, job_id, with_for_update=lock, populate_existing=lock)
-    if job is None or (owner is not None and job.owner != owner):
-        raise NoJobError(job_id)
-    return job
 
 
 def _newest_previews(connection: Connection, job_ids: Sequence[str]) -> dict[str, str]:

@@ -187,7 +187,7 @@ class Leases:
         until = self._database.clock() + self._seconds
         statuses: dict[str, JobStatus | None] = {}
         with self._database.writing() as session:
-            for lease in leases:
+            for lease in sorted(leases, key=lambda each: each.job_id):
                 job = self._leased_job(session, lease)
                 if job is not None:
                     job.lease_expires_at = until

@@ -1,4 +1,4 @@
-"""Handling of a database that is down or locked: waits are bounded, and callers get `DatabaseUnavailableError`."""
+"""Errors of the database that are no bugs: it is down or locked, or another transaction has removed a row."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import DBAPIError, InterfaceError, NoResultFound, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from service.errors import DatabaseBusyError, DatabaseUnavailableError
+from service.errors import ChangedMeanwhileError, DatabaseBusyError, DatabaseUnavailableError
 
 #: Time in seconds that a transaction waits for a probing transaction before it is rejected.
 _PROBE_SECONDS = 0.2
@@ -19,6 +19,8 @@ _SQLITE_BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED")
 _SQLITE_AWAY = ("SQLITE_CANTOPEN", "SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY")
 #: Classes of PostgreSQL errors for conflicting transactions.
 _POSTGRESQL_BUSY = ("40", "55")
+#: Names of SQLite's and codes of PostgreSQL's errors for rows that refer to a missing one or exist already.
+_CHANGED = (*(f"SQLITE_CONSTRAINT_{each}" for each in ("FOREIGNKEY", "PRIMARYKEY", "UNIQUE")), "23503", "23505")
 
 
 class Gate:
@@ -61,11 +63,18 @@ class Gate:
 
 @contextmanager
 def translated() -> Iterator[None]:
-    """Convert errors of an outage to `DatabaseUnavailableError`; other errors are raised unchanged."""
+    """Convert errors of an outage, and of rows that another transaction has removed or added; others are unchanged.
+
+    Raises:
+        DatabaseUnavailableError: If the database is down or locked.
+        ChangedMeanwhileError: If a row that this transaction refers to is gone, or one that it adds is there.
+    """
     try:
         yield
     except PoolTimeoutError as error:
         raise DatabaseBusyError from error
+    except NoResultFound as error:
+        raise ChangedMeanwhileError from error
     except DBAPIError as error:
         refusal = _refusal(error)
         if refusal is None:
@@ -73,12 +82,14 @@ def translated() -> Iterator[None]:
         raise refusal from error
 
 
-def _refusal(error: DBAPIError) -> DatabaseUnavailableError | None:
+def _refusal(error: DBAPIError) -> DatabaseUnavailableError | ChangedMeanwhileError | None:
     """Convert a driver's error to an exception for callers; return None if the error is a bug of the service."""
     sqlite: str | None = getattr(error.orig, "sqlite_errorname", None)
     sqlstate: str = getattr(error.orig, "sqlstate", None) or ""
     if (sqlite or "").startswith(_SQLITE_BUSY) or sqlstate.startswith(_POSTGRESQL_BUSY):
         return DatabaseBusyError()
+    if sqlite in _CHANGED or sqlstate in _CHANGED:
+        return ChangedMeanwhileError()
     away = isinstance(error, OperationalError | InterfaceError) if sqlite is None else sqlite.startswith(_SQLITE_AWAY)
     if not away and not error.connection_invalidated:
         return None

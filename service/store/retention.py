@@ -45,7 +45,8 @@ class Retention:
         clock = self._database.clock()
         with self._database.writing() as session:
             now = expiry_time(session, clock)
-            due = session.scalars(select(JobRow).where(JobRow.expires_at < now).limit(100).with_for_update()).all()
+            old = select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
+            due = session.scalars(old.with_for_update(skip_locked=True)).all()
             for job in due:
                 if job.status == JobStatus.EXPIRED:
                     forget(session, job)

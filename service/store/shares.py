@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 from sqlalchemy import delete, func, select
 
-from service.errors import NoJobError, NoShareError, ShareError, TooManySharesError
+from service.errors import NoShareError, ShareError, TooManySharesError
+from service.store.changes import job_of_owner
 from service.store.clocks import expiry_time
 from service.store.database import Database, new_id
 from service.store.keys import digest
-from service.store.quotas import lock_owner
 from service.store.states import JobStatus
 from service.store.tables import JobRow, KeyRow, ShareRow
 
@@ -50,10 +50,7 @@ class Shares:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            lock_owner(session, owner)
-            job = session.get(JobRow, job_id)
-            if job is None or job.owner != owner:
-                raise NoJobError(job_id)
+            job = job_of_owner(session, job_id, owner, lock=True)  # which a deletion then waits for
             if job.status != JobStatus.SUCCEEDED:
                 raise ShareError(job.status)
             of_job = ShareRow.job_id == job_id
@@ -101,7 +98,7 @@ class Shares:
             # compared in constant time, so that the time of the answer tells nothing about the digest
             if row is None or not hmac.compare_digest(row.sha256, digest(token)):
                 raise NoShareError
-            job = session.get_one(JobRow, row.job_id)
+            job = session.get_one(JobRow, row.job_id)  # both are of one snapshot
             key = session.get(KeyRow, job.owner)
             revoked = key is not None and key.revoked_at is not None
             if row.expires_at <= self._database.clock() or job.status != JobStatus.SUCCEEDED or revoked:

@@ -91,13 +91,13 @@ class PhotoFolder:
 
     def strangers(self, names: Collection[str]) -> list[str]:
         """Return the paths of files with the name of no camera, in any folder and case; hidden files are left out."""
-        found: set[Path] = set()
+        matching: set[Path] = set()
         for name in names:
             wanted = PurePosixPath(name.replace("\\", "/")).name
             stem = str(self._without_extension(PurePath(wanted)))
             for index, key in ((self._folded, stem.casefold()), (self._masks, wanted), (self._masks, stem)):
-                found.update(index.get(_normalized(PurePath(key)).parts, ()))
-        others = (path for path in sorted(self._folder.rglob("*")) if path.is_file() and path not in found)
+                matching.update(index.get(_normalized(PurePath(key)).parts, ()))
+        others = (path for path in sorted(self._folder.rglob("*")) if path.is_file() and path not in matching)
         return [path.relative_to(self._folder).as_posix() for path in others if not path.name.startswith(".")]
 
     def unreadable(self, names: Collection[str]) -> list[str]:

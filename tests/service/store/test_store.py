@@ -14,9 +14,17 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from sqlalchemy import func, inspect, select
+from sqlalchemy import event, func, inspect, select
 
-from service.errors import ConflictError, IdempotencyError, LeaseLostError, NotFoundError, QueueFullError, ServiceError
+from service.errors import (
+    ChangedMeanwhileError,
+    ConflictError,
+    IdempotencyError,
+    LeaseLostError,
+    NotFoundError,
+    QueueFullError,
+    ServiceError,
+)
 from service.store import Store, open_store
 from service.store.database import MIGRATIONS
 from service.store.history import GROWTH, add_point
@@ -24,7 +32,7 @@ from service.store.inputs import GRACE_SECONDS
 from service.store.jobs import Idempotency
 from service.store.leases import MAX_PROGRESS_EVENTS, Lease, Published
 from service.store.states import ACTIVE, FINISHED
-from service.store.tables import Base, ProgressPointRow
+from service.store.tables import Base, JobRow, ProgressPointRow, ShareRow
 from tests.service.store.helpers import (
     ATTEMPTS,
     LEASE,
@@ -59,6 +67,34 @@ def test_sqlite_commits_are_durable(tmp_path: Path) -> None:
         }
     assert pragmas == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}
     store.close()
+
+
+def test_detail_is_one_snapshot(store: Store) -> None:
+    """The job is returned to the queue between the statements of the query."""
+    queue(store)
+    held = lease(store)
+    released: list[str] = []
+
+    def release(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        if not released and "FROM jobs" in statement:
+            released.append(statement)
+            store.leases.release(held)
+
+    event.listen(store.database.engine, "after_cursor_execute", release)
+    job, position, attempts, _ = store.jobs.detail(held.job_id, None)
+    event.remove(store.database.engine, "after_cursor_execute", release)
+    assert released
+    assert (job.status, position, attempts[0].outcome) == ("starting", None, None)
+    job, position, attempts, _ = store.jobs.detail(held.job_id, None)
+    assert (job.status, position, attempts[0].outcome) == ("queued", 1, "released")
+
+
+def test_rows_that_vanish_are_conflicts(store: Store) -> None:
+    """A row that refers to a missing one, or that is missing itself, is decided in one place."""
+    with pytest.raises(ChangedMeanwhileError), store.database.writing() as session:
+        session.add(ShareRow(id="shr_1", job_id="job_1", sha256="0" * 64, created_at=0.0, expires_at=1.0))
+    with pytest.raises(ChangedMeanwhileError), store.database.reading() as session:
+        session.get_one(JobRow, "job_1")
 
 
 def test_idempotency_key_creates_one_job(store: Store) -> None:
