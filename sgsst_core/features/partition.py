@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from torch import Tensor
 
@@ -194,6 +195,7 @@ def computed_twice(areas: Sequence[int], cached: Sequence[bool]) -> int:
 TILE_SIZES = (64, 128, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 
 
+@lru_cache(maxsize=1 << 14)  # plans and steps ask for the same views again and again
 def choose_tile_size(
     height: int,
     width: int,
@@ -220,11 +222,16 @@ def choose_tile_size(
         largest: Maximum pixels of a tile; None for no limit.
     """
 
+    def areas_of(size: int | None) -> list[int]:
+        return [tile.outer.pixels for tile in partition(height, width, size, halo, region)]
+
     def work(size: int | None) -> float:
-        areas = [tile.outer.pixels for tile in partition(height, width, size, halo, region)]
+        areas = areas_of(size)
         area = max(areas, default=0)
         if size != TILE_SIZES[0] and (area * (1 + working) > held or area > (largest or area)):
             return math.inf
         return 2 * sum(areas) + computed_twice(areas, cached_tiles(areas, held, working))
 
+    if work(None) == 2 * sum(areas_of(None)):  # nothing is computed twice, and several tiles only add halos
+        return None
     return min((None, *TILE_SIZES), key=work)
