@@ -18,6 +18,10 @@ from tests.sgsst_core.synthetic_images import synthetic_image
 WIDTH, HEIGHT = 64, 48
 
 
+#: Content of a file that Git LFS did not download.
+LFS_POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 12345\n"
+
+
 def wall(columns: int = 28, rows: int = 22, sh_degree: int = 0) -> Scene:
     """Return a wall of flat Gaussians at z = 3 that fills every view of `cameras`."""
     generator = torch.Generator().manual_seed(5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +13,11 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.images import WHITE, Color
-from sgsst_core.files.photos import Photo, PhotoFolder, check_photos, photo_size, some_names
+from sgsst_core.files.photos import MOST_MISSING, Photo, PhotoFolder, check_photos, photo_size, some_names
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
-from sgsst_core.planning.capture_checks import compare_photos, frame_warnings, shown_by
+from sgsst_core.planning.capture_checks import compare_photos, frame_warnings
+from sgsst_core.planning.shown import shown_by
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.lens import undistorted
@@ -25,6 +27,7 @@ from worker.request import SceneRequest
 
 #: Axes of an SPZ scene are those under which a typical view shows this many times as many Gaussians.
 _CLEARLY_MORE = 2.0
+_PERHAPS_NOT_ALL = "warning: they may not be all"
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,9 @@ class Capture:
         lines = [*_about_undistorted(cameras, min(widths, default=1.0)), *_about_photos(sizes, photos, missing)]
         if strangers := PhotoFolder(folder).strangers(self.names):
             reason = f"they have the name of no camera: {some_names(strangers)}"
-            lines.append(Decision("photos", f"{len(strangers)} files are not used", reason))
+            mostly = len(strangers) > MOST_MISSING * (len(strangers) + len(photos))
+            text = f"{'warning: ' if mostly else ''}{len(strangers)} files are not used"
+            lines.append(Decision("photos", text, reason))
         return Capture(cameras, self.orbit, self.names, sizes, photos, (*self.decisions, *lines))
 
     def checked(self, scene: Scene, near: float) -> Capture:
@@ -105,18 +110,20 @@ def read_capture(source: SceneRequest, scene: Scene, images: Path | None = None)
         CameraError: If the cameras cannot be used.
     """
     orbit = None
+    notes: list[str] = []
     if source.cameras is None:
         orbit = make_orbit(scene, orbit_request(source))
         cameras = list(orbit.cameras)
     else:
-        cameras = read_cameras(source.cameras, images)
+        cameras = read_cameras(source.cameras, images, notes.append)
     names = tuple(camera.name for camera in cameras)
     if source.views is not None:
         cameras = spread(cameras, source.views)
     sizes = [photo_size(camera) for camera in cameras]
     if source.resolution is not None:
         cameras = [resized(camera, source.resolution) for camera in cameras]
-    return Capture(cameras, orbit, names, sizes)
+    decisions = tuple(Decision("cameras", _PERHAPS_NOT_ALL, note) for note in notes)
+    return Capture(cameras, orbit, names, sizes, decisions=decisions)
 
 
 def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAxes, list[Decision]]:
@@ -133,7 +140,7 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
         header = read_scene_header(source.scene)
         if not isinstance(header, SpzHeader) or header.extended or header.stated_axes is not None:
             return requested, []
-        cameras = read_cameras(source.cameras, images)
+        cameras = read_cameras(source.cameras, images, lambda note: None)  # `read_capture` reports the notes
         means = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene.means
     except (SceneError, CameraError):
         return requested, []
@@ -232,6 +239,10 @@ def _about_photos(sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], mis
         lines.append(
             Decision("photos", f"{len(other)} are resized to their views", f"they have other sizes, such as {shapes}")
         )
+    shared = [path.name for path, count in Counter(photo.path for photo in photos).items() if count > 1]
+    if shared:
+        text = f"warning: {len(shared)} belong to several cameras each, of which they can show one"
+        lines.append(Decision("photos", text, f"the names of these cameras are the same: {some_names(shared)}"))
     oriented = [photo for photo in photos if photo.oriented]
     if oriented:
         reason = f"without it they do not have the shapes of their cameras, such as {oriented[0].path.name}"

@@ -24,7 +24,8 @@ from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
 from sgsst_core.orbit.choice import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.survey import nothing_seen, sees_something
+from sgsst_core.planning.shown import nothing_seen
+from sgsst_core.planning.survey import sees_something
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera
@@ -184,14 +185,14 @@ def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> 
     return file, replace(capture, decisions=(*about_axes, *about_rendering(file), *capture.decisions))
 
 
-def check_something_seen(cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:
+def check_something_seen(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:
     """Check that at least one camera sees a Gaussian. Views are rendered until one shows a Gaussian.
 
     Raises:
         CameraError: If no camera sees a Gaussian.
     """
     if not any(sees_something(rasterizer.coverage(camera)) for camera in cameras):
-        raise nothing_seen(len(cameras))
+        raise nothing_seen(scene.means, cameras, rasterizer.near)
 
 
 def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float) -> None:
@@ -210,7 +211,7 @@ def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float
         inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
         if bool(inside.any()):
             return
-    check_something_seen(cameras, make_rasterizer("cpu", scene, near=near))
+    check_something_seen(scene, cameras, make_rasterizer("cpu", scene, near=near))
 
 
 def together(collectives: Collectives, make: Callable[[], T]) -> T:

@@ -12,7 +12,7 @@ from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.files.video import check_video_path, encoder, is_encoded, video_writer
+from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit.cameras import ELEVATION, turntable
 from sgsst_core.orbit.subject import find_subject
 from sgsst_core.orbit.up import find_up
@@ -82,7 +82,7 @@ def check_video_request(request: VideoRequest) -> None:
     for scene in (source.scene, request.unstylized):
         if scene is not None:
             check_is_not_input(out, scene)
-    check_folder(out.parent if out.suffix else out)
+    check_folder(frames_folder(out))
 
 
 def render_video(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -20,10 +21,12 @@ from api.cli.stylize_commands import demo, stylize
 from api.cli.weights_commands import weights_app
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import DISK_FULL
+from sgsst_core.files.camera_folder import CameraWarning
 from sgsst_core.options import renamed_hint
 
 #: Base of errors in the arguments, which typer does not export.
 _UsageError: Any = typer.BadParameter.__base__
+_formatted = warnings.formatwarning
 
 
 class _Program(typer.core.TyperGroup):
@@ -77,6 +80,7 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Expected errors become one message on stderr and an exit code, without a traceback."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    warnings.formatwarning = _format_warning
     try:
         _check_names(arguments)
         code = app(args=arguments, prog_name="sgsst", obj=arguments, standalone_mode=False)
@@ -123,6 +127,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         error_console.print("error: out of memory. Use a smaller --resolution, fewer --views or a --memory-limit.")
         return FAILURE
+
+
+def _format_warning(message: Warning | str, category: type[Warning], *place: Any) -> str:
+    """Return a warning about the user's cameras as a line without the place in the code that issued it."""
+    return f"warning: {message}\n" if category is CameraWarning else _formatted(message, category, *place)
 
 
 def _exit_code(error: SgsstError) -> int:

@@ -166,7 +166,7 @@ def render_views(
     file, capture = read_scene_and_capture(source)
     scene, cameras = file.scene, capture.cameras
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
-    check_something_seen(cameras, rasterizer)
+    check_something_seen(scene, cameras, rasterizer)
     for line in warnings_of(capture.decisions):
         warn(line)
     ensure_writable_folder(out)

@@ -72,7 +72,7 @@ def _render(source: SceneRequest, cameras: Sequence[Camera], background: tuple[f
     """Return the image [H, W, 3] of a scene at each camera."""
     scene = read_scene_and_capture(source)[0].scene
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
-    check_something_seen(cameras, rasterizer)
+    check_something_seen(scene, cameras, rasterizer)
     return [rasterizer.render(scene_colors(scene, camera), camera) for camera in cameras]
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from api.client.answers import RequestError
+from sgsst_core.files.camera_folder import find_cameras, issue_warning
 
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".heic", ".heif", ".hif"}
 
@@ -94,28 +95,19 @@ def different_names(paths: Sequence[Path]) -> list[str]:
 def camera_files(path: Path) -> list[Path]:
     """Return the camera files for a path: a JSON file, a COLMAP model or a folder with either.
 
-    It accepts the same paths as `sgsst stylize --cameras`.
+    It accepts the same paths as `sgsst stylize --cameras`, and issues a `CameraWarning` for a COLMAP model that is
+    smaller than one beside it.
 
     Raises:
-        RequestError: If there are none.
+        RequestError: If the path does not exist.
+        CameraError: If there are none.
     """
-    if path.is_file() and path.suffix in (".bin", ".txt") and (files := _model_files(path.parent)):
-        return files
-    if path.is_file():
-        companion = path.with_name("dataparser_transforms.json")
-        return [path, companion] if companion.is_file() and companion != path else [path]
     _check_exists(path)
-    sparse = path / "sparse"
-    numbered = sorted(sparse.glob("[0-9]*"), key=lambda model: (len(model.name), model))
-    for model in (path, sparse / "0", sparse, *numbered):
-        if files := _model_files(model):
-            return files
-    for name in ("transforms.json", "transforms_train.json", "cameras.json"):
-        if (path / name).is_file():
-            return camera_files(path / name)
-    if files := _model_files(path / "colmap" / "sparse" / "0"):
-        return files
-    raise RequestError(f"{path}: contains no cameras. Give a cameras.json, a COLMAP model or a transforms.json.")
+    found = find_cameras(path, issue_warning)
+    if found.is_dir():
+        return _model_files(found) or [path]
+    companion = found.with_name("dataparser_transforms.json")
+    return [found, companion] if companion.is_file() and companion != found else [found]
 
 
 def _model_files(folder: Path) -> list[Path]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sgsst_core.errors import CameraError
+from sgsst_core.files.lfs_pointers import POINTER, is_pointer
 
 _HEAD_BYTES = 4096
 
@@ -62,6 +63,7 @@ _ARCHIVE = "an archive. Unpack it, and give the folder with the cameras"
 
 #: Advice by the start of a file, in lower case and without a byte order mark or blanks.
 _BY_HEAD: tuple[tuple[Callable[[bytes], bool], str], ...] = (
+    (is_pointer, POINTER),
     (lambda head: head.startswith((b"<?xml", b"<document")) and b"<chunk" in head, _METASHAPE),
     (lambda head: head.startswith(b"#name,x,y,"), _REALITY_CAPTURE),
     (lambda head: b"<blocksexchange" in head, _BLOCKS_EXCHANGE),

@@ -7,7 +7,6 @@ camera with lens distortion is the pinhole with the same focal lengths and princ
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 from collections import ChainMap
@@ -21,18 +20,18 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import CameraError, ImageError
-from sgsst_core.files.camera_advice import refuse_file, refuse_folder, refuse_json
-from sgsst_core.files.colmap_model import ColmapCamera, read_model
+from sgsst_core.files.camera_advice import refuse_json
+from sgsst_core.files.camera_folder import FORMATS, find_cameras, issue_warning, load_json
+from sgsst_core.files.colmap_model import COMPARE, QUATERNION_TOLERANCE, ColmapCamera, Warn, read_model
 from sgsst_core.files.images import image_size
 from sgsst_core.files.photos import PhotoFolder
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import Lens, fisheye_lens, other_lens, radial_lens
 from sgsst_core.scene.rotations import exact_rotation
 
-#: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
-QUATERNION_TOLERANCE = 0.01
+#: Largest deviation of a size from whole pixels that is attributed to rounding: 119.99999 is 120.
+_WHOLE_TOLERANCE = 0.01
 
-_FORMATS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
 #: Distortion coefficients of transforms.json: those of a fisheye, and the others in OpenCV's order.
 _FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
 _RADIAL_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -41,8 +40,6 @@ _RADIAL_NAMES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL"
 _FISHEYE_NAMES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 #: Camera models without a focal length.
 _NO_PINHOLES = ("EQUIRECTANGULAR", "SPHERICAL", "ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
-#: Levels of subfolders that are searched for a COLMAP model, and entries per folder and folders per level.
-_SEARCHED_LEVELS, _SEARCHED_ENTRIES = 3, 100
 #: Offset of a principal point from the middle of an image, relative to half its sides, above which an image counts as
 #: resized if the file gives no sizes.
 _OFF_CENTER = 0.1
@@ -56,12 +53,10 @@ _COLMAP_RADIAL = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 _COLMAP_FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 
 
-def read_cameras(path: Path, photos: Path | None = None) -> list[Camera]:
-    """Detect the format of a camera file or folder, and read its cameras.
+def read_cameras(path: Path, photos: Path | None = None, warn: Warn | None = None) -> list[Camera]:
+    """Detect the format of a camera file or folder (see `find_cameras`), and read its cameras.
 
-    A folder may be a COLMAP sparse model, may hold such a model in sparse/0, sparse or another folder of sparse, or may
-    hold a transforms.json, transforms_train.json or cameras.json, or else a model in colmap/sparse. Cameras from JSON
-    keep their order; COLMAP's images are sorted by name.
+    Cameras from JSON keep their order; COLMAP's images are sorted by name.
 
     nerfstudio trains in a coordinate frame of its own. To match a scene exported by nerfstudio, cameras must be
     transformed by the `dataparser_transforms.json` of its training run. If that file lies beside the transforms.json,
@@ -72,69 +67,23 @@ def read_cameras(path: Path, photos: Path | None = None) -> list[Camera]:
         path: File or folder.
         photos: Folder of the photos, whose sizes cameras get if the file states none. None looks for them beside the
             file, at the paths that it states.
+        warn: Callback for cameras that may not be all; None to issue a `CameraWarning`.
 
     Raises:
         CameraError: If the file is missing, its format is unknown, it holds no cameras, a camera cannot be a pinhole,
             or a value is invalid. The message names the file and the camera.
     """
-    if path.is_dir():
-        return _read_folder(path, photos)
-    if path.suffix in (".bin", ".txt") and path.name.startswith(("cameras", "images", "points3D")):
-        return _read_colmap(path.parent)
-    content = _load_json(path)
-    refuse_json(path, content)
+    warn = warn or issue_warning
+    file = find_cameras(path, warn)
+    if file.is_dir():
+        return _read_colmap(file, warn)
+    content = load_json(file)
+    refuse_json(file, content)
     if isinstance(content, list):
-        return _convert_entries(path, content, _inria_camera)
+        return _convert_entries(file, content, _inria_camera)
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
-        return _read_transforms(path, content, photos)
-    raise CameraError(f"{path}: is in no known camera format. Give {_FORMATS}.")
-
-
-def _read_folder(folder: Path, photos: Path | None) -> list[Camera]:
-    sparse = folder / "sparse"
-    numbered = sorted(
-        (path for path in sparse.glob("[0-9]*") if path.is_dir()), key=lambda path: (len(path.name), path)
-    )
-    for model in (folder, sparse / "0", sparse, *numbered):
-        if _has_model(model):
-            return _read_colmap(model)
-    for name in ("transforms.json", "transforms_train.json", "cameras.json"):
-        if (folder / name).is_file():
-            return read_cameras(folder / name, photos)
-    if _has_model(folder / "colmap" / "sparse" / "0"):
-        return _read_colmap(folder / "colmap" / "sparse" / "0")
-    below = _model_below(folder)
-    if below:
-        raise CameraError(f"{folder}: holds no cameras, but {below} has a COLMAP model. Give that folder.")
-    refuse_folder(folder)
-    raise CameraError(f"{folder}: holds no cameras in a known format. Give {_FORMATS}.")
-
-
-def _model_below(folder: Path) -> Path | None:
-    """Return the first COLMAP model in subfolders; None if there is none among the entries that are searched."""
-    level = [folder]
-    with contextlib.suppress(OSError):
-        for _ in range(_SEARCHED_LEVELS):
-            entries = [entry for parent in level for entry in sorted(parent.iterdir())[:_SEARCHED_ENTRIES]]
-            level = [entry for entry in entries if entry.is_dir()][:_SEARCHED_ENTRIES]
-            for entry in level:
-                if _has_model(entry):
-                    return entry
-    return None
-
-
-def _has_model(folder: Path) -> bool:
-    return (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
-
-
-def _load_json(path: Path) -> Any:
-    try:
-        refuse_file(path)
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise CameraError(f"{path}: cannot be read: {error.strerror}. Check the path, or give {_FORMATS}.") from error
-    except (ValueError, RecursionError) as error:  # invalid JSON, or bytes that are not UTF-8
-        raise CameraError(f"{path}: is neither JSON nor a COLMAP model ({error}). Give {_FORMATS}.") from error
+        return _read_transforms(file, content, photos)
+    raise CameraError(f"{file}: is in no known camera format. Give {FORMATS}.")
 
 
 def _convert_entries(path: Path, entries: list[Any], convert: Any) -> list[Camera]:
@@ -145,7 +94,7 @@ def _convert_entries(path: Path, entries: list[Any], convert: Any) -> list[Camer
     for index, entry in enumerate(entries):
         where = f"{path}: camera {index}"
         if not isinstance(entry, dict):
-            raise CameraError(f"{where}: is not an object with named values. Give {_FORMATS}.")
+            raise CameraError(f"{where}: is not an object with named values. Give {FORMATS}.")
         cameras.append(convert(where, entry))
     return cameras
 
@@ -170,7 +119,8 @@ def _inria_camera(where: str, entry: Mapping[str, Any]) -> Camera:
 
 def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -> list[Camera]:
     files = PhotoFolder(photos) if photos is not None and photos.is_dir() else None
-    frame_change, common = _dataparser_change(path, content), _stated(content)
+    common = _stated(content)
+    frame_change = _dataparser_change(path, common)
 
     def convert(where: str, frame: dict[str, Any]) -> Camera:
         name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
@@ -192,6 +142,9 @@ def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -
 
 def _transforms_model(where: str, values: Mapping[str, Any]) -> str:
     """Return the name of the camera model; empty if the file gives none."""
+    for key, kind, expected in (("camera_model", (str,), "a name"), ("is_fisheye", (bool, int), "true or false")):
+        if key in values and not isinstance(values[key], kind):
+            raise _wrong(where, key, values[key], expected)
     model = str(values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "")).upper()
     if model in _NO_PINHOLES or model.startswith("VR180"):
         raise CameraError(
@@ -282,7 +235,7 @@ def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
     dataparser = path.with_name("dataparser_transforms.json")
     if not dataparser.is_file():
         return lambda pose: pose
-    values = _load_json(dataparser)
+    values = load_json(dataparser)
     if not isinstance(values, dict):
         raise CameraError(f"{dataparser}: needs a JSON object with `transform` and `scale`. Copy it again.")
     applied, stored = np.eye(4), np.eye(4)
@@ -303,8 +256,9 @@ def _dataparser_change(path: Path, content: Mapping[str, Any]) -> Any:
     return apply
 
 
-def _read_colmap(folder: Path) -> list[Camera]:
-    lenses, images = read_model(folder)
+def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
+    notes: list[str] = []
+    lenses, images = read_model(folder, notes.append)
     cameras = []
     for image in images:
         where = f"{folder}: image {image.name!r}"
@@ -318,7 +272,13 @@ def _read_colmap(folder: Path) -> list[Camera]:
         pinhole = (of_photos.fx, of_photos.fy, of_photos.cx, of_photos.cy)
         cameras.append(_with_lens(_camera(where, image.name, (lens.width, lens.height), pinhole, matrix), of_photos))
     if not cameras:
-        raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.")
+        found = "".join(f" {note}." for note in notes)
+        raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.{found}")
+    unused = len(lenses.keys() - {image.camera for image in images})
+    if unused:
+        notes.append(f"{folder}: {unused:,} of {len(lenses):,} cameras belong to no image. {COMPARE}")
+    for note in notes:
+        warn(note)
     return sorted(cameras, key=lambda camera: camera.name)
 
 
@@ -390,22 +350,32 @@ def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:
 
 
 def _name(where: str, entry: Mapping[str, Any], *keys: str) -> str:
-    name = next((str(entry[key]) for key in keys if key in entry), "")
-    if not name:
-        raise CameraError(f"{where}: has no name ({' or '.join(map(repr, keys))}). Give {_FORMATS}.")
-    return name
+    key = next((key for key in keys if entry.get(key) is not None), None)
+    if key is None or entry[key] == "":
+        raise CameraError(f"{where}: has no name ({' or '.join(map(repr, keys))}). Give {FORMATS}.")
+    if isinstance(entry[key], bool) or not isinstance(entry[key], (str, int)):
+        raise _wrong(where, key, entry[key], "a name")
+    return str(entry[key])
+
+
+def _wrong(where: str, key: str, value: Any, expected: str, verb: str = "is") -> CameraError:
+    """Return the error about a value of another kind than expected, which shows text in quotes."""
+    kind = {str: "the text ", list: "the list ", dict: "the object "}.get(type(value), "")
+    shown = json.dumps(value, ensure_ascii=False)[:40]
+    advice = "Write it without quotes, or export" if isinstance(value, str) else "Export"
+    return CameraError(f"{where}: {key!r} {verb} {kind}{shown}, not {expected}. {advice} the cameras again.")
 
 
 def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray[Any]:
     if key not in values:
-        raise CameraError(f"{where}: has no {key!r}. Give {_FORMATS}.")
+        raise CameraError(f"{where}: has no {key!r}. Give {FORMATS}.")
     nested = [values[key]]
     while nested:  # NumPy would parse text as numbers, even `1_0`, and allocate the longest text for every entry
         entry = nested.pop()
         if isinstance(entry, list):
             nested += entry
         elif isinstance(entry, bool) or not isinstance(entry, (int, float)):
-            raise CameraError(f"{where}: {key!r} is not an array of numbers. Export the cameras again.")
+            raise _wrong(where, key, entry, "only numbers", "is" if entry is values[key] else "holds")
     try:
         array = np.array(values[key], dtype=np.float64)
     except (ValueError, OverflowError) as error:
@@ -417,19 +387,22 @@ def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, 
 
 def _number(where: str, values: Mapping[str, Any], key: str) -> float:
     if key not in values:
-        raise CameraError(f"{where}: has no {key!r}. Give {_FORMATS}.")
+        raise CameraError(f"{where}: has no {key!r}. Give {FORMATS}.")
     value = values[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise _wrong(where, key, value, "a number")
     # no length or angle exceeds 1e100, and an integer in JSON may be too long for a float
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e100:
+    if not abs(value) < 1e100:
         raise CameraError(f"{where}: {key!r} is {str(value)[:40]}, not a finite number. Export the cameras again.")
     return float(value)
 
 
 def _size(where: str, values: Mapping[str, Any], *keys: str) -> tuple[int, int]:
-    width, height = (_number(where, values, key) for key in keys)
-    if width != int(width) or height != int(height):
-        raise CameraError(f"{where}: a size of {width} x {height} is not in whole pixels. Correct it.")
-    return int(width), int(height)
+    stated = [_number(where, values, key) for key in keys]
+    width, height = (round(side) for side in stated)
+    if max(abs(stated[0] - width), abs(stated[1] - height)) > _WHOLE_TOLERANCE:
+        raise CameraError(f"{where}: a size of {stated[0]} x {stated[1]} is not in whole pixels. Correct it.")
+    return width, height
 
 
 def _positive(where: str, key: str, value: float) -> float:

@@ -1,11 +1,13 @@
 """Reader of cameras and poses in COLMAP sparse models, binary or text, as COLMAP's "Output Format" page defines them.
 
 Only `cameras` and `images` are read, which contain everything that a view needs: COLMAP writes the pose of each image
-into `images`, even if `rigs` and `frames` also determine it. `points3D`, `rigs` and `frames` are never opened.
+into `images`, even if `rigs` and `frames` also determine it. `points3D`, `rigs` and `frames` are never opened. What is
+in a file but belongs to no entry is counted and reported.
 """
 
 from __future__ import annotations
 
+import math
 import mmap
 import re
 import struct
@@ -15,12 +17,20 @@ from pathlib import Path
 from typing import TypeVar
 
 from sgsst_core.errors import CameraError
+from sgsst_core.files.labels import label
+from sgsst_core.files.lfs_pointers import refuse_pointer
 
 T = TypeVar("T")
+Warn = Callable[[str], None]
 
 _CONVERT = "Convert it with `colmap image_undistorter`, and give the OUT/sparse that it writes"
 _EXPORT_AGAIN = "Export the model again."
+#: Advice of warnings about files whose entries may not be all.
+COMPARE = "If views are missing, export the model again"
+_HEAD_BYTES = 4096
 
+#: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
+QUATERNION_TOLERANCE = 0.01
 #: COLMAP's camera models by number: name and number of parameters.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
@@ -46,6 +56,10 @@ _PARAMETERS = dict(_MODELS.values())
 #: Stricter than `int` and `float`, which accept `1_0` and digits of other scripts.
 _INTEGER = re.compile("[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
+#: Line of points: x, y and ID of the 3D point of each. The possessive quantifiers keep the time linear.
+_POINTS = re.compile(rb"(?:(?:(?:[-+.0-9eE]++|-?nan|-?inf)(?:\s++|$)){3}+)++")
+#: Number of entries in the comment that COLMAP writes at the beginning of a text file.
+_DECLARED = re.compile(rb"# Number of (?:cameras|images): ([0-9]{1,18})\b")
 
 
 @dataclass(frozen=True)
@@ -75,26 +89,38 @@ class ColmapImage:
     translation: tuple[float, float, float]
 
 
-def read_model(folder: Path) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
+def read_model(folder: Path, warn: Warn) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
     """Read the cameras by ID, and the registered images in the file's order.
 
     Binary files take precedence over text files, as in COLMAP.
 
+    Args:
+        folder: Folder of the model.
+        warn: Callback for files with more or less than they declare.
+
     Raises:
         CameraError: If a file is missing, truncated, or has an invalid value. The message names the file.
     """
-    if (folder / "cameras.bin").is_file():
-        cameras = _by_id(folder / "cameras.bin", _binary(folder / "cameras.bin", _binary_camera))
-        images = _by_id(folder / "images.bin", _binary(folder / "images.bin", _binary_image))
-    else:
-        cameras = _by_id(folder / "cameras.txt", _text_cameras(folder / "cameras.txt"))
-        images = _by_id(folder / "images.txt", _text_images(folder / "images.txt"))
-    return cameras, list(images.values())
+    cameras, images = folder / "cameras.bin", folder / "images.bin"
+    if cameras.is_file():
+        return (
+            _by_id(cameras, _binary(cameras, _binary_camera, warn)),
+            list(_by_id(images, _binary(images, _binary_image, warn)).values()),
+        )
+    cameras, images = folder / "cameras.txt", folder / "images.txt"
+    intrinsics = _by_id(cameras, _text_cameras(cameras))
+    poses = _by_id(images, _text_images(images))
+    for path, count in ((cameras, len(intrinsics)), (images, len(poses))):
+        declared = _declared_count(path)
+        if declared not in (None, count):
+            warn(f"{path}: holds {count:,} {path.stem}, but its first lines state {declared:,}. {COMPARE}")
+    return intrinsics, list(poses.values())
 
 
 def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
     by_id: dict[int, T] = {}
     try:
+        refuse_pointer(path, CameraError)
         for number, entry in entries:
             if number in by_id:
                 raise CameraError(f"{path}: has id {number} twice. Export the model again.")
@@ -103,20 +129,32 @@ def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
         raise CameraError(f"{path}: cannot be read: {error.strerror}. Copy the model again.") from error
     except KeyError as error:
         raise CameraError(f"{path}: has an unknown COLMAP camera model, number {error}. {_CONVERT}.") from error
-    except (struct.error, EOFError, ValueError) as error:
+    except EOFError as error:
+        raise CameraError(f"{path}: is truncated or corrupt: {error}. Copy the model again.") from error
+    except (struct.error, ValueError) as error:
         raise CameraError(f"{path}: is truncated or corrupt. Copy the model again.") from error
     return by_id
 
 
-def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]]) -> Iterator[tuple[int, T]]:
-    """Yield as many entries as the file declares; raise EOFError for an entry beyond the end of the file."""
+def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]], warn: Warn) -> Iterator[tuple[int, T]]:
+    """Yield as many entries as the file declares.
+
+    Raises:
+        EOFError: If an entry is beyond the end of the file.
+    """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        position = 8
-        for _ in range(struct.unpack_from("<Q", data)[0]):
-            number, entry, position = read(data, position)
+        position, count = 8, struct.unpack_from("<Q", data)[0]
+        for done in range(count):
+            try:
+                number, entry, position = read(data, position)
+            except (struct.error, EOFError):
+                position = len(data) + 1
             if position > len(data):
-                raise EOFError
+                raise EOFError(f"it declares {count:,} {path.stem} and ends after {done:,}")
             yield number, entry
+        if position < len(data):
+            left = len(data) - position
+            warn(f"{path}: has {left:,} bytes after the {count:,} {path.stem} that it declares. {COMPARE}")
 
 
 def _binary_camera(data: mmap.mmap, position: int) -> tuple[int, ColmapCamera, int]:
@@ -136,7 +174,7 @@ def _binary_image(data: mmap.mmap, position: int) -> tuple[int, ColmapImage, int
     end_of_name = data.find(b"\0", position + 64)
     if end_of_name < 0:
         raise EOFError
-    name = data[position + 64 : end_of_name].decode()
+    name = label(data[position + 64 : end_of_name])
     points: int = struct.unpack_from("<Q", data, end_of_name + 1)[0]
     return number, _image(name, camera, pose), end_of_name + 9 + 24 * points
 
@@ -144,8 +182,10 @@ def _binary_image(data: mmap.mmap, position: int) -> tuple[int, ColmapImage, int
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     """Yield cameras from lines of ID, model name, width, height and parameters."""
     for where, line in _lines(path):
-        words = line.split()
+        words = [label(word) for word in line.split()]
         model = words[1] if len(words) > 1 else ""
+        if not words:
+            continue
         if model not in _PARAMETERS or len(words) != 4 + _PARAMETERS[model]:
             raise CameraError(
                 f"{where}: expected id, COLMAP camera model, width, height and its parameters. {_EXPORT_AGAIN}"
@@ -155,32 +195,46 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
-    """Yield images from pairs of lines.
+    """Yield images from lines of ID, quaternion, translation, camera ID and name.
 
-    The first line holds ID, quaternion, translation, camera ID and name. The second holds points and is skipped.
+    Each may be followed by a line of points, which is skipped. Some programs leave out such lines if they are empty.
     """
-    lines = _lines(path, points_follow=True)
-    for where, line in lines:
-        words = line.split(maxsplit=9)
+    may_be_points = False
+    for where, line in _lines(path):
+        words = [label(word) for word in line.split(maxsplit=9)]
+        if not line or (may_be_points and _POINTS.fullmatch(line) and not _is_pose(words)):
+            may_be_points = False
+            continue
         if len(words) != 10:
-            raise CameraError(f"{where}: expected id, 7 numbers of the pose, camera id and name. {_EXPORT_AGAIN}")
+            raise CameraError(
+                f"{where}: expected id, 7 numbers of the pose, camera id and name, or the points of the image above as "
+                f"x, y and id. {_EXPORT_AGAIN}"
+            )
         pose = [_number(where, word) for word in words[1:8]]
         yield _integer(where, words[0]), _image(words[9], _integer(where, words[8]), pose)
+        may_be_points = True
 
 
-def _lines(path: Path, *, points_follow: bool = False) -> Iterator[tuple[str, str]]:
-    """Yield the location of each line (for error messages) and its text.
+def _is_pose(words: Sequence[str]) -> bool:
+    """Return whether the words of a line of numbers are those of an image, whose name may be a number too."""
+    ids = all(_INTEGER.fullmatch(word) for word in (words[0], *words[8:9]))
+    numbers = len(words) >= 9 and all(_NUMBER.fullmatch(word) for word in words[1:8])
+    return ids and numbers and abs(math.hypot(*map(float, words[1:5])) - 1) <= QUATERNION_TOLERANCE
 
-    Blank lines and comments are skipped. If `points_follow` is set, the line after each yielded line is skipped too.
-    """
+
+def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Yield the location of each line (for error messages) and its text without blanks around it, except comments."""
     with path.open("rb") as file:
-        numbered = enumerate(file, start=1)
-        for number, data in numbered:
-            line = data.decode().strip()
-            if line and not line.startswith("#"):
-                yield f"{path}: line {number}", line
-                if points_follow:
-                    next(numbered, None)
+        for number, line in enumerate(file, start=1):
+            if not line.lstrip().startswith(b"#"):
+                yield f"{path}: line {number}", line.strip()
+
+
+def _declared_count(path: Path) -> int | None:
+    """Return the number of entries that the first lines of a text file state; None if they state none."""
+    with path.open("rb") as file:
+        stated = _DECLARED.search(file.read(_HEAD_BYTES))
+    return int(stated[1]) if stated else None
 
 
 def _image(name: str, camera: int, pose: Sequence[float]) -> ColmapImage:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.errors import MaskError
+from sgsst_core.files.lfs_pointers import refuse_pointer
 from sgsst_core.files.scene_file import SceneFile
 
 #: Suffix of masks of packed bits; every other file is read as .npy.
@@ -29,6 +30,10 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
     Raises:
         MaskError: If the file cannot be read, has another length, or has values other than 0 and 1.
     """
+    try:
+        refuse_pointer(path, MaskError)
+    except OSError as error:
+        raise MaskError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
     rows = len(file.scene) if file.retained is None else len(file.retained)
     read = _read_bits if path.suffix.lower() == BITS_SUFFIX else _read_npy
     flags = read(path, rows, file.path)
@@ -37,12 +42,9 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
 
 def _read_bits(path: Path, rows: int, scene: Path) -> NDArray[np.bool_]:
     expected = (rows + 7) // 8
-    try:
-        with path.open("rb") as file:
-            content = file.read(expected + 1)
-            size = len(content) if len(content) <= expected else path.stat().st_size
-    except OSError as error:
-        raise MaskError(f"{path}: cannot be read: {error}. Check the path.") from error
+    with path.open("rb") as file:
+        content = file.read(expected + 1)
+    size = len(content) if len(content) <= expected else path.stat().st_size
     if size != expected:
         raise MaskError(
             f"{path}: has {size:,} bytes, but {scene} has {rows:,} Gaussians. "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -18,6 +19,8 @@ from torch import Tensor
 from sgsst_core.errors import ImageError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.color_profiles import ColorProfile
+from sgsst_core.files.lfs_pointers import refuse_pointer
+from sgsst_core.files.png_metadata import SIGNATURE, open_png
 
 #: Maximum number of pixels: Pillow's limit against decompression bombs, which is twice its warning threshold. These 179
 #: megapixels exceed the largest camera sensors, and take 2 GB as float32.
@@ -121,10 +124,10 @@ def stored_size(path: Path) -> tuple[tuple[int, int], int]:
     Raises:
         ImageError: If the file is missing or not an image, or has more than MAX_PIXELS pixels.
     """
-    with _opened(path) as image:
-        # the EXIF data of a PNG may follow its pixels, and Pillow would decode all of them to find it
-        known = "exif" in image.info or image.format != "PNG"
-        orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if known else 1
+    with _opened(path, pixels=False) as image:
+        # that of a PNG decodes all pixels to find EXIF data behind them, which `open_png` has found already
+        exif = Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
+        orientation = exif.get(_EXIF_ORIENTATION, 1)
         return image.size, orientation if orientation in range(1, 9) else 1
 
 
@@ -144,13 +147,19 @@ def save_jpg(path: Path, image: Tensor) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    """Open an image and check its size. Decoding errors inside the block are raised as ImageError."""
+def _opened(path: Path, *, pixels: bool = True) -> Iterator[Image.Image]:
+    """Open an image and check its size. Decoding errors inside the block are raised as ImageError.
+
+    Without `pixels`, the image can only be asked for its header.
+    """
     try:
+        source, profile = _source(path, pixels)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
-            opened = Image.open(path, formats=[*FORMATS, *_heif_format(path)])
+            opened = Image.open(source, formats=[*FORMATS, *_heif_format(path)])
         with opened as image:
+            if profile is not None:
+                image.info["icc_profile"] = profile
             if image.width * image.height > MAX_PIXELS:
                 raise Image.DecompressionBombError
             yield image
@@ -161,11 +170,19 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             f"{path}: has more than {MAX_PIXELS // 10**6} megapixels; refused before decoding. Scale it down first."
         ) from error
     except UnidentifiedImageError as error:
+        refuse_pointer(path, ImageError)
         raise ImageError(f"{path}: is not an image that can be read. Give a PNG or JPEG.") from error
     except Exception as error:  # Pillow's decoders raise many types
         if isinstance(error, OSError) and error.strerror:
             raise ImageError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
         raise ImageError(f"{path}: is truncated or corrupt ({error}). Use an intact copy.") from error
+
+
+def _source(path: Path, pixels: bool) -> tuple[Path | io.BytesIO, bytes | None]:
+    """Return what Pillow opens, and the color profile of a PNG, which Pillow would refuse if it is long."""
+    with path.open("rb") as file:
+        is_png = file.read(len(SIGNATURE)) == SIGNATURE
+    return open_png(path, pixels=pixels) if is_png else (path, None)
 
 
 def _check_scans(path: Path) -> None:

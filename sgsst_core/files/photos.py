@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import unicodedata
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from sgsst_core.errors import ImageError
 from sgsst_core.files.images import BLACK, HEIF_SUFFIXES, Color, load_image, stored_size
+from sgsst_core.files.labels import label
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import undistort
 
@@ -67,7 +69,7 @@ class PhotoFolder:
         self._folded: dict[tuple[str, ...], list[Path]] = {}
         for path in sorted(folder.rglob("*")):
             if path.suffix.lower() in self._extensions and not path.name.startswith(".") and path.is_file():
-                stem = path.relative_to(folder).with_suffix("")
+                stem = _normalized(str(path.relative_to(folder))).with_suffix("")
                 _add(self._index, stem, path)
                 _add(self._folded, PurePath(str(stem).casefold()), path)
                 if masks:
@@ -80,7 +82,7 @@ class PhotoFolder:
 
         The longest matching path wins, then files outside deeper subfolders, then files with the exact extension.
         """
-        wanted = PurePosixPath(name.replace("\\", "/"))
+        wanted = _normalized(name)
         stem = self._without_extension(wanted)
         for index, key in ((self._index, stem), (self._masks, wanted), (self._masks, stem)):
             paths = self._best(index, key, wanted.suffix)
@@ -93,20 +95,21 @@ class PhotoFolder:
         """Return the paths of files with the name of no camera, in any folder and case; hidden files are left out."""
         matching: set[Path] = set()
         for name in names:
-            wanted = PurePosixPath(name.replace("\\", "/")).name
-            stem = str(self._without_extension(PurePath(wanted)))
-            for index, key in ((self._folded, stem.casefold()), (self._masks, wanted), (self._masks, stem)):
-                matching.update(index.get(_normalized(PurePath(key)).parts, ()))
+            wanted = PurePath(_normalized(name).name)
+            stem = str(self._without_extension(wanted))
+            for index, key in ((self._folded, stem.casefold()), (self._masks, str(wanted)), (self._masks, stem)):
+                matching.update(index.get((key,), ()))
         others = (path for path in sorted(self._folder.rglob("*")) if path.is_file() and path not in matching)
-        return [path.relative_to(self._folder).as_posix() for path in others if not path.name.startswith(".")]
+        return [str(_normalized(str(path.relative_to(self._folder)))) for path in others if path.name[0] != "."]
+
 
     def unreadable(self, names: Collection[str]) -> list[str]:
         """Return the suffixes of files that have these names of cameras, but no suffix of an image."""
-        stems = {self._without_extension(PurePosixPath(name.replace("\\", "/"))).name for name in names}
+        stems = {self._without_extension(_normalized(name)).name for name in names}
         return sorted({path.suffix for path in self._folder.rglob("*") if path.stem in stems} - self._extensions - {""})
 
     def _best(self, index: dict[tuple[str, ...], list[Path]], name: PurePath, suffix: str) -> list[Path]:
-        parts = tuple(part for part in _normalized(name).parts if part not in ("..", "/"))
+        parts = tuple(part for part in name.parts if part not in ("..", "/"))
         for start in range(len(parts)):
             paths = index.get(parts[start:], [])
             if paths:
@@ -122,14 +125,18 @@ class PhotoFolder:
 
 def _add(index: dict[tuple[str, ...], list[Path]], name: PurePath, path: Path) -> None:
     """Add a file to an index under every trailing part of its name."""
-    parts = _normalized(name).parts
+    parts = name.parts
     for start in range(len(parts)):
         index.setdefault(parts[start:], []).append(path)
 
 
-def _normalized(name: PurePath) -> PurePath:
-    """Return a name with composed accents, since macOS stores them decomposed."""
-    return type(name)(unicodedata.normalize("NFC", str(name)))
+def _normalized(name: str) -> PurePosixPath:
+    """Return a name of a camera or file in the form in which they are compared.
+
+    Accents are composed, since macOS stores them decomposed; names that are not UTF-8 are those of `label`; and
+    separators are those of Windows or POSIX.
+    """
+    return PurePosixPath(unicodedata.normalize("NFC", label(os.fsencode(name)).replace("\\", "/")))
 
 
 def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:

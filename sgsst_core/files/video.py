@@ -44,6 +44,19 @@ def is_encoded(out: Path) -> bool:
     return out.suffix.lower() in _ENCODERS
 
 
+def frames_folder(out: Path) -> Path:
+    """Return the folder in which a video or its images are written: the path itself if it names a folder.
+
+    A path names a folder if it is one, or if what follows its last dot has no letter, as in `v1.2`.
+    """
+    return out if _names_folder(out) else out.parent
+
+
+def _names_folder(out: Path) -> bool:
+    is_suffix = any(character.isalpha() for character in out.suffix)
+    return not is_encoded(out) and (out.is_dir() or not is_suffix)
+
+
 def check_video_path(out: Path, *, alpha: bool = False) -> None:
     """Check that a path names a video or a sequence of images that can be written.
 
@@ -59,9 +72,11 @@ def check_video_path(out: Path, *, alpha: bool = False) -> None:
             raise OutputError(f"{out}: is a folder. Name the video file to write, such as {out / 'video.mp4'}.")
         if alpha and suffix == ".mp4":
             raise OutputError(f"{out}: MP4 has no alpha channel. Name a .webm file or a folder for PNG images.")
+    elif _names_folder(out):
+        return
     elif suffix == ".png" and not _PATTERN.fullmatch(out.name):
         raise OutputError(f"{out}: names one image. Give a pattern such as frame_%04d.png, or a .mp4 file.")
-    elif suffix not in ("", ".png"):
+    elif suffix != ".png":
         raise OutputError(f"{out}: is no video. Name a .mp4 or .webm file, a frame_%04d.png, or a folder.")
 
 
@@ -94,8 +109,7 @@ def video_writer(
         with atomic_path(out) as temporary, encoder(temporary, width, height, fps, alpha=alpha) as write:
             yield write
     else:
-        folder, name = (out.parent, out.name) if out.suffix else (out, _FRAME_NAME)
-        with _image_sequence(folder, name) as write:
+        with _image_sequence(frames_folder(out), _FRAME_NAME if _names_folder(out) else out.name) as write:
             yield write
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import mean, median
 
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError
 from sgsst_core.files.photos import Photo, load_photo
-from sgsst_core.planning.survey import nothing_seen
+from sgsst_core.planning.shown import hidden_text, nothing_seen, shown_by
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
@@ -29,8 +29,8 @@ _LITTLE_SHOWN, _MUCH_UNCOVERED = 0.25, 0.1
 _NEARLY_NOTHING, _MOSTLY_UNCOVERED, _HALF = 0.01, 0.4, 0.5
 #: PSNR in dB below which photos are reported. Right photos have 26 to 31; cropped by 10 %, 20.
 _UNLIKE_PSNR = 22.0
-#: Gaussians, cameras and rendered views that are looked at.
-_GAUSSIANS, _CAMERAS, _VIEWS = 20_000, 200, 4
+#: Rendered views that are looked at.
+_VIEWS = 4
 #: Longer side in pixels of rendered views, and of those that are compared. Comparing averages of pixels matters: small
 #: Gaussians are wider and brighter in small renders.
 _SIDE, _COMPARED_SIDE = 256, 128
@@ -40,41 +40,8 @@ _COVERED, _LEAST_COMPARED = 0.98, 0.02
 _TINY = 1e-12
 
 
-@dataclass(frozen=True)
-class Shown:
-    """Fractions of a scene's Gaussians whose centers are in the frames of cameras.
-
-    Attributes:
-        typical: Fraction in one frame, median over the cameras.
-        together: Fraction in at least one frame.
-    """
-
-    typical: float
-    together: float
-
-
-def shown_by(means: Tensor, cameras: Sequence[Camera], near: float) -> Shown:
-    """Return how much of a scene cameras show, from samples of both.
-
-    Args:
-        means: Centers of the Gaussians, [N, 3].
-        cameras: At least one camera.
-        near: Distance of the near plane in world units.
-    """
-    points = means[:: max(1, len(means) // _GAUSSIANS)].double()
-    together = torch.zeros(len(points), dtype=torch.bool)
-    fractions = []
-    for camera in spread(cameras, _CAMERAS):
-        x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
-        across, down = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
-        together |= inside
-        fractions.append(float(inside.double().mean()))
-    return Shown(median(fractions), float(together.double().mean()))
-
-
 def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Decision]:
-    """Return a warning if cameras seem to be in another coordinate frame than the scene.
+    """Return a warning if the near plane hides much, or cameras seem to be in another coordinate frame than the scene.
 
     Views are rendered only if they show few Gaussians.
 
@@ -82,15 +49,19 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
         CameraError: If the cameras show almost nothing of the scene.
     """
     shown = shown_by(scene.means, cameras, near)
-    if shown.typical >= _LITTLE_SHOWN:
-        return []
+    hidden = []
+    if shown.near is not None:
+        warning = f"warning: {hidden_text(shown, len(scene), near)}"
+        hidden = [Decision("cameras", warning, f"they are not drawn; add --near {shown.near:g} to draw them")]
+    if shown.typical >= _LITTLE_SHOWN or (hidden and shown.together):
+        return hidden
     rasterizer = make_rasterizer("cpu", scene, near=near)
     views = [resized(camera, _SIDE) for camera in spread(cameras, _VIEWS)]
     uncovered = mean(float(1 - rasterizer.coverage(view).mean(dtype=torch.float64)) for view in views)
     if uncovered == 1:
-        raise nothing_seen(len(cameras))
-    if uncovered <= _MUCH_UNCOVERED:
-        return []
+        raise nothing_seen(scene.means, cameras, near)
+    if uncovered <= _MUCH_UNCOVERED or hidden:
+        return hidden
     text = f"a typical view has {shown.typical:.1%} of the Gaussians in its frame and {uncovered:.0%} uncovered pixels"
     advice = (
         "use the cameras of the scene's own training run and world. With nerfstudio, put the run's "

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sgsst_core.errors import CameraError
 from sgsst_core.features.partition import Rectangle, covered_region
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.shown import nothing_seen
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -63,14 +63,6 @@ def progress_of(surveyed: int, total: int, ranks: int, seconds: float) -> Planni
 def sees_something(coverage: Tensor) -> bool:
     """Return whether anything is visible in a view, given its coverage [H, W]."""
     return float(coverage.amax()) > SEEN_COVERAGE
-
-
-def nothing_seen(cameras: int) -> CameraError:
-    """Return the error for cameras that see no Gaussian."""
-    return CameraError(
-        f"None of the {cameras} cameras sees a Gaussian. Check that cameras and scene belong together (same training "
-        "run, same world), or let an orbit make the cameras."
-    )
 
 
 @dataclass(frozen=True)
@@ -138,7 +130,7 @@ def survey_views(
         views |= others
     covered = [index for index in range(len(cameras)) if views[index].covered]
     if not covered:
-        raise nothing_seen(len(cameras))
+        raise nothing_seen(scene.means, cameras, rasterizer.near)
     weights = collectives.all_reduce(weights).cpu()
     uncovered_fraction = sum(views[index].uncovered for index in covered) / sum(
         views[index].pixels for index in covered

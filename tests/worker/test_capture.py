@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
+from sgsst_core.decision import warnings_of
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.images import BLACK, WHITE
@@ -19,6 +20,7 @@ from sgsst_core.files.photos import load_photo
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
+from tests.sgsst_core.files.test_camera_files import colmap, views
 from tests.small_scenes import ball, cameras, wall, write_files
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.inputs import read_scene_and_capture
@@ -66,6 +68,27 @@ def test_cameras_without_distortion_and_photos_need_no_line(tmp_path: Path) -> N
     half = read_capture(request(tmp_path, resolution=32), SCENE).with_photos(photos)
     assert lines(half) == []
     assert half.cameras[0].width == 32
+
+
+def test_models_that_may_lack_views_are_reported(tmp_path: Path) -> None:
+    for model, count in (("0", 2), ("1", 3)):
+        colmap(tmp_path / "sparse" / model, views(count), text=True)
+    capture = read_capture(SceneRequest(scene=tmp_path / "scene.ply", cameras=tmp_path), SCENE)
+    (line,) = lines(capture.with_photos(None))
+    assert line.startswith(f"cameras: warning: they may not be all: {tmp_path}/sparse/0 has 2 images, and the model ")
+    assert warnings_of(capture.decisions)
+
+
+def test_photos_mostly_without_cameras_or_with_several_are_reported(tmp_path: Path) -> None:
+    photos = write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2", *(f"other_{index}" for index in range(5))])
+    (line,) = lines(read_capture(request(tmp_path), SCENE).with_photos(photos))
+    assert line.startswith("photos: warning: 5 files are not used: they have the name of no camera: other_0.png, ")
+    entries = json.loads((tmp_path / "cameras.json").read_text())
+    entries[1]["img_name"] = "view_0"
+    (tmp_path / "cameras.json").write_text(json.dumps(entries))
+    capture = read_capture(SceneRequest(scene=tmp_path / "scene.ply", cameras=tmp_path / "cameras.json"), SCENE)
+    shared = lines(capture.with_photos(photos))[0]
+    assert shared.startswith("photos: warning: 1 belong to several cameras each, of which they can show one: the names ")
 
 
 def test_photos_of_another_size_and_missing_ones_are_reported(tmp_path: Path) -> None:

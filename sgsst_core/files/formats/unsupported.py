@@ -9,6 +9,7 @@ from typing import NoReturn
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.scene_format import FileStart
+from sgsst_core.files.lfs_pointers import POINTER, is_pointer
 
 CONVERTER = "https://github.com/playcanvas/splat-transform"
 #: Signatures in the first bytes of a PyTorch checkpoint: the first file of its ZIP archive, and pickle.
@@ -43,10 +44,7 @@ _KNOWN: tuple[tuple[Callable[[bytes, str], bool], str], ...] = (
         "`ns-export gaussian-splat` (nerfstudio); the original 3DGS code has point_cloud/iteration_*/point_cloud.ply "
         "beside it.",
     ),
-    (
-        lambda head, _: head.startswith(b"version https://git-lfs"),
-        "a pointer of Git LFS, not the file itself. Run `git lfs pull`.",
-    ),
+    (lambda head, _: is_pointer(head), f"{POINTER}."),
     (
         lambda head, _: _is_html(head) and b"SuperSplat" in head,
         "a viewer of SuperSplat, with the scene in it or beside it. Export the scene as PLY or SOG instead.",

@@ -25,9 +25,11 @@ from api.client.transport import TRIES
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
+from sgsst_core.files.camera_folder import CameraWarning
 from tests.api.service import Service
 from tests.http_servers import serve
 from tests.nginx import Nginx
+from tests.sgsst_core.files.test_camera_files import colmap, views
 from tests.small_scenes import wall, write_files
 
 
@@ -268,6 +270,7 @@ def test_plan_queues_nothing_and_rejects_bad_files(
         (["cameras.bin", "images.bin"], "images.bin", ["cameras.bin", "images.bin"]),
         (["views.JSON", "sparse/0/cameras.bin"], "views.JSON", ["views.JSON"]),
         (["a.json", "dataparser_transforms.json"], "a.json", ["a.json", "dataparser_transforms.json"]),
+        (["transform_train.json", "notes.txt"], "", ["transform_train.json"]),
     ],
 )
 def test_cameras_are_found_as_on_the_command_line(
@@ -277,6 +280,13 @@ def test_cameras_are_found_as_on_the_command_line(
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     assert camera_files(tmp_path / given) == [tmp_path / name for name in sent]
+
+
+def test_smaller_model_is_sent_with_a_warning(tmp_path: Path) -> None:
+    for model, count in (("0", 1), ("1", 2)):
+        colmap(tmp_path / "sparse" / model, views(count), text=True)
+    with pytest.warns(CameraWarning, match=rf"0 has 1 images, and the model {tmp_path}/sparse/1 beside it 2\."):
+        assert camera_files(tmp_path)[0] == tmp_path / "sparse" / "0" / "cameras.txt"
 
 
 def test_photos_of_all_formats_are_sent_except_hidden_files(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shutil
 import struct
 from collections.abc import Callable
@@ -21,7 +22,9 @@ from PIL import Image
 from sgsst_core.errors import CameraError
 from sgsst_core.files import colmap_model
 from sgsst_core.files.camera_files import _rotation_matrix, read_cameras
+from sgsst_core.files.camera_folder import CameraWarning
 from sgsst_core.files.colmap_model import read_model
+from sgsst_core.files.photos import check_photos, find_masks
 from sgsst_core.scene.camera import Camera, look_at
 
 WIDTH, HEIGHT = 640, 480
@@ -174,7 +177,7 @@ def test_values_of_the_file_are_not_copied_for_each_frame(tmp_path: Path, monkey
             return super().keys()
 
     content, cameras = Content(nerfstudio(views(20))), views(20)
-    monkeypatch.setattr("sgsst_core.files.camera_files._load_json", lambda path: content)
+    monkeypatch.setattr("sgsst_core.files.camera_files.load_json", lambda path: content)
     assert_same(read_cameras(save(tmp_path / "transforms.json", {})), cameras, lambda name: f"images/{name}")
     assert len(calls) < len(cameras)
 
@@ -343,7 +346,7 @@ def test_poses_are_bit_identical_to_pycolmap(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "model", views(200), text=False)
     model = pycolmap.Reconstruction(folder)
     expected = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
-    _, images = read_model(folder)
+    _, images = read_model(folder, pytest.fail)
     assert len(images) == 200
     for image in images:
         assert (_rotation_matrix("", image.rotation) == expected[image.name][:, :3]).all()
@@ -435,6 +438,100 @@ def test_wrong_lines_of_colmap_text_are_named(tmp_path: Path, name: str, old: st
         read_cameras(folder)
 
 
+POINTS = ["", "1.5 2.5 -1 30 40 7", "1e-05 nan 18446744073709551615"]
+
+
+@pytest.mark.parametrize("comment", ["", "# a comment\n"])
+@pytest.mark.parametrize("name", ["{0}.png", "my image {0}.png", "{0}", "1 2 {0}"])
+@pytest.mark.parametrize("missing", [(), (0,), (1, 3), (0, 1, 2, 3)])
+def test_images_without_lines_of_points_are_all_read(
+    tmp_path: Path, missing: tuple[int, ...], name: str, comment: str
+) -> None:
+    folder, lines = colmap(tmp_path / "model", views(1), text=True), "\n"
+    for index in range(4):
+        lines += f"{comment}{index + 1} 1 0 0 0 {index} 0 0 1 {name.format(index)}\n"
+        lines += "" if index in missing else f"{POINTS[index % 3]}\n"
+    (folder / "images.txt").write_text(f"{lines}\n\n")
+    cameras = read_cameras(folder)
+    assert [view.name for view in cameras] == [name.format(index) for index in range(4)]
+    assert [float(view.world_to_camera[0, 3]) for view in cameras] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("line", ["1.5 2.5", "1.5 2.5 -1 3", "7 1 0 0 0 0 0 0 1", "1.5 2.5 x", "1 0 0 0 0 0 0 0 1 a b"])
+def test_lines_that_are_neither_images_nor_points_are_named(tmp_path: Path, line: str) -> None:
+    folder = colmap(tmp_path / "model", views(1), text=True)
+    (folder / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 a.png\n{line}\n2 1 0 0 0 0 0 0 1 b.png\n\n")
+    with pytest.raises(CameraError, match=r"images\.txt: line 2|has id 1 twice"):
+        read_cameras(folder)
+
+
+def notes_of(path: Path) -> list[str]:
+    """Return the notes of reading cameras, whose paths start at the given one."""
+    notes: list[str] = []
+    read_cameras(path, None, notes.append)
+    return [note.replace(f"{path}/", "") for note in notes]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "note"),
+    [
+        ("images.txt", "# images", "# Number of images: 5, mean observations: 1", "holds 3 images, but its .* state 5"),
+        ("images.txt", "# images", "# Number of images: 2", "holds 3 images, but its first lines state 2"),
+        ("cameras.txt", "# cameras", "# Number of cameras: 7", "holds 1 cameras, but its first lines state 7"),
+        (
+            "cameras.txt",
+            "# cameras",
+            f"9 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240",
+            "1 of 2 cameras belong to no image",
+        ),
+    ],
+)
+def test_counts_of_text_models_that_differ_are_reported(
+    tmp_path: Path, file: str, old: str, new: str, note: str
+) -> None:
+    folder = colmap(tmp_path / "model", views(), text=True)
+    assert notes_of(folder) == []
+    (folder / file).write_text((folder / file).read_text().replace(old, new))
+    (found,) = notes_of(folder)
+    assert re.search(note, found)
+    with pytest.warns(CameraWarning, match=note):
+        assert_same(read_cameras(folder), views())
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
+def test_bytes_after_the_declared_count_are_reported(tmp_path: Path, file: str) -> None:
+    folder = colmap(tmp_path / "model", views(), text=False)
+    data = (folder / file).read_bytes()
+    (folder / file).write_bytes(data + b"rest of it")
+    assert notes_of(folder)[0].startswith(f"{file}: has 10 bytes after the {data[0]} {file[:-4]} that it declares.")
+    (folder / "images.bin").write_bytes(bytes(8) + data[8:])
+    with pytest.raises(CameraError, match=r"no registered image.*images\.bin: has \d+ bytes after the 0 images"):
+        read_cameras(folder)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("encoding", ["cp949", "gbk", "cp932", "utf-8"])
+def test_names_in_any_encoding_are_read_and_match_photos(tmp_path: Path, encoding: str, text: bool) -> None:
+    """Half of the names are UTF-8. The trail byte of the last kanji is a backslash in CP932, its lead byte a blank."""
+    words = ["\u898b", "\u672c", "\u8868" if encoding == "cp932" else "\u5730"]
+    names = [word.encode(encoding if index else "utf-8") + b" 1.png" for index, word in enumerate(words)]
+    marked = [replace(view, name=f"NAME{index}") for index, view in enumerate(views())]
+    folder = colmap(tmp_path / "model", marked, text=text)
+    file, photos = folder / ("images.txt" if text else "images.bin"), tmp_path / "photos"
+    data = file.read_bytes()
+    photos.mkdir()
+    for index, name in enumerate(names):
+        data = data.replace(f"NAME{index}".encode(), name)
+        Image.new("RGB", (WIDTH, HEIGHT)).save(photos / os.fsdecode(name), "PNG")
+    file.write_bytes(data)
+    cameras = read_cameras(folder)
+    assert len({view.name for view in cameras}) == 3
+    assert "\u898b 1.png" in {view.name for view in cameras}
+    "".join(view.name for view in cameras).encode()  # can be printed and stored
+    for found in (check_photos(photos, cameras), find_masks(photos, cameras)):
+        assert {os.fsencode(photo.path.name) for photo in found if photo} == set(names)
+
+
 def test_names_with_spaces_and_windows_line_ends_are_read(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "model", views(), text=True)
     for file in ("cameras.txt", "images.txt"):
@@ -466,10 +563,17 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
     [
         ("rotation", None, "has no 'rotation'"),
         ("rotation", [[1, 0], [0, 1]], r"'rotation' has shape \(2, 2\), not \(3, 3\)"),
-        ("rotation", "right", "'rotation' is not an array of numbers"),
-        ("rotation", [["1_0", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]], "'rotation' is not an array of numbers"),
-        ("rotation", [[True, 0, 0], [0, 1, 0], [0, 0, 1]], "'rotation' is not an array of numbers"),
-        ("position", [0, 0, "1_0"], "'position' is not an array of numbers"),
+        ("rotation", "right", "'rotation' is the text \"right\", not only numbers. Write it without quotes"),
+        (
+            "rotation",
+            [["1_0", "0", "0"], ["0", "1", "0"], ["0", "0", "1"]],
+            "'rotation' holds the text \"1\", not only numbers",
+        ),
+        ("rotation", [[True, 0, 0], [0, 1, 0], [0, 0, 1]], "'rotation' holds true, not only numbers. Export"),
+        ("rotation", [[None, 0, 0], [0, 1, 0], [0, 0, 1]], "'rotation' holds null, not only numbers"),
+        ("position", {"x": 0}, "'position' is the object .*, not only numbers"),
+        ("position", [0, 0, "1_0"], "'position' holds the text \"1_0\", not only numbers"),
+        ("position", [[0], [0, 0], 0], "'position' is not an array of numbers"),
         ("rotation", [[1, 0, 0], [0, 10**400, 0], [0, 0, 1]], "'rotation' is not an array of numbers"),
         ("rotation", (2 * np.eye(3)).tolist(), "is 3 off a rotation"),
         ("rotation", [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]], "is 0.01 off a rotation"),
@@ -485,8 +589,10 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
         ("fy", -1.0, "focal length y is -1"),
         ("fx", NAN, "'fx' is nan, not a finite number"),
         ("fx", 10**400, "not a finite number"),
-        ("fx", True, "'fx' is True"),
-        ("fx", "500", "'fx' is 500"),
+        ("fx", True, "'fx' is true, not a number. Export"),
+        ("fx", "500", "'fx' is the text \"500\", not a number. Write it without quotes"),
+        ("width", "640", "'width' is the text \"640\", not a number"),
+        ("cx", [320], "'cx' is the list .320., not a number"),
     ],
 )
 def test_wrong_values_of_inria_cameras_are_named(tmp_path: Path, key: str, value: Any, message: str) -> None:
@@ -502,7 +608,11 @@ def test_wrong_values_of_inria_cameras_are_named(tmp_path: Path, key: str, value
         ("transform_matrix", np.eye(3).tolist(), r"shape \(3, 3\), not \(4, 4\) or \(3, 4\)"),
         ("transform_matrix", (3 * np.eye(4)).tolist(), "is 8 off a rotation"),
         ("k1", NAN, "'k1' is nan, not a finite number"),
-        ("p2", "0.1", "'p2' is 0.1"),
+        ("p2", "0.1", "'p2' is the text \"0.1\", not a number"),
+        ("h", "480", "'h' is the text \"480\", not a number"),
+        ("fl_y", {}, "'fl_y' is the object {}, not a number"),
+        ("camera_model", 3, "'camera_model' is 3, not a name"),
+        ("is_fisheye", "false", "'is_fisheye' is the text \"false\", not true or false"),
         ("camera_model", "EQUIRECTANGULAR", "EQUIRECTANGULAR, which has no pinhole part.*ns-process-data"),
         ("camera_model", "VR180_L", "VR180_L, which has no pinhole part"),
         ("w", -1, "width is -1"),
@@ -513,6 +623,13 @@ def test_wrong_values_of_nerfstudio_cameras_are_named(tmp_path: Path, key: str, 
     path = save(tmp_path / "transforms.json", change(nerfstudio(views()), key, value))
     with pytest.raises(CameraError, match=rf"transforms\.json: camera 1 \('images/img_1\.png'\): .*{message}"):
         read_cameras(path)
+
+
+def test_sizes_of_whole_pixels_up_to_rounding_are_read(tmp_path: Path) -> None:
+    content = nerfstudio(views()) | {"w": WIDTH - 1e-5, "h": float(HEIGHT)}
+    assert_same(read_cameras(save(tmp_path / "t.json", content)), views(), lambda name: f"images/{name}")
+    with pytest.raises(CameraError, match=r"a size of 640\.4 x 480\.0 is not in whole pixels"):
+        read_cameras(save(tmp_path / "t.json", content | {"w": 640.4}))
 
 
 def test_missing_or_impossible_lenses_are_refused(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import random
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -22,7 +23,8 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.photos import check_photos
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import undistorted
-from tests.sgsst_core.files.test_camera_files import HEIGHT, WIDTH, views
+from tests.sgsst_core.files.test_camera_files import HEIGHT, WIDTH, colmap, inria, nerfstudio, views
+from tests.small_scenes import LFS_POINTER
 
 CAPTURES = Path(__file__).parent / "captures"
 #: nerfstudio's axes: x, z, -y of COLMAP's world.
@@ -150,6 +152,61 @@ def test_project_prefers_its_first_model_and_own_transforms(tmp_path: Path) -> N
     (project / "sparse" / "2" / "images.bin").unlink()
     shutil.copytree(CAPTURES / "metashape" / "sparse" / "0", project / "sparse" / "2", dirs_exist_ok=True)
     assert [view.name for view in read_cameras(project)] == [view.name for view in views()]
+
+
+@pytest.mark.parametrize("given", ["", "sparse", "sparse/0", "sparse/0/images.bin"])
+def test_larger_model_beside_is_named(tmp_path: Path, given: str) -> None:
+    for model, count in (("0", 2), ("1", 3), ("2", 5)):
+        colmap(tmp_path / "sparse" / model, views(count), text=model != "0")
+    notes: list[str] = []
+    if given == "sparse":
+        with pytest.raises(CameraError, match=rf"but {tmp_path}/sparse/2 has a COLMAP model. Give that folder"):
+            read_cameras(tmp_path / given)
+        return
+    assert len(read_cameras(tmp_path / given, None, notes.append)) == 2
+    (note,) = notes
+    assert note.startswith(f"{tmp_path}/sparse/0 has 2 images, and the model {tmp_path}/sparse/2 beside it 5. ")
+    assert f"Add --cameras {tmp_path}/sparse/2 if" in note
+    read_cameras(tmp_path / "sparse" / "2", None, pytest.fail)
+
+
+@pytest.mark.parametrize("name", ["transform_train.json", "my cameras.json", "transforms_val.json"])
+@pytest.mark.parametrize("content", [inria(views()), nerfstudio(views())])
+def test_the_only_json_with_cameras_is_read(tmp_path: Path, name: str, content: Any) -> None:
+    (tmp_path / name).write_text(json.dumps(content))
+    for other, text in (("settings.json", "{}"), ("broken.json", "{"), ("list.json", "[[1]]")):
+        (tmp_path / other).write_text(text)
+    assert_close(read_cameras(tmp_path), views())
+    (tmp_path / "other.json").write_text(json.dumps(content))
+    names = ", ".join(sorted([name, "other.json"]))
+    with pytest.raises(CameraError, match=f"holds several files with cameras: {names}. Give one"):
+        read_cameras(tmp_path)
+
+
+def test_folders_without_cameras_name_what_was_looked_at(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(CameraError, match=r"a\.json: is neither JSON"):
+        read_cameras(tmp_path)
+    (tmp_path / "b.json").write_text("{}")
+    with pytest.raises(CameraError, match=r"holds no cameras in a known format \(looked at a\.json, b\.json\)"):
+        read_cameras(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["cameras.json", "any.json", "transforms.json", "images.bin", "cameras.bin", "images.txt", "cameras.txt", "c.csv"],
+)
+@pytest.mark.parametrize("folder", [False, True])
+def test_pointers_of_git_lfs_are_named(tmp_path: Path, name: str, folder: bool) -> None:
+    if name[-3:] in ("bin", "txt"):
+        colmap(tmp_path / "model", views(), text=name.endswith("txt"))
+    path = tmp_path / "model" / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(LFS_POINTER)
+    if folder and name == "c.csv":
+        return
+    with pytest.raises(CameraError, match=rf"{name}: is a pointer of Git LFS, not the file itself. Run `git lfs pull`"):
+        read_cameras(path.parent if folder else path)
 
 
 def test_rig_capture_has_no_points_file(tmp_path: Path) -> None:

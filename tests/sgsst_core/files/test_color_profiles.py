@@ -141,11 +141,21 @@ BROKEN: dict[str, tuple[bytes, str]] = {
 }
 
 
+@pytest.mark.parametrize("length", [3 << 19, MAX_PROFILE_BYTES - 10_000])
+def test_long_profiles_of_a_png_are_used(tmp_path: Path, length: int) -> None:
+    """Pillow itself refuses more than 1 MiB."""
+    profile = rgb_profile(*ADOBE_RGB)
+    expected = load_image(save(tmp_path / "a.tif", colors(), profile))
+    long = profile + np.random.default_rng(2).bytes(length)
+    assert torch.equal(load_image(save(tmp_path / "a.png", colors(), long)), expected)
+
+
+@pytest.mark.parametrize("suffix", ["tif", "png"])
 @pytest.mark.parametrize("name", BROKEN)
-def test_unusable_profiles_are_ignored_with_a_warning(tmp_path: Path, name: str) -> None:
+def test_unusable_profiles_are_ignored_with_a_warning(tmp_path: Path, name: str, suffix: str) -> None:
     profile, reason = BROKEN[name]
-    path = save(tmp_path / "a.tif", colors(), profile)
-    with pytest.warns(ImageWarning, match=rf"a\.tif: its color profile is ignored, because it {reason}"):
+    path = save(tmp_path / f"a.{suffix}", colors(), profile)
+    with pytest.warns(ImageWarning, match=rf"a\.{suffix}: its color profile is ignored, because it {reason}"):
         image = load_image(path)
     assert torch.equal(image, torch.from_numpy(colors()).float() / 255)
     messages: list[str] = []

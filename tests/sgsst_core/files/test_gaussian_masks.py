@@ -14,7 +14,7 @@ import torch
 from sgsst_core.errors import MaskError
 from sgsst_core.files.gaussian_masks import read_mask
 from sgsst_core.files.scene_file import SceneFile, read_scene
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import LFS_POINTER, wall, write_files
 
 
 @pytest.fixture
@@ -46,6 +46,13 @@ def test_lowest_bit_of_a_byte_is_its_first_gaussian(tmp_path: Path, file: SceneF
     mask = read_mask(tmp_path / "m.BIN", file)
     assert mask.dtype == torch.bool
     assert mask.nonzero().flatten().tolist() == [0, 1, 15, 19]
+
+
+@pytest.mark.parametrize("name", ["m.bin", "m.npy"])
+def test_pointers_of_git_lfs_are_named(tmp_path: Path, file: SceneFile, name: str) -> None:
+    (tmp_path / name).write_text(LFS_POINTER)
+    with pytest.raises(MaskError, match=rf"{name}: is a pointer of Git LFS, not the file itself\. Run `git lfs pull`"):
+        read_mask(tmp_path / name, file)
 
 
 @pytest.mark.parametrize("rows", [1, 7, 8, 9, 20])

@@ -23,7 +23,9 @@ from sgsst_core.files.images import (
     load_image,
     save_jpg,
     save_png,
+    stored_size,
 )
+from tests.small_scenes import LFS_POINTER
 
 
 def gradient(height: int = 6, width: int = 9) -> np.ndarray:
@@ -64,6 +66,76 @@ def test_exif_orientation_is_applied(tmp_path: Path, orientation: int) -> None:
     image = load_image(path)
     assert torch.equal(image, torch.from_numpy(shown.copy()).float() / 255)
     assert image_size(path) == (image.shape[1], image.shape[0])
+
+
+def with_chunks(path: Path, *chunks: tuple[bytes, bytes], behind: bool = False) -> Path:
+    """Insert chunks of a PNG after its header, or behind its pixels."""
+    data = path.read_bytes()
+    added = b"".join(
+        struct.pack(">I4s", len(content), kind) + content + struct.pack(">I", zlib.crc32(kind + content))
+        for kind, content in chunks
+    )
+    at = len(data) - 12 if behind else 33
+    path.write_bytes(data[:at] + added + data[at:])
+    return path
+
+
+def exif_chunk(orientation: int) -> tuple[bytes, bytes]:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    return b"eXIf", exif.tobytes().removeprefix(b"Exif\0\0")
+
+
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize("kind", ["eXIf", "iTXt", "compressed"])
+def test_orientation_behind_the_pixels_is_applied_as_before_them(tmp_path: Path, behind: bool, kind: str) -> None:
+    """The XMP data are longer than 1 MiB, the limit of Pillow for compressed ones."""
+    xmp = b'<x tiff:Orientation="6"/>' + b" " * (3 << 19)
+    chunk = {
+        "eXIf": exif_chunk(6),
+        "iTXt": (b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + xmp),
+        "compressed": (b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0" + zlib.compress(xmp)),
+    }[kind]
+    path = with_chunks(save(tmp_path / "a.png", Image.fromarray(gradient())), chunk, behind=behind)
+    assert stored_size(path) == ((9, 6), 6)
+    assert image_size(path) == (6, 9)
+    assert torch.equal(load_image(path), torch.from_numpy(np.rot90(gradient(), -1).copy()).float() / 255)
+    assert torch.equal(load_image(path, oriented=False), torch.from_numpy(gradient()).float() / 255)
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_long_texts_are_skipped_and_text_bombs_refused(tmp_path: Path, behind: bool) -> None:
+    noise = np.random.default_rng(1).integers(1, 255, 3 << 20, np.uint8).tobytes()
+    texts = [
+        (b"tEXt", b"Comment\0" + noise),
+        (b"zTXt", b"Comment\0\0" + zlib.compress(noise)),
+        (b"iTXt", b"Comment\0\1\0\0\0" + zlib.compress(noise)),
+        (b"zTXt", b"broken\0\0" + noise[:9]),
+        (b"zTXt", b""),
+    ]
+    path = with_chunks(save(tmp_path / "a.png", Image.fromarray(gradient())), *texts, behind=behind)
+    assert torch.equal(load_image(path), torch.from_numpy(gradient()).float() / 255)
+    bombs = [(b"zTXt", b"a\0\0" + zlib.compress(bytes(9 << 20)))] * 2
+    with_chunks(path, *bombs, behind=behind)
+    for read in (load_image, image_size):
+        with pytest.raises(ImageError, match=r"a\.png: holds more than 16 MiB of compressed text\. Save it without"):
+            read(path)
+
+
+@pytest.mark.parametrize("stop", range(8, 140, 7))
+def test_truncated_pngs_with_metadata_are_refused(tmp_path: Path, stop: int) -> None:
+    path = with_chunks(save(tmp_path / "a.png", Image.fromarray(gradient(40, 40))), exif_chunk(3))
+    path.write_bytes(path.read_bytes()[:stop])
+    with pytest.raises(ImageError):
+        load_image(path)
+
+
+def test_pointers_of_git_lfs_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_text(LFS_POINTER)
+    for read in (load_image, image_size):
+        with pytest.raises(ImageError, match=r"a\.png: is a pointer of Git LFS, not the file itself\. Run `git lfs"):
+            read(path)
 
 
 def test_transparency_is_composited_on_white(tmp_path: Path) -> None:

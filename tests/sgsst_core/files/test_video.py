@@ -143,6 +143,18 @@ def test_paths_that_cannot_be_written_are_refused(tmp_path, name, alpha, message
         check_video_path(tmp_path / name, alpha=alpha)
 
 
+@pytest.mark.parametrize(
+    ("name", "exists"),
+    [("v1.2", True), ("v1.2", False), ("take.two", True), ("2026.01.31", False), ("still.png", True)],
+)
+def test_folder_with_a_dot_in_its_name_gets_images(tmp_path, name, exists):
+    if exists:
+        (tmp_path / name).mkdir()
+    with video_writer(tmp_path / name, 16, 16, 2) as write:
+        write(np.zeros((16, 16, 3), np.uint8))
+    assert [path.name for path in (tmp_path / name).iterdir()] == ["frame_0000.png"]
+
+
 def test_folder_named_like_a_video_is_refused(tmp_path):
     (tmp_path / "video.mp4").mkdir()
     with pytest.raises(OutputError, match="is a folder"):

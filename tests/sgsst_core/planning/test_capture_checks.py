@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,8 @@ from sgsst_core.files.images import save_png
 from sgsst_core.files.photos import Photo, check_photos
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.choice import OrbitRequest, make_orbit
-from sgsst_core.planning.capture_checks import compare_photos, fitted_psnr, frame_warnings, shown_by
+from sgsst_core.planning.capture_checks import compare_photos, fitted_psnr, frame_warnings
+from sgsst_core.planning.shown import shown_by
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
@@ -69,6 +71,31 @@ def test_gaussians_with_centers_in_the_frame_count_as_shown() -> None:
 def test_cameras_that_see_nothing_are_refused() -> None:
     with pytest.raises(CameraError, match="None of the 1 cameras sees a Gaussian"):
         frame_warnings(wall(), [blind_camera()], NEAR)
+
+
+@pytest.mark.parametrize("units", [1e-3, 0.02])
+def test_near_plane_beyond_the_scene_is_named(units: float) -> None:
+    """The error suggests a near plane that shows nearly everything."""
+    scene = wall()
+    small, views = replace(scene, means=scene.means * units), [moved(view, scale=units) for view in cameras()]
+    with pytest.raises(
+        CameraError, match=r"sees a Gaussian: 224 of 616 Gaussians are in .*, but nearer .* at 0\.2\. "
+    ) as error:
+        frame_warnings(small, views, NEAR)
+    found = re.search(r"Add --near (\S+),", str(error.value))
+    assert found
+    assert frame_warnings(small, views, float(found[1])) == []
+    assert shown_by(small.means, views, float(found[1])) == shown_by(scene.means, cameras(), NEAR)
+
+
+def test_near_plane_amid_the_scene_is_reported() -> None:
+    scene = ball()
+    depth = float((scene.means - cameras()[1].center).norm(dim=1).median())
+    (line,) = frame_warnings(scene, cameras(), depth)
+    assert re.fullmatch(r"warning: \d+ of 300 Gaussians are in their frames, but nearer .* plane at .*", line.decision)
+    found = re.search(r"add --near (\S+) ", line.reason)
+    assert found
+    assert frame_warnings(scene, cameras(), float(found[1])) == []
 
 
 def test_real_cameras_are_reported_only_in_other_frames(shared_data: Path) -> None:
