@@ -103,11 +103,11 @@ def camera_files(path: Path) -> list[Path]:
         CameraError: If there are none.
     """
     _check_exists(path)
-    found = find_cameras(path, issue_warning)
-    if found.is_dir():
-        return _model_files(found) or [path]
-    companion = found.with_name("dataparser_transforms.json")
-    return [found, companion] if companion.is_file() and companion != found else [found]
+    cameras = find_cameras(path, issue_warning)
+    if cameras.is_dir():
+        return _model_files(cameras) or [path]
+    companion = cameras.with_name("dataparser_transforms.json")
+    return [cameras, companion] if companion.is_file() and companion != cameras else [cameras]
 
 
 def _model_files(folder: Path) -> list[Path]:

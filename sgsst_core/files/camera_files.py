@@ -272,8 +272,8 @@ def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
         pinhole = (of_photos.fx, of_photos.fy, of_photos.cx, of_photos.cy)
         cameras.append(_with_lens(_camera(where, image.name, (lens.width, lens.height), pinhole, matrix), of_photos))
     if not cameras:
-        found = "".join(f" {note}." for note in notes)
-        raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.{found}")
+        reasons = "".join(f" {note}." for note in notes)
+        raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.{reasons}")
     unused = len(lenses.keys() - {image.camera for image in images})
     if unused:
         notes.append(f"{folder}: {unused:,} of {len(lenses):,} cameras belong to no image. {COMPARE}")

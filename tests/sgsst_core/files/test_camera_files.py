@@ -492,8 +492,8 @@ def test_counts_of_text_models_that_differ_are_reported(
     folder = colmap(tmp_path / "model", views(), text=True)
     assert notes_of(folder) == []
     (folder / file).write_text((folder / file).read_text().replace(old, new))
-    (found,) = notes_of(folder)
-    assert re.search(note, found)
+    (line,) = notes_of(folder)
+    assert re.search(note, line)
     with pytest.warns(CameraWarning, match=note):
         assert_same(read_cameras(folder), views())
 
@@ -528,8 +528,8 @@ def test_names_in_any_encoding_are_read_and_match_photos(tmp_path: Path, encodin
     assert len({view.name for view in cameras}) == 3
     assert "\u898b 1.png" in {view.name for view in cameras}
     "".join(view.name for view in cameras).encode()  # can be printed and stored
-    for found in (check_photos(photos, cameras), find_masks(photos, cameras)):
-        assert {os.fsencode(photo.path.name) for photo in found if photo} == set(names)
+    for matches in (check_photos(photos, cameras), find_masks(photos, cameras)):
+        assert {os.fsencode(photo.path.name) for photo in matches if photo} == set(names)
 
 
 def test_names_with_spaces_and_windows_line_ends_are_read(tmp_path: Path) -> None:

@@ -82,10 +82,10 @@ def test_near_plane_beyond_the_scene_is_named(units: float) -> None:
         CameraError, match=r"sees a Gaussian: 224 of 616 Gaussians are in .*, but nearer .* at 0\.2\. "
     ) as error:
         frame_warnings(small, views, NEAR)
-    found = re.search(r"Add --near (\S+),", str(error.value))
-    assert found
-    assert frame_warnings(small, views, float(found[1])) == []
-    assert shown_by(small.means, views, float(found[1])) == shown_by(scene.means, cameras(), NEAR)
+    suggested = re.search(r"Add --near (\S+),", str(error.value))
+    assert suggested
+    assert frame_warnings(small, views, float(suggested[1])) == []
+    assert shown_by(small.means, views, float(suggested[1])) == shown_by(scene.means, cameras(), NEAR)
 
 
 def test_near_plane_amid_the_scene_is_reported() -> None:
@@ -93,9 +93,9 @@ def test_near_plane_amid_the_scene_is_reported() -> None:
     depth = float((scene.means - cameras()[1].center).norm(dim=1).median())
     (line,) = frame_warnings(scene, cameras(), depth)
     assert re.fullmatch(r"warning: \d+ of 300 Gaussians are in their frames, but nearer .* plane at .*", line.decision)
-    found = re.search(r"add --near (\S+) ", line.reason)
-    assert found
-    assert frame_warnings(scene, cameras(), float(found[1])) == []
+    suggested = re.search(r"add --near (\S+) ", line.reason)
+    assert suggested
+    assert frame_warnings(scene, cameras(), float(suggested[1])) == []
 
 
 def test_real_cameras_are_reported_only_in_other_frames(shared_data: Path) -> None:
