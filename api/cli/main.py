@@ -129,9 +129,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILURE
 
 
-def _format_warning(message: Warning | str, category: type[Warning], *place: Any) -> str:
+def _format_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
     """Return a warning about the user's cameras as a line without the place in the code that issued it."""
-    return f"warning: {message}\n" if category is CameraWarning else _formatted(message, category, *place)
+    if category is CameraWarning:
+        return f"warning: {message}\n"
+    return _formatted(message, category, filename, lineno, line)
 
 
 def _exit_code(error: SgsstError) -> int:

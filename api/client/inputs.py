@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from api.client.answers import RequestError
 from sgsst_core.files.camera_folder import find_cameras, issue_warning
+from sgsst_core.files.labels import label
 
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".heic", ".heif", ".hif"}
 
@@ -136,4 +138,4 @@ def image_files(folder: Path) -> list[tuple[Path, str]]:
     images = sorted(path for path in visible if path.suffix.lower() in _IMAGE_SUFFIXES and path.is_file())
     if not images:
         raise RequestError(f"{folder}: contains no images. Give a folder of image files.")
-    return [(path, path.relative_to(folder).as_posix()) for path in images]
+    return [(path, label(os.fsencode(path.relative_to(folder).as_posix()))) for path in images]

@@ -360,10 +360,12 @@ def _name(where: str, entry: Mapping[str, Any], *keys: str) -> str:
 
 def _wrong(where: str, key: str, value: Any, expected: str, verb: str = "is") -> CameraError:
     """Return the error about a value of another kind than expected, which shows text in quotes."""
-    kind = {str: "the text ", list: "the list ", dict: "the object "}.get(type(value), "")
+    kinds: dict[type, str] = {str: "the text ", list: "the list ", dict: "the object "}
     shown = json.dumps(value, ensure_ascii=False)[:40]
     advice = "Write it without quotes, or export" if isinstance(value, str) else "Export"
-    return CameraError(f"{where}: {key!r} {verb} {kind}{shown}, not {expected}. {advice} the cameras again.")
+    return CameraError(
+        f"{where}: {key!r} {verb} {kinds.get(type(value), '')}{shown}, not {expected}. {advice} the cameras again."
+    )
 
 
 def _array(where: str, values: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> NDArray[Any]:

@@ -102,7 +102,6 @@ class PhotoFolder:
         others = (path for path in sorted(self._folder.rglob("*")) if path.is_file() and path not in matching)
         return [str(_normalized(str(path.relative_to(self._folder)))) for path in others if path.name[0] != "."]
 
-
     def unreadable(self, names: Collection[str]) -> list[str]:
         """Return the suffixes of files that have these names of cameras, but no suffix of an image."""
         stems = {self._without_extension(_normalized(name)).name for name in names}

@@ -80,7 +80,9 @@ def test_models_that_may_lack_views_are_reported(tmp_path: Path) -> None:
 
 
 def test_photos_mostly_without_cameras_or_with_several_are_reported(tmp_path: Path) -> None:
-    photos = write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2", *(f"other_{index}" for index in range(5))])
+    photos = write_photos(
+        tmp_path / "photos", ["view_0", "view_1", "view_2", *(f"other_{index}" for index in range(5))]
+    )
     (line,) = lines(read_capture(request(tmp_path), SCENE).with_photos(photos))
     assert line.startswith("photos: warning: 5 files are not used: they have the name of no camera: other_0.png, ")
     entries = json.loads((tmp_path / "cameras.json").read_text())
@@ -88,7 +90,9 @@ def test_photos_mostly_without_cameras_or_with_several_are_reported(tmp_path: Pa
     (tmp_path / "cameras.json").write_text(json.dumps(entries))
     capture = read_capture(SceneRequest(scene=tmp_path / "scene.ply", cameras=tmp_path / "cameras.json"), SCENE)
     shared = lines(capture.with_photos(photos))[0]
-    assert shared.startswith("photos: warning: 1 belong to several cameras each, of which they can show one: the names ")
+    assert shared.startswith(
+        "photos: warning: 1 belong to several cameras each, of which they can show one: the names "
+    )
 
 
 def test_photos_of_another_size_and_missing_ones_are_reported(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import gzip
 import hashlib
 import inspect
 import math
+import os
 import signal
 import socket
 import threading
@@ -293,6 +294,8 @@ def test_photos_of_all_formats_are_sent_except_hidden_files(tmp_path: Path) -> N
     for name in ("a.HEIC", "b.avif", "c.jpg", "._c.jpg", "notes.txt"):
         (tmp_path / name).touch()
     assert [name for _, name in image_files(tmp_path)] == ["a.HEIC", "b.avif", "c.jpg"]
+    (tmp_path / os.fsdecode("\uac00.png".encode("cp949"))).touch()  # sent as the cameras that name it are read
+    assert image_files(tmp_path)[-1][1] == "\xb0\xa1.png"
 
 
 @pytest.mark.parametrize("find", [camera_files, image_files])
