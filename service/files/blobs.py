@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import os
 import secrets
 import shutil
@@ -16,11 +17,11 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import IO, Protocol
 
 from service.errors import LockedError, LostUploadError, NoSpaceError, NotFoundError, StoreError, TooLargeError
-from service.files.cache import file_digest
 from service.files.objects import CHUNK, ObjectStore
 from service.store.inputs import Inputs, check_offset
 from service.store.tables import BlobRow, UploadRow
@@ -60,7 +61,7 @@ class Receiver:
         self._limit = limit
         self._ensure_space = ensure_space
         with disk_errors():
-            self._file = path.open("wb", buffering=0)
+            self._file = path.open("xb", buffering=0)
 
     def write(self, data: bytes) -> None:
         """Append bytes to the file.
@@ -122,9 +123,13 @@ class Blobs(ABC):
         self.incoming.mkdir(parents=True, exist_ok=True)
         self._inputs, self._min_free = inputs, min_free
 
+    def missing_space(self, size: int) -> int:
+        """Return the bytes to free before `size` bytes (at least one) can be written; not positive if they can."""
+        return max(size, 1) + self._min_free - shutil.disk_usage(self.incoming).free
+
     def ensure_space(self, size: int) -> None:
         """Raise NoSpaceError if `size` more bytes would leave too little free disk space."""
-        if shutil.disk_usage(self.incoming).free - size < self._min_free:
+        if self.missing_space(size) > 0:
             raise NoSpaceError
         inodes = os.statvfs(self.incoming)
         if inodes.f_files and inodes.f_favail < _MIN_FREE_INODES:  # file systems without an inode table report 0
@@ -261,8 +266,9 @@ class BlobFolder(Blobs):
             upload_id: Upload or receipt (`service.store.inputs`) that holds the blob from now on; None for none.
             link: Whether to hard-link the file instead of moving it, so that `path` remains.
         """
-        path.chmod(0o400)
-        size, sha256 = path.stat().st_size, file_digest(path)
+        with open_file(path, "rb") as file:
+            os.fchmod(file.fileno(), 0o400)
+            size, sha256 = os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
         final = self._blobs / sha256[:2] / f"{sha256}-{secrets.token_hex(4)}"
         final.parent.mkdir(exist_ok=True)
         if link:
@@ -301,7 +307,7 @@ class BlobFolder(Blobs):
     def start_upload(self, upload_id: str) -> None:
         """Create an empty file for the upload."""
         with disk_errors():
-            self.upload_path(upload_id).touch()
+            open_file(self.upload_path(upload_id), "ab").close()
 
     def append(self, upload: UploadRow, seconds: float) -> PartWriter:
         """Return a writer to the upload's file."""
@@ -311,12 +317,12 @@ class BlobFolder(Blobs):
         """Link the upload's file as a blob."""
         path = self.upload_path(upload.id)
         try:
-            with path.open("rb") as file:
+            with open_file(path, "rb") as file:
                 _lock(file)
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is not None:
                     return known
-                if path.stat().st_size != upload.length:
+                if os.fstat(file.fileno()).st_size != upload.length:
                     raise LostUploadError(upload.id)
                 sha256 = self.add(path, upload.id, link=True)
                 self._inputs.finish_upload(upload.id, sha256, seconds)
@@ -360,7 +366,7 @@ class _FileWriter:
         self._offset = self._saved = upload.offset
         try:
             with disk_errors():
-                self._file = path.open("r+b", buffering=0)
+                self._file = open_file(path, "r+b")
         except FileNotFoundError:
             raise LostUploadError(upload.id) from None
         except StoreError:
@@ -401,6 +407,24 @@ class _FileWriter:
         self._file.close()
 
 
+def open_file(path: Path, mode: str) -> FileIO:
+    """Open a received file without buffering, but not through a symbolic link, which is none of the service's.
+
+    Raises:
+        FileNotFoundError: If there is no such file, or it is a link.
+    """
+
+    def opened(name: str, flags: int) -> int:
+        try:
+            return os.open(name, flags | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            if error.errno == errno.ELOOP:
+                raise FileNotFoundError(errno.ENOENT, "is a symbolic link", name) from error
+            raise
+
+    return FileIO(path, mode, opener=opened)
+
+
 def _lock(file: IO[bytes]) -> None:
     """Lock an upload's file until it is closed; the system releases the lock if the process dies.
 
@@ -436,7 +460,7 @@ def flush_folder(folder: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
@@ -444,6 +468,6 @@ def _remove(path: Path) -> None:
 
 def _older(path: Path, before: float) -> bool:
     try:
-        return path.stat().st_ctime < before  # ctime also changes when the file is renamed
+        return path.lstat().st_ctime < before  # ctime also changes when the file is renamed
     except OSError:
         return False

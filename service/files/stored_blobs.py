@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import secrets
-import shutil
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -61,7 +60,7 @@ class StoredBlobs(Blobs):
         try:
             super().ensure_space(size)
         except NoSpaceError:
-            self._cache.free(size + self._min_free - shutil.disk_usage(self.incoming).free)
+            self._cache.free(self.missing_space(size))
             super().ensure_space(size)
 
     def add(self, path: Path, upload_id: str | None = None) -> str:
