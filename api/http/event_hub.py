@@ -69,13 +69,19 @@ class Hub:
         if self._task is not None:
             self._task.cancel()
 
-    async def ended(self, job_id: str, after: int) -> bool:
-        """Return whether the job has ended and has no events after the one with id `after`."""
+    async def resumed(self, job_id: str, after: int) -> int | None:
+        """Return the id of the event after which to continue a stream whose last event had the id `after`.
+
+        It is 0 if the job has not had such an event, because the database was restored from a backup: the stream starts
+        again. It is None if the job has ended, and has no later events.
+        """
         last = (await asyncio.to_thread(self._store.jobs.last_events, [job_id])).get(job_id)
         if last is None or last > after:
-            return False
+            return after
         rows = await asyncio.to_thread(self._store.jobs.events, job_id, last - 1, 1)
-        return bool(rows) and _to_item(rows[0]).ends
+        if rows and _to_item(rows[0]).ends:
+            return None
+        return after if after == last else 0
 
     async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
         """Yield the encoded events of a job after the one with id `after`, until the job has ended."""

@@ -79,14 +79,16 @@ async def watch_job(
             alias="Last-Event-ID",
             ge=0,
             lt=2**62,
-            description="ID of the last received event; later ones follow.",
+            description="ID of the last received event; later ones follow. After an ID that the job has not had, all "
+            "events follow.",
             examples=[42],
         ),
     ] = None,
 ) -> Response:
     """Watch a job. Resume an interrupted stream with `Last-Event-ID`, which browsers' `EventSource` sends by itself."""
     await asyncio.to_thread(find, context, caller, job_id)
-    if last_event_id and await context.hub.ended(job_id, last_event_id):
+    after = await context.hub.resumed(job_id, last_event_id) if last_event_id else 0
+    if after is None:
         return Response(status_code=204)
     response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(context.hub.watch(job_id, last_event_id or 0), 200, response_headers, "text/event-stream")
+    return StreamingResponse(context.hub.watch(job_id, after), 200, response_headers, "text/event-stream")
