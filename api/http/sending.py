@@ -28,7 +28,7 @@ _MOST_BYTES = 1 << 20
 #: Maximum number of characters of a suggested file name.
 _MAX_NAME = 120
 
-_ETAG = re.compile(r'"[^"]*"')
+_ETAG = re.compile(r'(W/)?("[^"]*")')
 
 IfNoneMatch = Annotated[
     str | None,
@@ -36,6 +36,14 @@ IfNoneMatch = Annotated[
         alias="If-None-Match",
         description="ETag of the known content; if it is current, the answer is 304.",
         examples=['"e7d2c939"'],
+    ),
+]
+IfMatch = Annotated[
+    str | None,
+    Header(
+        alias="If-Match",
+        description="ETag of the expected content; if the file has changed, the answer is 412.",
+        examples=[f'"{SHA256}"'],
     ),
 ]
 RangeHeader = Annotated[str | None, Header(alias="Range", description="One range of bytes.", examples=["bytes=0-1023"])]
@@ -56,6 +64,7 @@ class Conditions:
     range_: RangeHeader = None
     if_range: IfRange = None
     if_none_match: IfNoneMatch = None
+    if_match: IfMatch = None
 
 
 ConditionsDep = Annotated[Conditions, Depends()]
@@ -70,6 +79,13 @@ class RangeError(ServiceError):
     def __init__(self, size: int) -> None:
         super().__init__(f"The file has {size} bytes.")
         self.headers = {"Content-Range": f"bytes */{size}"}
+
+
+class ChangedError(ServiceError):
+    """A file that is not the one that `If-Match` names."""
+
+    code, status = "precondition-failed", 412
+    message = "The file is not the one that If-Match names. Its current ETag is that of a HEAD request."
 
 
 class JustRemovedError(NotFoundError):
@@ -137,22 +153,29 @@ def file_answers(starts: dict[str, Any], *, always_policy: bool = False) -> Resp
     }
 
 
-def names_etag(if_none_match: str | None, tag: str) -> bool:
-    """Return whether an If-None-Match header names an entity tag, by weak comparison (RFC 9110, section 13.1.2)."""
-    header = (if_none_match or "").strip()
-    return header == "*" or tag in _ETAG.findall(header)
+def names_etag(header: str | None, tag: str, *, strong: bool = False) -> bool:
+    """Return whether an If-None-Match or If-Match header names an entity tag (RFC 9110, section 13.1).
+
+    Args:
+        strong: Whether weak tags, which proxies make of strong ones when they compress, name nothing.
+    """
+    text = (header or "").strip()
+    return text == "*" or any(tag == named and not (strong and weak) for weak, named in _ETAG.findall(text))
 
 
 async def send_file(request: Request, file: SentFile, conditions: Conditions) -> Response:
     """Return the response with a file or a range of it.
 
     Raises:
+        ChangedError: If the file is not the one that If-Match names.
         RangeError: If the range starts after the end of the file.
         NotFoundError: If the file has just been deleted.
         LostFileError, DamagedFileError: If the stored file does not match its database row. No byte of it is sent.
     """
     tag = f'"{file.sha256}"'
     response_headers = _headers(file, tag)
+    if conditions.if_match is not None and not names_etag(conditions.if_match, tag, strong=True):
+        raise ChangedError
     if names_etag(conditions.if_none_match, tag):
         return Response(status_code=304, headers=response_headers)
     unchanged = conditions.if_range in (None, tag)
@@ -182,7 +205,7 @@ def _headers(file: SentFile, tag: str) -> dict[str, str]:
     response_headers = {
         "ETag": tag,
         "Accept-Ranges": "bytes",
-        "Cache-Control": "private, no-cache",
+        "Cache-Control": "private, no-cache, no-transform",  # compressed by a proxy, it would have no ranges
         "X-Content-Type-Options": "nosniff",
         "Content-Disposition": disposition(file.name, inline=file.inline),
     }

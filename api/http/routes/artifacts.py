@@ -16,6 +16,7 @@ from api.http.documentation import Responses, invalid, links, problems
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import ArtifactList, artifact_view
 from api.http.sending import (
+    ChangedError,
     ConditionsDep,
     JustRemovedError,
     RangeError,
@@ -87,6 +88,7 @@ _ANSWERS: Responses = {
     **problems(
         NoArtifactError,
         RangeError,
+        ChangedError,
         invalid("query.format", f"Input should be {listed([repr(each.name) for each in RESULT_FORMATS])}"),
         RefusedInputError(
             "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",

@@ -16,6 +16,7 @@ from api.http.input_references import input_entry
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import InputList, input_views
 from api.http.sending import (
+    ChangedError,
     ConditionsDep,
     JustRemovedError,
     RangeError,
@@ -63,6 +64,7 @@ _ANSWERS: Responses = {
     **problems(
         NoInputError,
         RangeError,
+        ChangedError,
         StoreError,
         LostFileError,
         DamagedFileError,

@@ -124,7 +124,14 @@ def test_inputs_are_sent_in_ranges(client: httpx.Client, files: dict[str, Path],
     assert client.get(url, headers={"If-None-Match": tag}).status_code == 304
     assert client.get(url, headers={"Range": "bytes=0-4", "If-Range": '"other"'}).content == whole
     assert client.get(url, headers={"Range": "bytes=0-4", "If-Range": tag}).content == whole[:5]
+    assert client.get(url, headers={"Range": "bytes=0-4", "If-Range": f"W/{tag}"}).content == whole
     refused(client.get(url, headers={"Range": f"bytes={size}-"}), 416, "range-not-satisfiable")
+    assert client.get(url, headers={"If-None-Match": f'"a", W/{tag}'}).status_code == 304
+    for matching in (tag, f'"a", {tag}', "*"):
+        assert client.get(url, headers={"If-Match": matching}).content == whole
+    for other in (f"W/{tag}", '"a"', "", tag[:-2] + '"'):
+        refused(client.get(url, headers={"If-Match": other, "If-None-Match": tag}), 412, "precondition-failed")
+        assert client.head(url, headers={"If-Match": other}).status_code == 412
 
 
 @pytest.mark.parametrize(
