@@ -9,7 +9,7 @@ import sys
 import textwrap
 import time
 
-_FIELDS = ("job", "attempt", "method", "path", "status", "seconds", "owner")
+_FIELDS = ("job", "attempt", "method", "path", "status", "seconds", "request_id", "owner")
 
 
 class JsonFormatter(logging.Formatter):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from functools import cached_property
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from service.outgoing import parse_origins
 
 GB = 1_000_000_000
+#: Maximum number of characters of a path at which a proxy offers the service.
+_MAX_SUBPATH = 200
 
 
 def is_loopback(host: str) -> bool:
@@ -20,6 +23,11 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def is_subpath(text: str) -> bool:
+    """Return whether a text can be the path at which a proxy offers the service, such as "/tools/sgsst"."""
+    return len(text) <= _MAX_SUBPATH and re.fullmatch(r"(/[A-Za-z0-9_~-][A-Za-z0-9._~-]*)+", text) is not None
 
 
 class ServiceSettings(BaseSettings):
@@ -42,8 +50,9 @@ class ServiceSettings(BaseSettings):
         max_jobs_a_day_per_key, max_gpu_seconds_a_day_per_key, max_bytes_per_key, max_requests_a_second_per_key: Quotas
             of keys without their own (`service.store.quotas`); None for no limit.
         max_connections: Maximum number of concurrent connections per API process, including event streams.
-        trusted_proxies: Addresses and networks of reverse proxies, separated by commas, whose `X-Forwarded-For` and
-            `X-Forwarded-Proto` are trusted; empty for none.
+        trusted_proxies: Addresses and networks of reverse proxies, separated by commas, whose `X-Forwarded-For`,
+            `X-Forwarded-Proto` and `X-Forwarded-Prefix` are trusted; empty for none.
+        root_path: Path at which a reverse proxy offers the service, such as `/sgsst`; replaces `X-Forwarded-Prefix`.
         min_free_bytes: Free disk space below which the service accepts no data.
         inspection_seconds, inspection_bytes: Base limits of CPU time and memory for checking a job's files; both grow
             with the size of the files (`service.inspection.inspector`).
@@ -96,6 +105,7 @@ class ServiceSettings(BaseSettings):
     max_requests_a_second_per_key: float | None = Field(None, gt=0)
     max_connections: int = Field(10_000, gt=0)
     trusted_proxies: str = ""
+    root_path: str = ""
     min_free_bytes: int = Field(2 * GB, ge=0)
     file_cache_bytes: int = Field(50 * GB, ge=0)
     inspection_seconds: float = Field(120, gt=0)
@@ -131,6 +141,14 @@ class ServiceSettings(BaseSettings):
     def _check_hosts(cls, text: str) -> str:
         parse_origins(text)
         return text
+
+    @field_validator("root_path")
+    @classmethod
+    def _check_root_path(cls, text: str) -> str:
+        path = text.rstrip("/")
+        if path and not is_subpath(path):
+            raise ValueError("must be a path such as /sgsst, of letters, digits and - . _ ~")
+        return path
 
     @cached_property
     def folder(self) -> Path:

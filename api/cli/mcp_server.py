@@ -135,7 +135,7 @@ class Tools:
             path = await self._write(job_id, _RESULT, out, _format(out)) if out else None
             preview = job.data["preview"]
             image = await self._image(job_id, preview) if preview else None
-        urls = {each["name"]: f"{self._client.url}{each['url']}" for each in artifacts}
+        urls = {each["name"]: self._address(job_id, each["name"]) for each in artifacts}
         result = Result(job_id=job_id, status=job.status, urls=urls, path=path)
         text = TextContent(type="text", text=result.model_dump_json())
         content = [text] if image is None else [text, image.to_image_content()]
@@ -154,7 +154,10 @@ class Tools:
         with _messages():
             name = await self._client.blend(job_id, weight, others, _format(out) or PLY.name)
             path = await self._write(job_id, name, out) if out else None
-        return Blended(url=f"{self._client.url}/v1/jobs/{job_id}/artifacts/{name}", path=path)
+        return Blended(url=self._address(job_id, name), path=path)
+
+    def _address(self, job_id: str, name: str) -> str:
+        return f"{self._client.url}/v1/jobs/{job_id}/artifacts/{name}"
 
     def _state(self, job: Job) -> State:
         progress = job.progress or {}

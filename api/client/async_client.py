@@ -269,7 +269,7 @@ class AsyncClient:
         """
         response = await self._transport.call("POST", f"{_job_path(job_id)}/shares", json={"days": days})
         share: dict[str, Any] = response.json()
-        return share | {"url": f"{self.url}{share['url']}"}
+        return share | {"url": f"{self.url}/shared#{share['url'].partition('#')[2]}"}
 
     async def shares(self, job_id: str) -> list[dict[str, Any]]:
         """Return the links to a result that have not expired, without their addresses."""

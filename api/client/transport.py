@@ -56,7 +56,7 @@ class Transport:
         if not (key.isascii() and key.isprintable()):
             raise RequestError("The API key contains characters that no key has. Copy it again.")
         self.http = _http_client(url, {"Authorization": f"Bearer {key}"} if key else {})
-        self.url = str(self.http.base_url)
+        self.url = str(self.http.base_url).rstrip("/")
         self.reached = False
         self._retrying = stamina.AsyncRetryingCaller(
             attempts=TRIES,

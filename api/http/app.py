@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-import time
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
@@ -13,14 +11,15 @@ from typing import Any
 
 import anyio.to_thread
 from fastapi import FastAPI
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp
 
 from api.http.context import Context
 from api.http.documentation import complete
 from api.http.event_hub import Hub
 from api.http.fetching import Fetcher
 from api.http.metrics import Metrics
-from api.http.problems import METHODS, Problem, add_handlers, logged_path, route_of
+from api.http.middleware import Methods, Observed, Proxied
+from api.http.problems import Problem, add_handlers
 from api.http.rates import Rates
 from api.http.readiness import Readiness
 from api.http.receipts import Receipts
@@ -44,8 +43,6 @@ from service.weights import check_weights
 _THREADS = 40
 #: Seconds that a request waits for a locked database, and for each response of the database server.
 _ANSWER_SECONDS = 8.0
-
-_access = logging.getLogger("api.access")
 
 _DESCRIPTION = """
 Style transfer for 3D Gaussian Splatting scenes. Send a scene, its cameras and a style image to `POST /v1/jobs`, watch
@@ -103,7 +100,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         context.readiness.close()
         store.close()
 
-    app = FastAPI(
+    app = _App(
         title="sgsst",
         version=_version(),
         description=_DESCRIPTION,
@@ -111,11 +108,11 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         docs_url=None,  # FastAPI's own page loads its script from a CDN
         redoc_url=None,
     )
+    app.settings = settings
     for module in (jobs, events, inputs, blends, artifacts, videos, shares, uploads, session, operations):
         app.include_router(module.router)
     add_static(app)
     add_handlers(app)
-    app.add_middleware(Observed, state=app.state)
 
     plain = app.openapi
 
@@ -128,32 +125,15 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     return app
 
 
-class Observed:
-    """Middleware that counts and logs requests by route instead of by path."""
+class _App(FastAPI):
+    """FastAPI with middleware around its own, which responds to unexpected errors."""
 
-    def __init__(self, app: ASGIApp, state: Any) -> None:
-        self._app, self._state = app, state
+    settings: ServiceSettings
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request; record its status and the time until its response starts."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        started = time.perf_counter()
-
-        async def observed(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                self._note(scope, message["status"], time.perf_counter() - started)
-            await send(message)
-
-        await self._app(scope, receive, observed)
-
-    def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        route = route_of(scope)
-        method = scope["method"] if scope["method"] in METHODS else "(other)"
-        self._state.context.metrics.observe(method, route, status, seconds)
-        extra = {"method": scope["method"], "path": logged_path(scope), "status": status, "seconds": round(seconds, 4)}
-        _access.info("request", extra=extra)
+    def build_middleware_stack(self) -> ASGIApp:
+        """Return the app with all middleware."""
+        inner = Methods(super().build_middleware_stack())
+        return Observed(Proxied(inner, self.settings), self.state)
 
 
 def _version() -> str:

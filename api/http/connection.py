@@ -9,7 +9,7 @@ from enum import Enum, auto
 from http import HTTPStatus
 from typing import Any
 
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from api.http.context import SESSION_COOKIE
 from api.http.problems import HeadTooLargeError, MalformedRequestError, TooManyConnectionsError, from_service
@@ -37,6 +37,21 @@ def _session_cookie(cookies: bytes) -> bytes:
     """
     pairs = (pair.strip() for pair in cookies.split(b";"))
     return b"; ".join(pair for pair in pairs if pair.startswith(_SESSION) and b'"' not in pair)
+
+
+class _Undelimited(RequestResponseCycle):
+    """Response to an HTTP/1.0 client, which knows no chunks: without a length, it ends with the connection."""
+
+    has_length = True
+
+    async def send(self, message: Any) -> None:
+        """Send a part of the response."""
+        if message["type"] == "http.response.start":
+            self.has_length = any(name.lower() == b"content-length" for name, _ in message["headers"])
+            self.chunked_encoding = None if self.has_length else False
+        elif not self.has_length:
+            self.expected_content_length = len(message.get("body", b""))
+        await super().send(message)
 
 
 class _Stage(Enum):
@@ -148,6 +163,8 @@ class Connection(HttpToolsProtocol):
         self._steps += 1
         self._stop_timer()
         super().on_headers_complete()
+        if self.scope["http_version"] == "1.0":
+            self.cycle.__class__ = _Undelimited
 
     def on_body(self, body: bytes) -> None:
         """Pass a block of a body to the app, and pause reading until the app has taken it."""

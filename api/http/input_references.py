@@ -6,6 +6,7 @@ import base64
 import re
 from typing import Any
 
+from api.http.addresses import subpath
 from api.http.multipart import BadRequestError
 from service.store.states import JobStatus
 from service.store.tables import JobRow
@@ -17,7 +18,7 @@ _INPUT = re.compile(r"([a-z]{1,10})(?::([0-9]{1,6}))?", re.ASCII)
 
 def parse_reference(text: str) -> tuple[str, str] | None:
     """Return the job's id and the input that a path of the API refers to, or None if it is not such a path."""
-    match = _PATH.fullmatch(text)
+    match = _PATH.fullmatch(text.removeprefix(subpath.get()))
     return (match[1], match[2]) if match else None
 
 

@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 from starlette.types import Scope
 
+from api.http.addresses import address, path_of
 from service.errors import ServiceError
 from service.parameters import JobParameters
 from sgsst_core.errors import InvalidInputError
@@ -151,18 +152,25 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     path, headers = request.scope["path"][:_SHOWN], dict(error.headers or {})
     if error.status_code == 404:
-        return problem(404, "not-found", f"There is nothing at {path!r}. /docs lists all paths.", headers)
+        detail = f"There is nothing at {path!r}. {address('/docs')} lists all paths."
+        return problem(404, "not-found", detail, headers)
     if error.status_code == 405:
-        headers["Allow"] = ", ".join(_allowed(request))  # the router lists only the methods of the first route
+        headers["Allow"] = ", ".join(_allowed(request.scope))  # the router lists only the methods of the first route
         detail = f"{path!r} does not support {request.method[:_SHOWN]}. Use one of {headers['Allow']}."
         return problem(405, "method-not-allowed", detail, headers)
     return problem(error.status_code, "http-error", str(error.detail), headers)
 
 
-def _allowed(request: Request) -> list[str]:
-    """Return the methods that the request's path supports, over all routes."""
-    routes = request.app.router.routes
-    scopes = {method: {**request.scope, "method": method} for method in METHODS}
+def _allowed(scope: Scope) -> list[str]:
+    """Return the methods that a request's path supports. HEAD is supported wherever GET is."""
+    routed = routed_methods(scope)
+    return [method for method in METHODS if method in routed or (method == "HEAD" and "GET" in routed)]
+
+
+def routed_methods(scope: Scope) -> list[str]:
+    """Return the methods that the path of a request has routes for."""
+    routes = scope["app"].router.routes
+    scopes = {method: {**scope, "method": method} for method in METHODS}
     return [method for method in METHODS if any(route.matches(scopes[method])[0] is Match.FULL for route in routes)]
 
 
@@ -175,8 +183,10 @@ async def _system_error(request: Request, error: Exception) -> JSONResponse:
 
 
 async def _unexpected(request: Request, error: Exception) -> JSONResponse:
-    _log.exception("%s %s failed unexpectedly", request.method, logged_path(request.scope), exc_info=error)
-    return from_service(InternalError())
+    scope, request_id = request.scope, request.scope["request_id"]
+    extra = {"request_id": request_id}
+    _log.exception("%s %s failed unexpectedly", request.method, logged_path(scope), exc_info=error, extra=extra)
+    return from_service(InternalError(request_id=request_id))
 
 
 def route_of(scope: Scope) -> str:
@@ -186,5 +196,5 @@ def route_of(scope: Scope) -> str:
 
 def logged_path(scope: Scope) -> str:
     """Return the path of a request for the log; that of its route if the path contains a secret token."""
-    path: str = scope["path"]
+    path = path_of(scope)
     return route_of(scope) if path.startswith(_SHARED) else path

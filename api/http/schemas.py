@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
+from api.http.addresses import address
 from service.examples import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.files.artifacts import media_type
 from service.parameters import JobName, JobParameters
@@ -555,7 +556,7 @@ def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRo
 
 
 def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) -> dict[str, Any]:
-    address = f"/v1/jobs/{job.id}"
+    base = address(f"/v1/jobs/{job.id}")
     return {
         "id": job.id,
         "name": job.name,
@@ -573,10 +574,10 @@ def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) ->
         "parameters": JobParameters().model_dump(mode="json") | job.parameters,
         "inputs": job.inputs,
         "links": Links(
-            self=address,
-            events=f"{address}/events",
-            artifacts=f"{address}/artifacts",
-            result=f"{address}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None,
+            self=base,
+            events=f"{base}/events",
+            artifacts=f"{base}/artifacts",
+            result=f"{base}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None,
         ),
     }
 
@@ -587,8 +588,8 @@ def input_views(job: JobRow) -> list[InputFileView]:
     for entry in job.inputs:
         role, index = entry["role"], counts[entry["role"]]
         counts[role] += 1
-        address = f"/v1/jobs/{job.id}/inputs/{role}" + (f":{index}" if index else "")
-        views.append(InputFileView(**entry, url=address))
+        path = f"/v1/jobs/{job.id}/inputs/{role}" + (f":{index}" if index else "")
+        views.append(InputFileView(**entry, url=address(path)))
     return views
 
 
@@ -613,7 +614,7 @@ def artifact_view(row: ArtifactRow) -> ArtifactView:
         sha256=row.sha256,
         media_type=media_type(row.name),
         created_at=row.created_at,
-        url=f"/v1/jobs/{row.job_id}/artifacts/{row.name}",
+        url=address(f"/v1/jobs/{row.job_id}/artifacts/{row.name}"),
     )
 
 

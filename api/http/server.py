@@ -45,8 +45,7 @@ def main() -> None:
         timeout_graceful_shutdown=_GRACE,
         timeout_keep_alive=75,
         server_header=False,
-        proxy_headers=bool(settings.trusted_proxies),
-        forwarded_allow_ips=settings.trusted_proxies,
+        proxy_headers=False,  # `api.http.middleware` reads them
     )
     server = uvicorn.Server(config)
     with contextlib.suppress(KeyboardInterrupt):

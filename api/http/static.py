@@ -2,7 +2,8 @@
 
 The files are read and compressed once, and served from memory. Their URLs, `/static/DIGEST/NAME`, contain a digest of
 all files, so that browsers can cache them forever. JavaScript modules import each other by relative paths, so a page
-always loads modules of the same version.
+always loads modules of the same version. All URLs in pages and modules are relative, so that a proxy can offer the
+service below any path.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 
 from fastapi import FastAPI, Request, Response
 
+from api.http.addresses import path_of
 from api.http.sending import names_etag
 from service.errors import NotFoundError
 from service.store.states import ACTIONS, TITLES, UNFINISHED
@@ -93,7 +95,7 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
     for name, body in contents.items():
         whole.update(f"{name}\0{len(body)}\0".encode() + body)
     digest = whole.hexdigest()[:_DIGEST_LETTERS]
-    pages = {name: contents.pop(name).replace(_PREFIX, f"/static/{digest}".encode()) for name, _ in _PAGES.values()}
+    pages = {name: contents.pop(name).replace(_PREFIX, f"static/{digest}".encode()) for name, _ in _PAGES.values()}
     return StaticFiles(
         digest, *({name: _file(name, body) for name, body in part.items()} for part in (contents, pages))
     )
@@ -132,7 +134,7 @@ def add_static(app: FastAPI) -> None:
     static = static_files()
 
     async def get_page(request: Request) -> Response:
-        name, policy = _PAGES[request.url.path]
+        name, policy = _PAGES[path_of(request.scope)]
         return _answer(request, static.pages[name], "no-cache", policy)
 
     async def get_file(request: Request, digest: str, name: str) -> Response:

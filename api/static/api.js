@@ -1,5 +1,5 @@
 // @ts-check
-/** Requests to the service. */
+/** Requests to the service. Their paths are relative to the page, which a proxy may offer below a subpath. */
 import { words } from "./words.js";
 
 /** Error answer of the service, with its message. */
@@ -53,7 +53,7 @@ export async function ask(method, path, { body, json, headers = {}, signal } = {
   }
   if (answer.ok) return answer;
   const told = await answer.json().catch(() => null);
-  if (answer.status === 401 && path !== "/v1/session") onSignIn();
+  if (answer.status === 401 && path !== "v1/session") onSignIn();
   throw new Problem(answer.status, told);
 }
 
@@ -83,7 +83,7 @@ export async function* eventsOf(answer) {
 }
 
 /** Return the path of a job's artifact. @param {string} id @param {string} name */
-export const artifactPath = (id, name) => `/v1/jobs/${encodeURIComponent(id)}/artifacts/${name.split("/").map(encodeURIComponent).join("/")}`;
+export const artifactPath = (id, name) => `v1/jobs/${encodeURIComponent(id)}/artifacts/${name.split("/").map(encodeURIComponent).join("/")}`;
 
 /** Return a random key; works in insecure contexts too, where `crypto.randomUUID` is missing. */
 export const randomKey = () => Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");

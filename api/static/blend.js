@@ -100,7 +100,7 @@ export class Blend {
     this.button.disabled = true;
     put(this.note, say.saving);
     try {
-      const { name } = await (await ask("POST", `/v1/jobs/${first.id}/blends`, { json })).json();
+      const { name } = await (await ask("POST", `v1/jobs/${first.id}/blends`, { json })).json();
       const href = artifactPath(first.id, name);
       h("a", { href, download: "" }).click();
       put(this.note, say.saved, " ", h("a", { href, download: "" }, name.split("/").pop()));

@@ -27,7 +27,7 @@ export class CompareView {
 
   async load() {
     try {
-      const jobs = await Promise.all(this.ids.map((id) => get(`/v1/jobs/${id}`, this.leaving.signal)));
+      const jobs = await Promise.all(this.ids.map((id) => get(`v1/jobs/${id}`, this.leaving.signal)));
       this.show(jobs);
       if (jobs.some((job) => UNFINISHED.has(job.status))) this.timer = setTimeout(() => (document.hidden ? this.later() : this.load()), OFTEN);
       else this.showStage(jobs.filter((job) => job.status === "succeeded"));

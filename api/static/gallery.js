@@ -38,7 +38,7 @@ export class Gallery {
   async loadUsed() {
     if (!this.element.open || this.loaded) return;
     this.loaded = true;
-    const { jobs } = await get("/v1/jobs?limit=60", this.signal).catch(() => ({ jobs: [] })), found = new Map();
+    const { jobs } = await get("v1/jobs?limit=60", this.signal).catch(() => ({ jobs: [] })), found = new Map();
     for (const job of jobs) {
       if (job.status !== "expired") for (const painting of storedInputs(job).style) if (!found.has(painting.sha256)) found.set(painting.sha256, painting);
     }

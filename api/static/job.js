@@ -84,7 +84,7 @@ export class JobView {
   async lookElsewhere() {
     const { name, status } = this.job;
     try {
-      const job = await get(`/v1/jobs/${this.id}`, this.leaving.signal);
+      const job = await get(`v1/jobs/${this.id}`, this.leaving.signal);
       if (job.name === name && job.status === status) return;
       this.job = job;
       this.update();
@@ -102,13 +102,13 @@ export class JobView {
   }
 
   async refresh() {
-    this.job = await get(`/v1/jobs/${this.id}`, this.leaving.signal);
+    this.job = await get(`v1/jobs/${this.id}`, this.leaving.signal);
     this.update();
   }
 
   async loadHistory() {
     try {
-      this.chart.add((await get(`/v1/jobs/${this.id}/progress`, this.leaving.signal)).points);
+      this.chart.add((await get(`v1/jobs/${this.id}/progress`, this.leaving.signal)).points);
     } catch (error) {
       if (!(error instanceof Problem) || error.status !== 404) return;
     }
@@ -117,7 +117,7 @@ export class JobView {
   /** Watch the events of the job. The browser reconnects by itself, and sends the id of the last event. */
   watch() {
     if (this.leaving.signal.aborted) return;
-    const source = (this.source = new EventSource(`/v1/jobs/${this.id}/events`));
+    const source = (this.source = new EventSource(`v1/jobs/${this.id}/events`));
     this.leaving.signal.addEventListener("abort", () => source.close());
     source.onopen = () => this.setConnected(true);
     source.onerror = () => {
@@ -214,7 +214,7 @@ export class JobView {
     const save = async (/** @type {Event} */ event) => {
       event.preventDefault();
       try {
-        this.job = await (await ask("PATCH", `/v1/jobs/${this.id}`, { json: { name: input.value.trim() } })).json();
+        this.job = await (await ask("PATCH", `v1/jobs/${this.id}`, { json: { name: input.value.trim() } })).json();
         close();
         this.update();
       } catch (error) {
@@ -251,10 +251,10 @@ export class JobView {
     if (this.shownFor === job.status) return;
     this.shownFor = job.status;
     put(this.actions,
-      actionsOf(job.status).map(({ name, title }) => button(say.actions[name] ?? title, () => ask("POST", `/v1/jobs/${this.id}/${name}`), UNFINISHED.has(job.status) ? "quiet" : "primary")),
+      actionsOf(job.status).map(({ name, title }) => button(say.actions[name] ?? title, () => ask("POST", `v1/jobs/${this.id}/${name}`), UNFINISHED.has(job.status) ? "quiet" : "primary")),
       UNFINISHED.has(job.status) ? null : [h("button.quiet", { type: "button", onclick: () => startFrom(this.job, { painting: false }) }, say.anotherPainting), h("button.quiet", { type: "button", onclick: () => startFrom(this.job) }, say.changed)]);
     put(this.deletion, UNFINISHED.has(job.status) ? null : deleteButton(say.remove, async () => {
-        await ask("DELETE", `/v1/jobs/${this.id}`);
+        await ask("DELETE", `v1/jobs/${this.id}`);
         location.hash = "#/jobs";
       }, (error) => this.tellError(error)));
   }
@@ -291,7 +291,7 @@ export class JobView {
     /** @type {any[]} */
     let found;
     try {
-      found = (await get(`/v1/jobs/${this.id}/artifacts`, this.leaving.signal)).artifacts;
+      found = (await get(`v1/jobs/${this.id}/artifacts`, this.leaving.signal)).artifacts;
     } catch {
       return;
     }
@@ -418,7 +418,7 @@ export class JobView {
   compareLink() {
     const chooser = h("select", { "aria-label": say.compareWith, hidden: true, onchange: () => chooser.value && (location.hash = `#/compare/${this.id}/${chooser.value}`) });
     const scene = this.job.inputs.find((/** @type {any} */ input) => input.role === "scene")?.sha256;
-    get("/v1/jobs?status=succeeded&limit=100", this.leaving.signal).then(({ jobs }) => {
+    get("v1/jobs?status=succeeded&limit=100", this.leaving.signal).then(({ jobs }) => {
       const others = jobs.filter((/** @type {any} */ job) => job.id !== this.id && job.inputs.some((/** @type {any} */ input) => input.role === "scene" && input.sha256 === scene));
       chooser.hidden = !others.length;
       const names = labels(others);

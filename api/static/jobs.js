@@ -41,7 +41,7 @@ export class JobsView {
   async load(more) {
     clearTimeout(this.timer);
     try {
-      const found = await get(`/v1/jobs?limit=${PAGE}${more && this.cursor ? `&cursor=${this.cursor}` : ""}`, this.leaving.signal);
+      const found = await get(`v1/jobs?limit=${PAGE}${more && this.cursor ? `&cursor=${this.cursor}` : ""}`, this.leaving.signal);
       const known = new Map(this.jobs.map((job) => [job.id, job]));
       for (const job of found.jobs) known.set(job.id, job);
       const newest = new Set(found.jobs.map((/** @type {any} */ job) => job.id)), last = found.jobs.at(-1)?.id ?? "";
@@ -97,7 +97,7 @@ export class JobsView {
   /** @param {any} job @param {string} name */
   deleter(job, name) {
     return deleteButton(words.job.remove, async () => {
-      await ask("DELETE", `/v1/jobs/${job.id}`);
+      await ask("DELETE", `v1/jobs/${job.id}`);
       this.jobs = this.jobs.filter((each) => each.id !== job.id);
       this.chosen.delete(job.id);
       announce(say.removed);

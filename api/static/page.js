@@ -20,7 +20,7 @@ let view = null;
 
 document.body.append(
   h("a.skip", { href: "#main", onclick: (/** @type {Event} */ event) => (event.preventDefault(), main.focus()) }, say.skip),
-  h("header.top", h("a.brand", { href: "#/" }, h("span.mark", { "aria-hidden": "true" }), say.name), h("nav", { "aria-label": say.main }, links), h("span.grow"), h("a.faint", { href: "/docs" }, say.api), out),
+  h("header.top", h("a.brand", { href: "#/" }, h("span.mark", { "aria-hidden": "true" }), say.name), h("nav", { "aria-label": say.main }, links), h("span.grow"), h("a.faint", { href: "docs" }, say.api), out),
   main,
   h("div.away", { id: "said", "aria-live": "polite" }),
 );
@@ -53,7 +53,7 @@ function enter() {
 }
 
 async function signOut() {
-  await ask("DELETE", "/v1/session").catch(() => {});
+  await ask("DELETE", "v1/session").catch(() => {});
   announce(words.signIn.out);
   signIn(words.signIn.out);
   forgetDraft(); // the next person at this computer must not see it
@@ -67,7 +67,7 @@ function signIn(why = out.hidden ? words.signIn.lead : words.signIn.expired) {
 }
 
 async function begin() {
-  const session = await get("/v1/session").catch(() => ({ keys_needed: false, signed_in: false }));
+  const session = await get("v1/session").catch(() => ({ keys_needed: false, signed_in: false }));
   out.hidden = !session.signed_in;
   if (session.keys_needed && !session.signed_in) signIn();
   else enter();

@@ -234,7 +234,7 @@ export class ResultStage {
 
 /** Return where the files of a job are. @param {any} job @param {AbortSignal} signal @returns {Files} */
 function filesOf(job, signal) {
-  const inputs = `/v1/jobs/${job.id}/inputs`;
+  const inputs = `v1/jobs/${job.id}/inputs`;
   const cameras = async () => {
     const found = (await get(inputs, signal)).inputs.filter((/** @type {any} */ input) => /^cameras(:|$)/.test(input.role));
     return Promise.all(found.map(async (/** @type {any} */ file) => ({ name: file.name, blob: await (await ask("GET", `${inputs}/${file.role}`, { signal })).blob() })));

@@ -10,7 +10,7 @@ const DAYS = [1, 7, 30, 90];
 export class ShareCard {
   /** @param {string} id id of the job */
   constructor(id) {
-    this.path = `/v1/jobs/${id}/shares`;
+    this.path = `v1/jobs/${id}/shares`;
     this.days = h("select", { "aria-label": say.lifetime }, DAYS.map((days) => h("option", { value: days, selected: days === 7 }, say.days(days))));
     this.link = h("div");
     /** Id of the share whose link is shown. */
@@ -35,7 +35,7 @@ export class ShareCard {
 
   async create() {
     const { id, url } = await (await ask("POST", this.path, { json: { days: Number(this.days.value) } })).json();
-    const input = h("input", { type: "text", readOnly: true, value: new URL(url, location.href).href, "aria-label": say.link, onfocus: () => input.select() });
+    const input = h("input", { type: "text", readOnly: true, value: new URL(`shared${url.slice(url.indexOf("#"))}`, location.href).href, "aria-label": say.link, onfocus: () => input.select() });
     this.linked = id;
     put(this.link, h("div.row", input, h("button.primary", { type: "button", onclick: () => copy(input) }, say.copy)), h("p.help", say.once));
     input.focus();

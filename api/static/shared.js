@@ -19,7 +19,7 @@ async function show() {
   leaving.abort();
   leaving = new AbortController();
   stage?.end();
-  const { signal } = leaving, at = `/v1/shared/${encodeURIComponent(location.hash.slice(1))}`;
+  const { signal } = leaving, at = `v1/shared/${encodeURIComponent(location.hash.slice(1))}`;
   try {
     const view = await get(at, signal);
     const job = { id: "shared", name: view.name, parameters: view.parameters, inputs: [{ role: "scene", sha256: "shared" }] };

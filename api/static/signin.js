@@ -27,7 +27,7 @@ export class SignInView {
   async send(done) {
     this.wrong.hidden = true;
     try {
-      await ask("POST", "/v1/session", { json: { key: this.input.value.trim() } });
+      await ask("POST", "v1/session", { json: { key: this.input.value.trim() } });
       this.input.value = "";
       done();
     } catch (error) {

@@ -6,7 +6,7 @@ import { ask } from "./api.js";
 
 export class StoredFile {
   /**
-   * @param {string} path path of the input in the API, by which a new job refers to it
+   * @param {string} path path of the input in the API, without the leading slash that a new job refers to it by
    * @param {{name: string, size: number, sha256: string}} input
    */
   constructor(path, { name, size, sha256 }) {
@@ -33,7 +33,7 @@ export function storedInputs(job) {
   const found = { scene: [], style: [], cameras: [], photos: [], mask: [] };
   for (const input of job.inputs) {
     const those = found[input.role];
-    those?.push(new StoredFile(`/v1/jobs/${job.id}/inputs/${input.role}:${those.length}`, input));
+    those?.push(new StoredFile(`v1/jobs/${job.id}/inputs/${input.role}:${those.length}`, input));
   }
   return found;
 }

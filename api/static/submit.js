@@ -214,7 +214,7 @@ export class SubmitView {
   async loadOptions() {
     let schema;
     try {
-      const document = await get("/openapi.json", this.leaving.signal);
+      const document = await get("openapi.json", this.leaving.signal);
       schema = document.components.schemas.JobParameters.properties;
     } catch {
       if (!this.leaving.signal.aborted) put(this.main, h("p.quiet", say.optionsAway));
@@ -278,7 +278,7 @@ export class SubmitView {
     for (const preset of this.times.keys()) {
       if (preset === body.parameters.preset || signal.aborted) continue;
       try {
-        tell(preset, await (await ask("POST", "/v1/jobs?dry_run=true", { json: { ...body, parameters: { ...body.parameters, preset } }, signal })).json());
+        tell(preset, await (await ask("POST", "v1/jobs?dry_run=true", { json: { ...body, parameters: { ...body.parameters, preset } }, signal })).json());
       } catch {
         // this preset is shown without a time
       }
@@ -559,7 +559,7 @@ export class SubmitView {
     this.sending = all.map((file) => /** @type {Upload} */ (this.uploads.get(file)));
     for (const upload of this.sending) upload.over = false;
     const ids = await sendAll(this.sending), idOf = new Map(all.map((file, i) => [/** @type {Chosen} */ (file), ids[i]]));
-    const named = (/** @type {Chosen[]} */ chosen) => chosen.map((file) => (file instanceof StoredFile ? file.path : idOf.get(file)));
+    const named = (/** @type {Chosen[]} */ chosen) => chosen.map((file) => (file instanceof StoredFile ? `/${file.path}` : idOf.get(file)));
     return {
       scene: named(scene.files)[0], style: named(style.files), cameras: this.orbiting ? [] : named(cameras.files),
       photos: this.orbiting ? [] : named(photos.files), mask: named(masks), parameters: this.parameters(),
@@ -607,7 +607,7 @@ export class SubmitView {
   /** @param {any} body */
   async plan(body) {
     this.tellPlanning(say.planning);
-    const answer = await ask("POST", "/v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: AbortSignal.any([this.leaving.signal, /** @type {AbortController} */ (this.stopping).signal]) });
+    const answer = await ask("POST", "v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: AbortSignal.any([this.leaving.signal, /** @type {AbortController} */ (this.stopping).signal]) });
     if (!answer.headers.get("content-type")?.includes("event-stream")) return void this.showPlan(body, await answer.json());
     for await (const { event, data } of eventsOf(answer)) {
       if (event === "planning") this.tellPlanning(say.planned(data.step, data.total), data.fraction);
@@ -644,7 +644,7 @@ export class SubmitView {
       const text = JSON.stringify(body), key = this.keys.get(text) ?? randomKey();
       this.keys.set(text, key); // a second attempt creates only those jobs that are missing
       try {
-        jobs.push(await (await ask("POST", "/v1/jobs", { json: body, headers: { "Idempotency-Key": key } })).json());
+        jobs.push(await (await ask("POST", "v1/jobs", { json: body, headers: { "Idempotency-Key": key } })).json());
       } catch (error) {
         if (jobs.length && error instanceof Error) error.message += ` ${say.createdSome(jobs.length, bodies.length)}`;
         throw error;

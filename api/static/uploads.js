@@ -171,7 +171,7 @@ export class Upload {
     const { file } = this;
     if (this.id) {
       try {
-        const answer = await ask("HEAD", `/v1/uploads/${this.id}`, { headers: TUS });
+        const answer = await ask("HEAD", `v1/uploads/${this.id}`, { headers: TUS });
         if (Number(answer.headers.get("Upload-Length")) !== file.size) throw new Problem(404, null);
         this.arrived(Number(answer.headers.get("Upload-Offset")));
         return;
@@ -182,7 +182,7 @@ export class Upload {
     }
     const name = btoa(String.fromCharCode(...new TextEncoder().encode(file.name.slice(-180))));
     const headers = { ...TUS, "Upload-Length": String(file.size), "Upload-Metadata": `filename ${name}` };
-    this.id = (await (await ask("POST", "/v1/uploads", { headers })).json()).id;
+    this.id = (await (await ask("POST", "v1/uploads", { headers })).json()).id;
     this.arrived(0);
   }
 
@@ -199,7 +199,7 @@ export class Upload {
     this.sending = new AbortController();
     const body = this.file.slice(this.sent, this.sent + size);
     const headers = { ...TUS, "Upload-Offset": String(this.sent), "Content-Type": "application/offset+octet-stream" };
-    const answer = await ask("PATCH", `/v1/uploads/${this.id}`, { body, headers, signal: this.sending.signal });
+    const answer = await ask("PATCH", `v1/uploads/${this.id}`, { body, headers, signal: this.sending.signal });
     this.arrived(Number(answer.headers.get("Upload-Offset")));
     const took = performance.now() - begun;
     this.part = Math.round(Math.min(LARGEST, Math.max(SMALLEST, (size * PART) / Math.max(took, 1), this.part / 2), this.part * 2));

@@ -47,7 +47,7 @@ export class VideoCard {
     this.tell(say.starting);
     const json = { path: this.path.value, seconds: Number(this.seconds.value), compare: this.compare.checked };
     try {
-      const answer = await ask("POST", `/v1/jobs/${this.job.id}/video`, { json, headers: { Accept: "text/event-stream" }, signal: this.signal });
+      const answer = await ask("POST", `v1/jobs/${this.job.id}/video`, { json, headers: { Accept: "text/event-stream" }, signal: this.signal });
       for await (const { event, data } of eventsOf(answer)) {
         if (event === "rendering") this.tell(say.rendering(data.step, data.total, data.eta_s), data.fraction);
         else if (event === "problem") throw new Problem(data.status, data);

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 
+from api.http.addresses import address
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.fetching import file_name, is_url
@@ -232,7 +233,7 @@ def _queue_job(
     )
     if created:
         receipt.hand_over()
-    response_headers = {"Location": f"/v1/jobs/{job.id}", "Retry-After": "2"}
+    response_headers = {"Location": address(f"/v1/jobs/{job.id}"), "Retry-After": "2"}
     if not created:
         response_headers["Idempotency-Replayed"] = "true"
     preview = None if created else jobs.previews([job.id]).get(job.id)

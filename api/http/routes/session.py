@@ -6,6 +6,7 @@ import asyncio
 
 from fastapi import APIRouter, Request, Response
 
+from api.http.addresses import subpath
 from api.http.context import (
     SESSION_COOKIE,
     Context,
@@ -119,7 +120,8 @@ def _answer(request: Request, text: str, seconds: int) -> Response:
     """
     secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
     response = Response(status_code=204, headers={"Cache-Control": "no-store"})
+    path = subpath.get() or "/"
     response.set_cookie(
-        SESSION_COOKIE, text, max_age=seconds, path="/", secure=secure, httponly=True, samesite="strict"
+        SESSION_COOKIE, text, max_age=seconds, path=path, secure=secure, httponly=True, samesite="strict"
     )
     return response

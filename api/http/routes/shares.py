@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
+from api.http.addresses import address
 from api.http.context import CallerDep, Context, ContextDep, ForeignSiteError, check_site, is_id
 from api.http.documentation import Responses, headers, invalid, links, problems
 from api.http.input_references import input_entry
@@ -17,7 +18,7 @@ from api.http.routes.artifacts import check_artifact
 from api.http.routes.inputs import check_input
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, ShareView, shared_view
-from api.http.sending import ConditionsDep, RangeError, SentFile, file_answers, send_file
+from api.http.sending import ChangedError, ConditionsDep, RangeError, SentFile, file_answers, send_file
 from service.errors import (
     DamagedFileError,
     LostFileError,
@@ -109,7 +110,8 @@ async def create_share(request: Request, job_id: JobId, context: ContextDep, cal
     check_media_type(request, "application/json")
     new = NewShare.model_validate(await read_json(request, context.settings, _MAX_BODY))
     row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
-    view = ShareCreated(id=row.id, created_at=row.created_at, expires_at=row.expires_at, url=f"/shared#{token}")
+    url = address(f"/shared#{token}")
+    view = ShareCreated(id=row.id, created_at=row.created_at, expires_at=row.expires_at, url=url)
     body = view.model_dump_json()
     return Response(body, 201, {"Cache-Control": "no-store"}, media_type="application/json")
 
@@ -178,6 +180,7 @@ _ANSWERS: Responses = {
         NoShareError,
         NoSharedFileError,
         RangeError,
+        ChangedError,
         RateLimitError,
         ForeignSiteError,
         StoreError,

@@ -10,10 +10,11 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Request, Response
 
+from api.http.addresses import address
 from api.http.context import CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.input_references import uploaded_name
-from api.http.multipart import BadRequestError, BodyTypeError, TooSlowError, body_blocks, check_media_type
+from api.http.multipart import BadRequestError, BodyTypeError, TooSlowError, body_blocks, check_media_type, media_type
 from api.http.numbers import Digits
 from api.http.receiving import ALGORITHMS, ChecksumError, LongerThanDeclaredError, append_body, parse_checksum
 from api.http.routes.jobs import IdempotencyHeader
@@ -39,6 +40,13 @@ from service.store.tables import UploadRow
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
 VERSION = "1.0.0"
+#: Supported extensions of the protocol, and headers of others: name, part of the value, extension.
+EXTENSIONS = "creation,expiration,checksum,termination"
+_UNSUPPORTED = (
+    ("Upload-Concat", "", "concatenation"),
+    ("Upload-Defer-Length", "", "creation-defer-length"),
+    ("Trailer", "upload-checksum", "checksum-trailer"),
+)
 #: Media type of a part of a file.
 _PART_TYPE = "application/offset+octet-stream"
 _HEADERS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
@@ -54,6 +62,17 @@ class WrongVersionError(ServiceError):
     def __init__(self, version: str) -> None:
         wrong = f"{version[:20]!r} is not supported" if version else "is missing"
         super().__init__(f"Tus-Resumable: {wrong}. Send {VERSION}.")
+
+
+class ExtensionError(ServiceError):
+    """A header of an extension of the tus protocol that is not supported."""
+
+    code, status = "unsupported-tus-extension", 400
+    headers = MappingProxyType({"Tus-Extension": EXTENSIONS})
+    example = ("Upload-Concat", "concatenation")
+
+    def __init__(self, header: str, extension: str) -> None:
+        super().__init__(f"{header}: the extension {extension!r} is not supported. Tus-Extension lists those that are.")
 
 
 class EmptyFileError(BadRequestError):
@@ -82,17 +101,26 @@ OffsetHeader = Annotated[
 ]
 
 
-def check_version(tus: Tus = "") -> None:
-    """Refuse a request that does not state the protocol version. tus requires it for all methods except OPTIONS.
+def check_protocol(request: Request, tus: Tus = "") -> None:
+    """Refuse a request that does not state the protocol version, or uses an unsupported extension.
+
+    tus requires the version for all methods except OPTIONS.
 
     Raises:
         WrongVersionError: If the version is missing or not supported.
+        ExtensionError: If a header belongs to an unsupported extension. Ignoring it would store other bytes than meant.
     """
     if tus != VERSION:
         raise WrongVersionError(tus)
+    for header, value, extension in _UNSUPPORTED:
+        if value in request.headers.get(header, "").lower() and header in request.headers:
+            raise ExtensionError(header, extension)
+    empty = request.headers.get("content-length", "0") == "0" and "transfer-encoding" not in request.headers
+    if request.method == "POST" and media_type(request) == _PART_TYPE and not empty:
+        raise ExtensionError("Content-Type", "creation-with-upload")
 
 
-_REQUIRES_TUS = [Depends(check_version)]
+_REQUIRES_TUS = [Depends(check_protocol)]
 
 
 def _following_operations(**parameters: str) -> dict[str, Any]:
@@ -120,7 +148,7 @@ def describe_uploads(context: ContextDep) -> Response:
     response_headers = {
         "Tus-Resumable": VERSION,
         "Tus-Version": VERSION,
-        "Tus-Extension": "creation,expiration,checksum,termination",
+        "Tus-Extension": EXTENSIONS,
         "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
         "Tus-Max-Size": str(context.settings.max_upload_bytes),
     }
@@ -143,6 +171,7 @@ def describe_uploads(context: ContextDep) -> Response:
             EmptyFileError,
             TooManyUploadsError,
             WrongVersionError,
+            ExtensionError,
             FileTooLargeError,
             invalid("header.Upload-Length", "Field required"),
             IdempotencyError,
@@ -181,7 +210,11 @@ def create_upload(
     )
     if row.sha256 is None:  # a repeated request may refer to an upload that is already complete
         context.blobs.start_upload(row.id)
-    response_headers = {**_HEADERS, "Location": f"/v1/uploads/{row.id}", "Upload-Expires": _http_date(row.expires_at)}
+    response_headers = {
+        **_HEADERS,
+        "Location": address(f"/v1/uploads/{row.id}"),
+        "Upload-Expires": _http_date(row.expires_at),
+    }
     return Response(upload_view(row).model_dump_json(), 201, response_headers, "application/json")
 
 
@@ -206,7 +239,7 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
                 maybe=("Upload-Metadata",),
             ),
         },
-        **problems(NoUploadError, WrongVersionError("")),
+        **problems(NoUploadError, WrongVersionError(""), ExtensionError),
     },
     operation_id="head_upload",
     response_class=Response,
@@ -253,6 +286,7 @@ _PATCH_BODY = {
             TooSlowError,
             OffsetError,
             WrongVersionError,
+            ExtensionError,
             LongerThanDeclaredError,
             BodyTypeError(_PART_TYPE),
             invalid("header.Upload-Offset", "Field required"),
@@ -309,7 +343,7 @@ async def append_upload(
     dependencies=_REQUIRES_TUS,
     responses={
         204: {"description": "The upload is deleted.", "headers": headers("Tus-Resumable", "Cache-Control")},
-        **problems(NoUploadError, WrongVersionError("")),
+        **problems(NoUploadError, WrongVersionError(""), ExtensionError),
     },
     operation_id="delete_upload",
 )

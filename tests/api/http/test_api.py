@@ -513,6 +513,15 @@ def raw(service: Service, head: str, body: bytes, *, close: bool = True) -> byte
         return answer
 
 
+def until_closed(service: Service, head: str) -> tuple[bytes, bytes]:
+    """Return head and body of the service's raw response, which ends when the service closes the connection."""
+    host, port = service.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=60) as connection:
+        connection.sendall(f"{head}\nHost: 127.0.0.1\n\n".replace("\n", "\r\n").encode())
+        first, _, body = connection.makefile("rb").read().partition(b"\r\n\r\n")
+    return first, body
+
+
 def test_truncated_body_is_rejected(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
     request = client.build_request("POST", "/v1/jobs", files=form(files))
     body = request.read()
@@ -633,6 +642,65 @@ def test_upload_in_parts_becomes_job(service: Service, client: httpx.Client, fil
     assert answer.status_code == 202, answer.text
     mixed = client.post("/v1/jobs", files=form(files, scene=None), data={"scene": unfinished["scene"]})
     assert mixed.status_code == 202, mixed.text
+
+
+def test_method_of_an_upload_can_be_sent_as_a_header(client: httpx.Client) -> None:
+    where = begin(client, 10)
+    part = {**TUS, "Upload-Offset": "0", "Content-Type": OFFSET_STREAM, "X-HTTP-Method-Override": "PATCH"}
+    answer = client.post(where, content=b"01234", headers=part)
+    assert (answer.status_code, answer.headers["upload-offset"]) == (204, "5")
+    head = client.post(where, headers={**TUS, "X-HTTP-Method-Override": "HEAD"})
+    assert (head.status_code, head.headers["upload-offset"]) == (200, "5")
+    assert client.get(where, headers={"X-HTTP-Method-Override": "BREW"}).json()["code"] == "method-not-allowed"
+    assert client.post(where, headers={**TUS, "X-HTTP-Method-Override": "DELETE"}).status_code == 204
+    assert client.head(where, headers=TUS).status_code == 404
+    assert client.post("/v1/uploads/x", headers={**TUS, "X-HTTP-Method-Override": "DELETE"}).status_code == 404
+
+
+def test_method_is_overridden_for_uploads_only(client: httpx.Client, files: dict[str, bytes]) -> None:
+    where = f"/v1/jobs/{client.post('/v1/jobs', files=form(files)).json()['id']}"
+    assert client.get(where, headers={"X-HTTP-Method-Override": "DELETE"}).status_code == 200
+    assert client.post(where, headers={"X-HTTP-Method-Override": "DELETE"}).status_code == 405
+    assert client.post(f"{where}/cancel").status_code == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Upload-Concat": "partial"},
+        {"Upload-Concat": "final;/v1/uploads/a /v1/uploads/b"},
+        {"Upload-Defer-Length": "1"},
+        {"Trailer": "X, Upload-Checksum"},
+        {"Content-Type": OFFSET_STREAM},
+    ],
+)
+def test_extensions_that_are_not_offered_are_refused(client: httpx.Client, headers: dict[str, str]) -> None:
+    answer = client.post("/v1/uploads", content=b"01234", headers={**TUS, "Upload-Length": "5", **headers})
+    problem = refused(answer, 400, "unsupported-tus-extension")
+    assert problem["detail"].startswith(next(iter(headers)))
+    assert answer.headers["tus-extension"] == "creation,expiration,checksum,termination"
+    where = begin(client, 5)
+    if "Trailer" in headers:
+        refused(send(client, where, 0, b"01234", **headers), 400, "unsupported-tus-extension")
+    assert client.head(where, headers=TUS).headers["upload-offset"] == "0"
+
+
+def test_links_among_unfinished_uploads_are_not_followed(
+    service: Service, client: httpx.Client, tmp_path: Path
+) -> None:
+    target = tmp_path / "target"
+    target.write_bytes(b"untouched!")
+    for offset, target_now in ((0, target), (0, tmp_path / "missing")):
+        where = begin(client, 10)
+        part = service.data / "uploads" / f"{where.rpartition('/')[2]}.part"
+        part.unlink()
+        part.symlink_to(target_now)
+        refused(send(client, where, offset, b"0123456789"), 404, "not-found")
+    assert (target.read_bytes(), target.stat().st_mode & 0o200) == (b"untouched!", 0o200)
+    assert not (tmp_path / "missing").exists()
+    with pytest.raises(FileNotFoundError, match="symbolic link"):
+        BlobFolder(tmp_path, None, 0).add(part)  # type: ignore[arg-type]  # the database is not reached
+    assert target.read_bytes() == b"untouched!"
 
 
 def test_broken_connection_preserves_received_bytes(service: Service, client: httpx.Client) -> None:
@@ -839,14 +907,63 @@ def test_stream_after_last_event_is_empty(client: httpx.Client, files: dict[str,
     assert client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(last - 1)}).status_code == 200
 
 
+def test_stream_after_unknown_event_starts_again(client: httpx.Client, files: dict[str, bytes]) -> None:
+    where = f"/v1/jobs/{client.post('/v1/jobs', files=form(files)).json()['id']}"
+    for number in (1000, 2**61):
+        with client.stream("GET", f"{where}/events", headers={"Last-Event-ID": str(number)}) as stream:
+            assert next(line for line in stream.iter_lines() if line.startswith("id: ")) == "id: 1"
+    client.post(f"{where}/cancel")
+
+
+def test_head_is_get_without_body(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+    job = client.post("/v1/jobs", files=form(files)).json()["id"]
+    where = f"/v1/jobs/{job}"
+    paths = ["/", "/docs", "/openapi.json", "/livez", "/readyz", "/v1/jobs", "/v1/session", "/v1/jobs/job_1"]
+    paths += [where + each for each in ("", "/inputs", "/inputs/scene", "/artifacts", "/artifacts/none.ply", "/shares")]
+    changing = {"date", "x-request-id"}
+    for path in paths:
+        head, response = client.head(path), client.get(path)
+        assert head.status_code == response.status_code, path
+        assert head.headers.keys() - changing == response.headers.keys() - changing, path
+        assert all(head.headers[name] == response.headers[name] for name in head.headers.keys() - changing), path
+        assert not head.content
+        first, body = until_closed(service, f"HEAD {path} HTTP/1.1\nConnection: close")
+        assert first.startswith(f"HTTP/1.1 {response.status_code} ".encode())
+        assert not body
+    assert client.head(f"{where}/events").headers["content-type"].startswith("text/event-stream")
+    assert client.head("/metrics").status_code == 200
+    assert all(method in client.put(where).headers["allow"] for method in ("GET", "HEAD", "PATCH", "DELETE"))
+    client.post(f"{where}/cancel")
+
+
+@pytest.mark.parametrize("path", ["/events", "/inputs/scene", "", "/none"])
+def test_responses_to_http_1_0_are_not_chunked(
+    service: Service, client: httpx.Client, files: dict[str, bytes], path: str
+) -> None:
+    where = f"/v1/jobs/{client.post('/v1/jobs', files=form(files)).json()['id']}"
+    client.post(f"{where}/cancel")  # the stream ends
+    wanted = client.get(where + path).content
+    head, body = until_closed(service, f"GET {where}{path} HTTP/1.0")
+    assert b"transfer-encoding" not in head.lower()
+    assert b"connection: close" in head.lower()
+    assert body == wanted
+
+
+def test_prefix_of_untrusted_proxy_is_ignored(client: httpx.Client) -> None:
+    headers = {**TUS, "Upload-Length": "10", "X-Forwarded-Prefix": "/sgsst"}
+    assert client.post("/v1/uploads", headers=headers).headers["location"].startswith("/v1/uploads/")
+
+
 def test_unknown_paths_and_methods(client: httpx.Client) -> None:
     answer = client.get("/v1/nothing")
     refused(answer, 404, "not-found")
     assert answer.json()["detail"] == "There is nothing at '/v1/nothing'. /docs lists all paths."
     answer = client.put("/v1/jobs")
     refused(answer, 405, "method-not-allowed")
-    assert answer.json()["detail"] == "'/v1/jobs' does not support PUT. Use one of GET, POST."
-    assert answer.headers["allow"] == "GET, POST"
+    assert answer.json()["detail"] == "'/v1/jobs' does not support PUT. Use one of GET, HEAD, POST."
+    assert answer.headers["allow"] == "GET, HEAD, POST"
+    assert client.head("/v1/nothing").status_code == 404
+    assert client.head("/v1/jobs/job_1/cancel").status_code == 405
     for job_id in ("job_00000000000", "../x", "job_' OR 1=1", "a" * 5000):
         assert client.get(f"/v1/jobs/{job_id}").status_code == 404
     refused(client.get("/v1/jobs", params={"limit": 0}), 422, "invalid-request")
