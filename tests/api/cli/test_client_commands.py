@@ -355,7 +355,7 @@ class Painter(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer a request for a job, for all jobs or for events."""
-        job = {"id": "job_1" + self.EVIL, "status": "running" + self.EVIL, "name": "name" + self.EVIL}
+        job: dict[str, Any] = {"id": "job_1" + self.EVIL, "status": "running" + self.EVIL, "name": "name" + self.EVIL}
         job |= {"created_at": "2026-01-01T00:00:00Z", "result": None, "error": {"message": "error" + self.EVIL}}
         progress = {"stage": "stage" + self.EVIL, "step": 1, "total": 2, "fraction": 0.5}
         if self.path.endswith("/events"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,7 +62,7 @@ def test_photos_of_any_name_give_the_result_of_the_command(tmp_path: Path) -> No
         path = tmp_path / "photos" / name.replace("\u00e9", "e\u0301")  # as macOS writes it
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.linear_gradient("L").resize((64, 48)).rotate(90 * level).save(path)
-    parameters = {"steps_coarse": 1, "steps_sos": 6, "backbone": "vgg16"}
+    parameters: dict[str, Any] = {"steps_coarse": 1, "steps_sos": 6, "backbone": "vgg16"}
     with Service(tmp_path / "data") as service, Client(service.url) as client:
         job = client.submit(ply, style, cameras=cameras, photos=tmp_path / "photos", **parameters)
         assert client.wait(job.id).status == "succeeded"
