@@ -7,6 +7,7 @@ in a file but belongs to no entry is counted and reported.
 
 from __future__ import annotations
 
+import codecs
 import math
 import mmap
 import re
@@ -225,9 +226,10 @@ def _is_pose(words: Sequence[str]) -> bool:
 def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
     """Yield the location of each line (for error messages) and its text without blanks around it, except comments."""
     with path.open("rb") as file:
-        for number, line in enumerate(file, start=1):
-            if not line.lstrip().startswith(b"#"):
-                yield f"{path}: line {number}", line.strip()
+        for number, data in enumerate(file, start=1):
+            line = data.removeprefix(codecs.BOM_UTF8).strip()
+            if not line.startswith(b"#"):
+                yield f"{path}: line {number}", line
 
 
 def _declared_count(path: Path) -> int | None:

@@ -536,7 +536,7 @@ def test_names_with_spaces_and_windows_line_ends_are_read(tmp_path: Path) -> Non
     folder = colmap(tmp_path / "model", views(), text=True)
     for file in ("cameras.txt", "images.txt"):
         content = (folder / file).read_text().replace("img_1", "my img_1")
-        (folder / file).write_text(content.replace("\n", "\r\n"), newline="")
+        (folder / file).write_text("\ufeff" + content.replace("\n", "\r\n"), newline="", encoding="utf-8")
     assert_same(
         sorted(read_cameras(folder), key=lambda view: view.name[-5]),
         views(),
