@@ -77,7 +77,7 @@ def check_video_path(out: Path, *, alpha: bool = False) -> None:
     elif suffix == ".png" and not _PATTERN.fullmatch(out.name):
         raise OutputError(f"{out}: names one image. Give a pattern such as frame_%04d.png, or a .mp4 file.")
     elif suffix != ".png":
-        raise OutputError(f"{out}: is no video. Name a .mp4 or .webm file, a frame_%04d.png, or a folder.")
+        raise OutputError(f"{out}: is no video. Name a .mp4 or .webm file, a frame_%04d.png, or an existing folder.")
 
 
 @contextmanager
