@@ -74,7 +74,7 @@ def usage_rows(heading: str) -> list[list[str]]:
 
 def test_usage_lists_every_scene_format() -> None:
     listed = {suffix for row in usage_rows("| scene format |") for suffix in re.findall(r"`(\.[\w.]+)`", row[0])}
-    assert {each.suffix for each in FORMATS} == listed | {".v4.spz"}
+    assert {each.suffix for each in FORMATS} == listed | {".v3.spz"}
 
 
 def test_usage_lists_every_capture() -> None:

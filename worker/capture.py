@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from torch import Tensor
+
 from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError, SceneError
 from sgsst_core.files.camera_files import read_cameras
@@ -16,6 +18,8 @@ from sgsst_core.files.images import WHITE, Color
 from sgsst_core.files.photos import MOST_MISSING, Photo, PhotoFolder, check_photos, photo_size, some_names
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
+from sgsst_core.orbit.subject import find_subject
+from sgsst_core.orbit.up import find_up
 from sgsst_core.planning.capture_checks import compare_photos, frame_warnings
 from sgsst_core.planning.shown import shown_by
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
@@ -28,6 +32,7 @@ from worker.request import SceneRequest
 #: Axes of an SPZ scene are those under which a typical view shows this many times as many Gaussians.
 _CLEARLY_MORE = 2.0
 _PERHAPS_NOT_ALL = "warning: they may not be all"
+_ROTATED = "the scene is rotated by 180 degrees about x (rub: y up, z backward)"
 
 
 @dataclass(frozen=True)
@@ -127,29 +132,47 @@ def read_capture(source: SceneRequest, scene: Scene, images: Path | None = None)
 
 
 def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAxes, list[Decision]]:
-    """Return the axes to read an SPZ scene with, and the line for the plan if the cameras decide.
+    """Return the axes to read an SPZ scene with, and the line for the plan if cameras or the scene decide.
 
-    If neither request nor file state them, they are those under which the cameras see the scene. Without cameras, or if
-    they see it under both, the axes stay "auto", and the scene gets a note. Nothing is raised: `read_scene` and
-    `read_capture` report unusable files.
+    If neither request nor file state them, they are those under which the cameras see the scene, or without cameras
+    those under which it stands upright. If that does not decide, or `up` is requested, the axes stay "auto", and the
+    scene gets a note. Nothing is raised: `read_scene` and `read_capture` report unusable files.
     """
     requested = source.spz_axes
-    if source.cameras is None or requested != "auto":
+    if requested != "auto":
         return requested, []
     try:
         header = read_scene_header(source.scene)
         if not isinstance(header, SpzHeader) or header.extended or header.stated_axes is not None:
             return requested, []
-        cameras = read_cameras(source.cameras, images, lambda note: None)  # `read_capture` reports the notes
-        means = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene.means
+        cameras = None
+        if source.cameras is not None:
+            cameras = read_cameras(source.cameras, images, lambda note: None)  # `read_capture` reports the notes
+        scene = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes="rdf").scene
     except (SceneError, CameraError):
         return requested, []
-    rdf = shown_by(means, cameras, source.near).typical
-    rub = shown_by(means * means.new_tensor([1, -1, -1]), cameras, source.near).typical
+    return _seen_axes(scene.means, cameras, source.near) if cameras else _upright_axes(scene, source.up)
+
+
+def _upright_axes(scene: Scene, requested_up: str) -> tuple[SpzAxes, list[Decision]]:
+    """Return the axes under which a scene that was read as RDF stands upright; see `choose_axes`."""
+    up = find_up(find_subject(scene)) if requested_up == "auto" else None
+    if up is None or not up.sure or up.name not in ("y", "-y"):
+        return "auto", []
+    reason = f"the file states none, and up is {up.name} in its values: {up.reason}; see --spz-axes"
+    if up.name == "-y":
+        return "rdf", [Decision("axes", "the scene is read as rdf: y down, z forward, as in a PLY", reason)]
+    return "rub", [Decision("axes", _ROTATED, reason)]
+
+
+def _seen_axes(means: Tensor, cameras: Sequence[Camera], near: float) -> tuple[SpzAxes, list[Decision]]:
+    """Return the axes under which cameras see positions [N, 3] that were read as RDF; see `choose_axes`."""
+    rdf = shown_by(means, cameras, near).typical
+    rub = shown_by(means * means.new_tensor([1, -1, -1]), cameras, near).typical
     if rub <= _CLEARLY_MORE * rdf:
-        return ("rdf" if rdf > _CLEARLY_MORE * rub else requested), []
+        return ("rdf" if rdf > _CLEARLY_MORE * rub else "auto"), []
     reason = f"a typical view has {rub:.1%} of the Gaussians in its frame so, and {rdf:.1%} with rdf; see --spz-axes"
-    return "rub", [Decision("axes", "the scene is rotated by 180 degrees about x (rub: y up, z backward)", reason)]
+    return "rub", [Decision("axes", _ROTATED, reason)]
 
 
 def about_rendering(file: SceneFile) -> list[Decision]:

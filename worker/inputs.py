@@ -182,7 +182,8 @@ def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> 
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = file.rendered(source.render_mode, source.eps2d)
     capture = read_capture(source, file.scene, images).with_photos(images).checked(file.scene, source.near)
-    return file, replace(capture, decisions=(*about_axes, *about_rendering(file), *capture.decisions))
+    decisions = (*about_notes(file), *about_axes, *about_rendering(file), *capture.decisions)
+    return file, replace(capture, decisions=decisions)
 
 
 def check_something_seen(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:

@@ -23,7 +23,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.stylizer import Stylizer
-from worker.capture import about_rendering, choose_axes, orbit_request, read_capture
+from worker.capture import about_notes, about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view
 from worker.options import DEFAULT_SIDE, JobVideo, VideoOptions
 from worker.outputs import check_folder, check_is_not_input
@@ -209,7 +209,7 @@ def _read(source: SceneRequest) -> tuple[Scene, list[Decision]]:
     axes, decisions = choose_axes(source)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = file.rendered(source.render_mode, source.eps2d)
-    return file.scene, [*decisions, *about_rendering(file)]
+    return file.scene, [*about_notes(file), *decisions, *about_rendering(file)]
 
 
 def _same_geometry(first: Scene, second: Scene) -> bool:

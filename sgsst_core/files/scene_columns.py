@@ -135,12 +135,12 @@ class SceneColumns:
             table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
             first = self._stored.column // 4
             arrays.append(table[:, first : first + 3 * self._stored.coefficients])
-        rotated = self.arrays["quats"][start : start + count].any(axis=1)
+        rotated = (self.arrays["quats"][start : start + count] != 0).any(axis=1)
         if not (rotated.all() and all(bool(np.isfinite(array).all()) for array in arrays)):
             self.flaws.append(self._flaws_of(start, count, rows))
 
     def _flaws_of(self, start: int, count: int, rows: NDArray[Any] | None) -> _Flaws:
-        unrotated: NDArray[np.bool_] = np.logical_not(self.arrays["quats"][start : start + count].any(axis=1))
+        unrotated: NDArray[np.bool_] = (self.arrays["quats"][start : start + count] == 0).all(axis=1)
         valid, counts = np.logical_not(unrotated), {}
         columns = {name: target[start : start + count] for name, target in self._targets.items()}
         if self._stored is not None and rows is not None:
@@ -153,12 +153,13 @@ class SceneColumns:
                 counts[name] = nans, int((~good).sum()) - nans
         return _Flaws(start, valid, counts, unrotated)
 
-    def valid_rows(self, path: Path, drop_invalid: bool) -> NDArray[np.bool_] | None:
+    def valid_rows(self, path: Path, drop_invalid: bool, surplus: str = "") -> NDArray[np.bool_] | None:
         """Return the mask [count] bool of valid rows; None if all are valid.
 
         Args:
             path: Path of the file, for messages.
             drop_invalid: Whether rows may be invalid.
+            surplus: Note on content after the rows. With it, invalid rows mean that the header does not fit them.
 
         Raises:
             SceneError: If invalid rows may not be dropped, or no valid rows remain.
@@ -188,6 +189,8 @@ class SceneColumns:
                 f"have a quaternion of length 0, not a rotation ({len(unrotated)}, first: Gaussian {min(unrotated)})"
             ]
         summary = f"{path}: {bad} of {len(retained)} Gaussians {', or '.join(flawed)}"
+        if surplus:
+            raise SceneError(f"{summary}. Its rows are not as the header declares: {surplus}.")
         if bad == len(retained):
             raise SceneError(f"{summary}. No valid Gaussians remain. Train or export the scene again.")
         if not drop_invalid:

@@ -24,12 +24,13 @@ from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
-from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets
+from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets, surplus
 from sgsst_core.files.formats.render_tag import FILTER_3D, UNTAGGED, RenderTag
 from sgsst_core.files.formats.scene_format import Arrays, SceneFormat, SceneHeader
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
-from sgsst_core.files.scene_columns import SceneColumns, about_rounded_positions
+from sgsst_core.files.formats.units import check_units
+from sgsst_core.files.scene_columns import FLAT, SceneColumns, about_rounded_positions
 from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import RenderMode
@@ -159,6 +160,7 @@ def read_scene(
     stamp = file.stamp
     stored = _row_layout(path, ply, stamp, offset) if ply and stays_in_file(header, held_bytes) else None
     columns, notes = _columns(header, stored), header.notes
+    about_rest = surplus(path, ply) if ply else ""
     if ply is None:
         notes += _read_arrays(file, header, columns)
     elif ply.text:
@@ -168,7 +170,9 @@ def read_scene(
     else:
         _read_binary(file, ply, offset, columns)
     file.check_unchanged(stamp)
-    retained = columns.valid_rows(path, drop_invalid)
+    retained = columns.valid_rows(path, drop_invalid, about_rest)
+    notes += (about_rest,) if about_rest else ()
+    notes += check_units(path, columns.arrays, FLAT, logits_stored=header.format is PLY)
     if ply is not None and ply.has_double_positions:
         notes += about_rounded_positions(columns.arrays["means"], columns.arrays["scales"])
     arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in columns.arrays.items()}

@@ -20,7 +20,7 @@ from torch import Tensor
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import HEAD_BYTES
-from sgsst_core.files.formats.unsupported import is_checkpoint
+from sgsst_core.files.formats.unsupported import is_checkpoint, refuse_changed_meaning
 from sgsst_core.files.scene_file import SceneFile, file_stamp
 from sgsst_core.files.splats import SPLAT_KEYS, scene_of_splats, stylized_splats
 from sgsst_core.refine.split import Refinement
@@ -89,6 +89,7 @@ def read_checkpoint(path: Path) -> TrainerCheckpoint:
     """
     stamp = file_stamp(path)
     tensors, names = _splats_in(path, _load(path))
+    refuse_changed_meaning(path, (name.removeprefix("_model.gauss_params.") for name in tensors))
     splats = {key: tensors[name] for key, name in names.items() if name in tensors}
     try:
         scene = scene_of_splats(splats)

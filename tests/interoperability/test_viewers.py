@@ -60,7 +60,7 @@ def test_playcanvas_reads_sog(modules: Path, full_scene: Scene, tmp_path: Path) 
     assert_same(read_scene(theirs).scene, read_scene(ours).scene)
 
 
-@pytest.mark.parametrize("name", ["ply", "compressed.ply", "spz", "sog"])
+@pytest.mark.parametrize("name", ["ply", "compressed.ply", "v3.spz", "sog"])
 def test_spark_reads_written_scenes(modules: Path, full_scene: Scene, tmp_path: Path, name: str) -> None:
     """Spark stores a Gaussian in 32 bytes: rotations and scales with about 10 bits, colors and opacities with 11.
 

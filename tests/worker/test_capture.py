@@ -21,6 +21,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
 from tests.sgsst_core.files.test_camera_files import colmap, views
+from tests.sgsst_core.orbit.objects import figure, ground, joined
 from tests.small_scenes import ball, cameras, wall, write_files
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.inputs import read_scene_and_capture
@@ -159,7 +160,7 @@ def test_orbits_are_not_checked(tmp_path: Path) -> None:
 def spz(folder: Path, scene: Scene) -> SceneRequest:
     """Write an SPZ file that does not state its axes."""
     path = folder / "scene.spz"
-    write_scene(path, scene, by_name("spz"))
+    write_scene(path, scene, by_name("v3.spz"))
     return SceneRequest(scene=path, cameras=write_files(folder)[1])
 
 
@@ -190,7 +191,7 @@ def test_scene_that_cameras_see_under_both_axes_gets_a_note(tmp_path: Path) -> N
     shift[2, 3] = 3
     views = [replace(view, world_to_camera=view.world_to_camera @ shift) for view in cameras()]
     centered = replace(ball(), means=ball().means - torch.tensor([0.0, 0.0, 3.0]))
-    write_scene(path, centered, by_name("spz"))
+    write_scene(path, centered, by_name("v3.spz"))
     source = SceneRequest(scene=path, cameras=write_files(tmp_path, centered, views)[1])
     assert not describe_axes(source)
     remove_axes(path)
@@ -206,10 +207,32 @@ def describe_axes(source: SceneRequest) -> str:
 
 
 def remove_axes(path: Path) -> None:
-    """Remove the extension with the axes from an SPZ file of version 3."""
-    data = bytearray(gzip.decompress(path.read_bytes()))
+    """Remove the extension with the axes from an SPZ file that was written by `write_scene`."""
+    data = bytearray(path.read_bytes())
+    if data.startswith(b"NGSP"):
+        data[14] &= ~2
+        data[16:20] = (32).to_bytes(4, "little")
+        path.write_bytes(bytes(data[:32] + data[44:]))
+        return
+    data = bytearray(gzip.decompress(data)[:-12])
     data[14] &= ~2
     path.write_bytes(gzip.compress(bytes(data)))
+
+
+@pytest.mark.parametrize("name", ["spz", "v3.spz"])
+def test_up_direction_determines_axes_of_spz_without_stated_axes_or_cameras(tmp_path: Path, name: str) -> None:
+    path, standing = tmp_path / "scene.spz", joined(ground(), figure())
+    source = SceneRequest(scene=path, orbit=3)
+    for scene, expected in ((standing, "rdf"), (rotated(standing), "rub"), (ball(), "auto")):
+        write_scene(path, scene, by_name(name))
+        remove_axes(path)
+        axes, about = choose_axes(source)
+        assert axes == expected
+        assert [line.item for line in about] == ["axes"] * (expected != "auto")
+        assert len(read_scene_and_capture(source)[0].notes) == (expected == "auto")
+        assert choose_axes(source.model_copy(update={"up": "y"})) == ("auto", [])
+        write_scene(path, scene, by_name(name))
+        assert choose_axes(source) == ("auto", [])
 
 
 def test_stated_axes_are_used(tmp_path: Path) -> None:

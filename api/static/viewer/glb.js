@@ -30,27 +30,33 @@ export async function glb(reader) {
   if (head.getUint32(4, true) !== 2 || size > MAX_JSON) throw new SceneError(words.scene.unreadable);
   const text = new TextDecoder().decode(await reader.take(size));
   const bytes = new DataView((await reader.take(8)).buffer).getUint32(0, true);
-  const { count, degree, places, rendering } = attributesOf(text, bytes), coefficients = places.length - NAMES.length;
+  const { parts, degree, rendering } = partsOf(text, bytes), coefficients = (degree + 1) ** 2 - 1;
+  const count = parts.reduce((sum, part) => sum + part.count, 0);
   /** @type {DataView | null} */
   let data = null;
+  let current = 0, first = 0; // batches are read in order
   return unpacked(count, degree, async (begin, into, width, some) => {
     data ??= new DataView((await reader.take(bytes)).buffer);
-    for (let i = 0; i < some; i++) unpack(data, places, begin + i, into, i * width, coefficients);
+    for (let i = 0; i < some; i++) {
+      while (begin + i >= first + parts[current].count) first += parts[current++].count;
+      unpack(data, parts[current].places, begin + i - first, into, i * width, coefficients);
+    }
   }, rendering);
 }
 
 /** @typedef {{offset: number, stride: number}} Place place of an attribute's values in the data */
 
+/** @typedef {{count: number, places: Place[]}} Part set of Gaussians: places of `NAMES`, then of harmonics */
+
 /**
- * Return the number of Gaussians, their SH degree, the places of their attributes (those of `NAMES`, then harmonics),
- * and their render mode.
+ * Return all sets of Gaussians, their largest SH degree and their render mode.
  *
  * @param {string} text the JSON document
  * @param {number} bytes size of the data
  */
-function attributesOf(text, bytes) {
+function partsOf(text, bytes) {
   try {
-    return attributesIn(JSON.parse(text), bytes);
+    return partsIn(JSON.parse(text), bytes);
   } catch (error) {
     throw error instanceof SceneError ? error : new SceneError(words.scene.unreadable); // values are missing
   }
@@ -60,24 +66,42 @@ function attributesOf(text, bytes) {
  * @param {any} document
  * @param {number} bytes
  */
-function attributesIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
-  const primitive = meshes.flatMap((/** @type {any} */ mesh) => mesh.primitives).find((/** @type {any} */ each) => each.extensions?.[EXTENSION]);
-  if (!primitive) throw new SceneError(words.scene.noSplats);
+function partsIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
+  const isSplats = (/** @type {any} */ each) => Boolean(each.extensions?.[EXTENSION]);
+  const shown = nodes.map((/** @type {any} */ node) => meshes[node.mesh]).filter((/** @type {any} */ mesh) => mesh?.primitives.some(isSplats));
+  const primitives = (shown.length ? shown : meshes).flatMap((/** @type {any} */ mesh) => mesh.primitives).filter(isSplats);
+  if (!primitives.length) throw new SceneError(words.scene.noSplats);
+  const plain = nodes.every((/** @type {any} */ node) => !node.matrix && !node.rotation && !node.scale && !node.translation);
+  /** @type {Part[]} */
+  const parts = primitives.map((/** @type {any} */ primitive) => partOf(primitive, accessors, bufferViews, bytes));
+  const count = parts.reduce((sum, part) => sum + part.count, 0);
+  if (!plain || !(count <= bytes)) throw new SceneError(words.scene.notShown("This kind of GLB"));
+  const degree = Math.max(...parts.map(({ places }) => Math.sqrt(places.length - NAMES.length + 1) - 1));
+  return { parts, degree, rendering: extrasRendering(primitives[0].extras) };
+}
+
+/**
+ * @param {any} primitive
+ * @param {any} accessors
+ * @param {any} bufferViews
+ * @param {number} bytes
+ * @returns {Part}
+ */
+function partOf(primitive, accessors, bufferViews, bytes) {
   const names = [...NAMES];
   let degree = 0;
   for (; degree < 3 && `${EXTENSION}:SH_DEGREE_${degree + 1}_COEF_0` in primitive.attributes; degree++) {
     for (let i = 0; i < 2 * degree + 3; i++) names.push(`${EXTENSION}:SH_DEGREE_${degree + 1}_COEF_${i}`);
   }
   const count = Number(accessors[primitive.attributes.POSITION].count);
-  const plain = nodes.every((/** @type {any} */ node) => !node.matrix && !node.rotation && !node.scale && !node.translation);
   const places = names.map((name) => {
     const { bufferView, byteOffset = 0, componentType, type, sparse } = accessors[primitive.attributes[name]], view = bufferViews[bufferView];
     const stride = view.byteStride ?? 4 * TYPES[type], offset = (view.byteOffset ?? 0) + byteOffset;
     const inside = count > 0 && offset >= 0 && stride > 0 && offset + (count - 1) * stride + 4 * TYPES[type] <= bytes;
-    if (!plain || componentType !== FLOAT || sparse || !inside) throw new SceneError(words.scene.notShown("This kind of GLB"));
+    if (componentType !== FLOAT || sparse || !inside) throw new SceneError(words.scene.notShown("This kind of GLB"));
     return { offset, stride };
   });
-  return { count, degree, places, rendering: extrasRendering(primitive.extras) };
+  return { count, places };
 }
 
 /**
@@ -86,7 +110,7 @@ function attributesIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
  * @param {number} i index of the Gaussian
  * @param {Float32Array} into
  * @param {number} o offset of its row
- * @param {number} coefficients number of harmonics per color channel
+ * @param {number} coefficients number of harmonics per color channel in a row, which may be more than the part has
  */
 function unpack(data, places, i, into, o, coefficients) {
   const [position, rotation, scale, opacity, color] = places.map(({ offset, stride }) => offset + i * stride);
@@ -102,7 +126,7 @@ function unpack(data, places, i, into, o, coefficients) {
   into[o + ROTATION + 1] = -value(rotation, 1);
   into[o + ROTATION + 2] = value(rotation, 0);
   into[o + ROTATION + 3] = value(rotation, 3);
-  for (let n = 0; n < coefficients; n++) {
+  for (let n = 0; n < places.length - NAMES.length; n++) {
     const { offset, stride } = places[NAMES.length + n];
     for (let c = 0; c < 3; c++) into[o + HARMONICS + c * coefficients + n] = ROTATED[n] * value(offset + i * stride, c);
   }

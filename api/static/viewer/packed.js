@@ -155,13 +155,12 @@ const SPZ_4 = 4;
  */
 
 /**
- * Return a scene of SPZ version 1 to 3, which is one gzip stream.
+ * Return a scene of SPZ version 1 to 3, which is one stream.
  *
- * @param {ByteReader} zipped
+ * @param {ByteReader} reader reader of the stream, which files compress
  * @returns {Promise<SceneFile>}
  */
-export async function spz(zipped) {
-  const reader = zipped.piped(/** @type {any} */ (new DecompressionStream("gzip")));
+export async function spz(reader) {
   const head = new DataView((await reader.take(16)).buffer);
   return spzScene(head, async (sizes) => {
     /** @type {Uint8Array<ArrayBuffer>[]} */

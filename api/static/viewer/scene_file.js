@@ -31,8 +31,8 @@ export async function openScene(reader, size) {
     const header = await readHeader(reader);
     return header.elements.some(({ name }) => name === "chunk") ? compressedPly(reader, header) : plainPly(reader, header);
   }
-  if (start[0] === 0x1f && start[1] === 0x8b) return spz(reader);
-  if (magic === "NGSP") return spz4(reader);
+  if (start[0] === 0x1f && start[1] === 0x8b) return spz(reader.piped(/** @type {any} */ (new DecompressionStream("gzip"))));
+  if (magic === "NGSP") return start[4] < 4 ? spz(reader) : spz4(reader);
   if (magic === "glTF") return glb(reader);
   const other = notShown(start);
   if (other) throw new SceneError(words.scene.notShown(other.title));

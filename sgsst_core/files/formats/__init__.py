@@ -18,11 +18,11 @@ from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat, SceneHeader
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.splat import SPLAT
-from sgsst_core.files.formats.spz import SPZ, SPZ_4
+from sgsst_core.files.formats.spz import SPZ, SPZ_3
 from sgsst_core.files.formats.unsupported import refuse_folder, refuse_unsupported
 
 #: All scene formats, in the order in which they are tried and listed. Formats without a magic number come last.
-FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_4, SOG, GLB, KSPLAT, SPLAT)
+FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_3, SOG, GLB, KSPLAT, SPLAT)
 #: Formats of results: PLY, and those that can be written in addition to it.
 RESULT_FORMATS = tuple(each for each in FORMATS if each.write)
 EXTRA_FORMATS = tuple(each for each in RESULT_FORMATS if each is not PLY)

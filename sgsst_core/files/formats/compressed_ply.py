@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.ply_header import PlyElement, PlyHeader, element_offsets, read_header
+from sgsst_core.files.formats.ply_header import PlyElement, PlyHeader, element_offsets, read_header, surplus
 from sgsst_core.files.formats.quantized import (
     OPACITY_LOGITS,
     SH_C0,
@@ -30,6 +30,7 @@ from sgsst_core.files.formats.quantized import (
 )
 from sgsst_core.files.formats.render_tag import comment_lines, ply_tag
 from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.files.formats.unsupported import refuse_changed_meaning
 from sgsst_core.scene.rendering import Rendering
 
 #: Number of Gaussians per chunk. Each chunk has its own quantization bounds.
@@ -81,6 +82,7 @@ def _read_header(start: FileStart) -> CompressedPlyHeader:
         raise SceneError(f"{path}: is a compressed PLY as text, which no program writes. Export it again as binary.")
     vertex = header.vertex
     _check_kinds(path, vertex, "u4", _PACKED)
+    refuse_changed_meaning(path, (prop.name for prop in vertex.properties))
     chunk = header.elements[header.names.index("chunk")] if "chunk" in header.names else None
     if chunk is None:
         raise SceneError(f"{path}: is a compressed PLY without element 'chunk', its bounds. Export it again.")
@@ -125,8 +127,10 @@ def _sh_coefficients(path: Path, header: PlyHeader, count: int) -> int:
     return coefficients
 
 
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
+    """Fill the arrays of a scene, and return the note on bytes after the last element."""
     assert isinstance(header, CompressedPlyHeader)
+    note = surplus(file.path, header.ply)
     starts = element_offsets(file.path, header.ply)
     kinds = {element.name: element.dtype(header.ply.byte_order) for element in header.ply.elements}
     for start in range(0, header.count, _BLOCK_ROWS):
@@ -142,6 +146,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
         _unpack(rows("vertex", start, count), chunks, {name: array[block] for name, array in into.items()})
         if header.coefficients:
             _unpack_harmonics(rows("sh", start, count), into["sh_rest"][block])
+    return (note,) if note else ()
 
 
 def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:

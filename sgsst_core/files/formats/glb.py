@@ -2,7 +2,8 @@
 
 A GLB is a JSON document followed by binary data. The Gaussians are a mesh primitive of points: each attribute is an
 accessor, which states offset, stride and type of its values in the data. Standard deviations and opacities are stored
-as they are, rotations as xyzw. The ratified specification is
+as they are, rotations as xyzw. All sets of Gaussians become one scene, each where its node shows it. The ratified
+specification is
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting.
 
 glTF has y up, z forward and x left. Scenes are rotated by 180 degrees about z from and to the axes of a PLY, after the
@@ -14,7 +15,9 @@ The specification does not define antialiasing. Written files state the render m
 from __future__ import annotations
 
 import json
+import re
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +29,11 @@ from numpy.typing import NDArray
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.formats.frame import Y_UP, Frame
 from sgsst_core.files.formats.quantized import SH_C0
-from sgsst_core.files.formats.render_tag import extras_of, extras_tag
+from sgsst_core.files.formats.render_tag import RenderTag, extras_of, extras_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.files.formats.surplus import surplus_note
+from sgsst_core.files.formats.units import logarithms, logits
+from sgsst_core.files.formats.unsupported import refuse_changed_meaning
 from sgsst_core.files.json_files import json_numbers
 from sgsst_core.scene.rendering import Rendering
 
@@ -39,7 +45,9 @@ _MAX_DEPTH = 64
 _MAX_BYTES = (1 << 32) - 1
 _EXTENSION = "KHR_gaussian_splatting"
 #: Extensions that change nothing in what is read. Files that require another one are refused.
-_KNOWN_EXTENSIONS = {_EXTENSION, "KHR_mesh_quantization"}
+_HARMLESS = re.compile(
+    rf"{_EXTENSION}|KHR_mesh_quantization|[A-Z]+_(materials|texture|lights|xmp|audio|animation)(_\w+)?"
+)
 _SUPPORTED = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
@@ -82,6 +90,8 @@ class Accessor:
         components: Number of components of a value.
         kind: NumPy type code of a component.
         normalized: Whether integers stand for -1 to 1, or 0 to 1.
+        view: Index of the buffer view.
+        view_end: Byte offset of the end of the buffer view.
     """
 
     offset: int
@@ -89,6 +99,8 @@ class Accessor:
     components: int
     kind: str
     normalized: bool
+    view: int
+    view_end: int
 
     @property
     def value_bytes(self) -> int:
@@ -97,18 +109,29 @@ class Accessor:
 
 
 @dataclass(frozen=True)
-class GlbHeader(SceneHeader):
-    """Header of a GLB scene.
+class GlbPart:
+    """Set of Gaussians of a GLB scene, as a node shows it.
 
     Attributes:
+        count: Number of Gaussians.
         accessors: Accessors by the names of the scene's tensors.
         harmonics: Accessors of the SH coefficients above degree 0.
         frame: Transformation to the axes of a PLY.
+        tag: Render mode that the set states.
     """
 
+    count: int
     accessors: dict[str, Accessor]
     harmonics: list[Accessor]
     frame: Frame
+    tag: RenderTag
+
+
+@dataclass(frozen=True)
+class GlbHeader(SceneHeader):
+    """Header of a GLB scene, which consists of `parts`."""
+
+    parts: list[GlbPart]
 
 
 def _read_header(start: FileStart) -> GlbHeader:
@@ -116,15 +139,20 @@ def _read_header(start: FileStart) -> GlbHeader:
     text, data_offset, data_bytes = _chunks(start)
     try:
         document = json.loads(text)
-        required = set(document.get("extensionsRequired", [])) - _KNOWN_EXTENSIONS
-        mesh, primitive = _splats(path, document)
-        if required or primitive["extensions"][_EXTENSION].get("extensions"):
-            names = sorted({*required, *primitive["extensions"][_EXTENSION].get("extensions", {})})
+        shown, hidden = _shown_splats(path, document)
+        required = {each for each in document.get("extensionsRequired", []) if not _HARMLESS.fullmatch(each)}
+        for primitive, _ in shown:
+            required |= set(primitive["extensions"][_EXTENSION].get("extensions") or {})
+        if required:
             raise SceneError(
-                f"{path}: its Gaussians need the glTF extension {', '.join(map(str, names))[:80]}, which cannot be "
+                f"{path}: its Gaussians need the glTF extension {', '.join(sorted(required))[:80]}, which cannot be "
                 "read. Export the GLB without compression."
             )
-        return _parsed(path, document, mesh, primitive, data_offset, data_bytes)
+        parts = [_part(path, document, *each, data_offset, data_bytes) for each in shown]
+        notes = [f"{hidden} sets of Gaussians that no node shows are left out"] if hidden else []
+        notes += ["animations are left out"] if document.get("animations") else []
+        notes += _about_rest(path, document, parts, (data_offset, data_offset + data_bytes))
+        return _joined(path, parts, data_bytes, tuple(notes))
     except _WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
 
@@ -159,29 +187,43 @@ def _chunks(start: FileStart) -> tuple[bytes, int, int]:
     return text, offset, size
 
 
-def _splats(path: Path, document: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    """Return the only primitive of Gaussians, and the index of its mesh."""
-    meshes = document.get("meshes", [])
-    splats = [
-        (index, primitive)
+def _shown_splats(path: Path, document: dict[str, Any]) -> tuple[list[tuple[dict[str, Any], NDArray[np.float64]]], int]:
+    """Return each primitive of Gaussians with the transformation [4, 4] of the node that shows it.
+
+    A mesh that several nodes show is returned as often. If no node shows any Gaussians, each is returned with the
+    identity.
+
+    Returns:
+        Primitives with their transformations, and the number of other primitives of Gaussians, which no node shows.
+    """
+    meshes, nodes = document.get("meshes", []), document.get("nodes", [])
+    splats = {
+        index: own
         for index, mesh in enumerate(meshes)
-        for primitive in mesh["primitives"]
-        if _EXTENSION in primitive.get("extensions", {})
-    ]
+        if (own := [each for each in mesh["primitives"] if _EXTENSION in each.get("extensions", {})])
+    }
     if not splats:
         raise SceneError(
             f"{path}: holds {len(meshes)} meshes but no Gaussians ({_EXTENSION}). Train Gaussians on the object first."
         )
-    if len(splats) > 1:
-        raise SceneError(f"{path}: holds {len(splats)} sets of Gaussians; one can be read. Merge them first.")
-    return splats[0]
+    showing = [(index, node["mesh"]) for index, node in enumerate(nodes) if node.get("mesh") in splats]
+    if not showing:
+        return [(each, np.eye(4)) for own in splats.values() for each in own], 0
+    parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
+    shown = [(each, _node_matrix(nodes, parents, index)) for index, mesh in showing for each in splats[mesh]]
+    return shown, sum(len(own) for mesh, own in splats.items() if mesh not in {mesh for _, mesh in showing})
 
 
 @np.errstate(over="ignore", invalid="ignore")  # the transformation is checked
-def _parsed(
-    path: Path, document: dict[str, Any], mesh: int, primitive: dict[str, Any], data_offset: int, data_bytes: int
-) -> GlbHeader:
-    """Parse a glTF document. Errors of `_WRONG_JSON` mean that a value is missing or wrong."""
+def _part(
+    path: Path,
+    document: dict[str, Any],
+    primitive: dict[str, Any],
+    matrix: NDArray[np.float64],
+    data_offset: int,
+    data_bytes: int,
+) -> GlbPart:
+    """Parse a primitive of Gaussians. Errors of `_WRONG_JSON` mean that a value is missing or wrong."""
     declared = primitive["extensions"][_EXTENSION]
     for name, supported in _SUPPORTED.items():
         if declared.get(name, supported) != supported:
@@ -190,6 +232,7 @@ def _parsed(
                 "Export it again."
             )
     attributes = primitive["attributes"]
+    refuse_changed_meaning(path, attributes)
     count = document["accessors"][attributes["POSITION"]]["count"]
     if type(count) is not int or count < 1:
         raise ValueError(f"count: {count}")
@@ -201,15 +244,50 @@ def _parsed(
 
     present = sum(name in attributes for name in _HARMONICS)
     coefficients = min(number for number in COEFFICIENTS.values() if number >= present)
-    return GlbHeader(
-        GLB,
+    try:
+        frame = Frame.of(Y_UP @ matrix)
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}, by the transformation of its node. Export it without that.") from error
+    return GlbPart(
         count,
-        coefficients,
         {name: accessor(*attribute) for name, attribute in _ATTRIBUTES.items()},
         [accessor(name, "VEC3") for name in _HARMONICS[:coefficients]],
-        _frame(path, document, mesh),
-        tag=extras_tag(primitive.get("extras"), "the extras of the GLB"),
+        frame,
+        extras_tag(primitive.get("extras"), "the extras of the GLB"),
     )
+
+
+def _joined(path: Path, parts: list[GlbPart], data_bytes: int, notes: tuple[str, ...]) -> GlbHeader:
+    """Return the header of a scene of all parts, which must have the same render mode."""
+    count = sum(part.count for part in parts)
+    if count > data_bytes:
+        raise SceneError(f"{path}: its nodes show {count} Gaussians, more than its {data_bytes} bytes can hold.")
+    if len({part.tag.rendering for part in parts}) > 1:
+        raise SceneError(f"{path}: its {len(parts)} sets of Gaussians have different render modes. Export them apart.")
+    coefficients = max(len(part.harmonics) for part in parts)
+    return GlbHeader(GLB, count, coefficients, parts, notes=notes, tag=parts[0].tag)
+
+
+def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data: tuple[int, int]) -> list[str]:
+    """Return notes on bytes after the binary data, and after positions that fill a buffer view alone.
+
+    Args:
+        path: Path of the file.
+        document: glTF document.
+        parts: Sets of Gaussians.
+        data: Byte offsets of the binary data and of their end.
+    """
+    declared = document["buffers"][0].get("byteLength", data[1] - data[0])
+    if type(declared) is not int or declared < 0:
+        raise ValueError(f"byteLength: {declared}")
+    spans = [(data[0] + declared, data[1]), (data[1], path.stat().st_size)]
+    readers = Counter(entry.get("bufferView") for entry in document["accessors"])
+    for part in parts:
+        positions = part.accessors["means"]
+        last = positions.offset + (part.count - 1) * positions.stride
+        if readers[positions.view] == 1:
+            spans.append((last + positions.value_bytes, positions.view_end))
+    return [note for span in dict.fromkeys(spans) if (note := surplus_note(path, *span))]
 
 
 def _accessor(
@@ -232,30 +310,19 @@ def _accessor(
     if not inside or not value_bytes <= stride <= _MAX_STRIDE:
         raise ValueError(f"accessor {index}: {count} values are more than its {size} bytes can hold")
     normalized = bool(entry.get("normalized", False)) and code in _LARGEST
-    return Accessor(data_offset + start + first, stride, _COMPONENTS[kind], code, normalized)
+    offset, end = data_offset + start + first, data_offset + start + size
+    return Accessor(offset, stride, _COMPONENTS[kind], code, normalized, entry["bufferView"], end)
 
 
-def _frame(path: Path, document: dict[str, Any], mesh: int) -> Frame:
-    """Return the transformation of the only node that shows a mesh, to the axes of a PLY."""
-    nodes = document.get("nodes", [])
-    showing = [index for index, node in enumerate(nodes) if node.get("mesh") == mesh]
-    if len(showing) > 1:
-        raise SceneError(f"{path}: {len(showing)} nodes show its Gaussians; one can be read. Export them once.")
-    matrix = Y_UP @ _node_matrix(nodes, showing)
-    try:
-        return Frame.of(matrix)
-    except ValueError as error:
-        raise SceneError(f"{path}: {error}, by the transformation of its node. Export it without that.") from error
-
-
-def _node_matrix(nodes: list[dict[str, Any]], showing: list[int]) -> NDArray[np.float64]:
-    """Return the transformation [4, 4] of the node that shows the Gaussians; identity if no node does."""
-    parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
-    matrix, node = np.eye(4), showing[0] if showing else None
-    for _ in range(_MAX_DEPTH):
-        if node is None:
-            return matrix
-        matrix, node = _local_matrix(nodes[node]) @ matrix, parents.get(node)
+def _node_matrix(nodes: list[dict[str, Any]], parents: dict[int, int], index: int) -> NDArray[np.float64]:
+    """Return the transformation [4, 4] of a node, with those of the nodes above it."""
+    matrix, node = np.eye(4), index
+    with np.errstate(over="ignore", invalid="ignore"):  # the transformation is checked
+        for _ in range(_MAX_DEPTH):
+            matrix = _local_matrix(nodes[node]) @ matrix
+            if node not in parents:
+                return matrix
+            node = parents[node]
     raise ValueError("the nodes are nested too deeply, or form a cycle")
 
 
@@ -281,21 +348,31 @@ def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene. Opacities of 0 and 1 and standard deviations of 0 become infinite."""
     assert isinstance(header, GlbHeader)
-    accessors = header.accessors
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # invalid values are reported later
+    first = 0
+    for part in header.parts:
+        rows = slice(first, first + part.count)
+        _read_part(file, part, {name: array[rows] for name, array in into.items()})
+        first += part.count
+
+
+def _read_part(file: OpenScene, part: GlbPart, into: Arrays) -> None:
+    """Fill the arrays of a set of Gaussians."""
+    accessors = part.accessors
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid values are reported later
         for name in ("means", "sh_dc"):
-            for block, values in _values(file, accessors[name], header.count):
+            for block, values in _values(file, accessors[name], part.count):
                 into[name][block] = values
-        for block, values in _values(file, accessors["quats"], header.count):
+        for block, values in _values(file, accessors["quats"], part.count):
             into["quats"][block] = np.roll(values, 1, axis=1)
-        for block, values in _values(file, accessors["scales"], header.count):
-            into["scales"][block] = np.log(values)
-        for block, values in _values(file, accessors["opacities"], header.count):
-            into["opacities"][block] = (np.log(values) - np.log1p(-values))[:, 0]
-        for index, accessor in enumerate(header.harmonics):
-            for block, values in _values(file, accessor, header.count):
+        for block, values in _values(file, accessors["scales"], part.count):
+            into["scales"][block] = logarithms(file.path, values)
+        for block, values in _values(file, accessors["opacities"], part.count):
+            into["opacities"][block] = logits(file.path, values)[:, 0]
+        for index, accessor in enumerate(part.harmonics):
+            for block, values in _values(file, accessor, part.count):
                 into["sh_rest"][block, index] = values
-        header.frame.apply(into)
+        into["sh_rest"][:, len(part.harmonics) :] = 0
+        part.frame.apply(into)
 
 
 def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:

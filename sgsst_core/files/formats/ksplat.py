@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, SH_C0
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.files.formats.surplus import surplus_note
+from sgsst_core.files.formats.units import logarithms
 
 #: Version 0.1, the only one.
 _MAGIC = b"\0\1\0\0"
@@ -29,8 +31,8 @@ _MAX_DEGREE = 2
 _TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}
 #: Default of the largest position step and of the range of SH coefficients at level 2.
 _STEPS, _RANGE = 32767, 1.5
-#: Standard deviation of those that 16-bit floats round to 0: half of the smallest positive one.
-_LEAST_SCALE = 2.0**-25
+#: Log scale of those that 16-bit floats round to 0: half of the smallest positive one.
+_LEAST_LOG_SCALE = math.log(2.0**-25)
 _BLOCK_ROWS = 1 << 16
 
 
@@ -119,7 +121,9 @@ def _read_header(start: FileStart) -> KsplatHeader:
             f"{sum(section.count for section in read)}: it was not written completely. Export it again."
         )
     coefficients = COEFFICIENTS[max(section.degree for section in read)]
-    return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read)
+    note = surplus_note(path, position, start.size)
+    notes = (note,) if note else ()
+    return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read, notes=notes)
 
 
 def _section(entry: bytes, level: int, start: int) -> tuple[KsplatSection | None, int]:
@@ -168,8 +172,8 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
                 positions = (positions - section.steps) * section.step + centers[owners]
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
                 into["means"][block] = positions
-                scales = rows["scale"].astype(np.float64)
-                into["scales"][block] = np.log(np.maximum(scales, _LEAST_SCALE) if header.level else scales)
+                scales = logarithms(file.path, rows["scale"].astype(np.float64))
+                into["scales"][block] = np.maximum(scales, _LEAST_LOG_SCALE) if header.level else scales
                 into["quats"][block] = rows["rotation"]
                 into["sh_dc"][block] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
                 into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]

@@ -20,6 +20,7 @@ from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.ply_header import PlyHeader, check_length, read_header
 from sgsst_core.files.formats.render_tag import comment_lines, is_flat, ply_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, SceneFormat, SceneHeader
+from sgsst_core.files.formats.unsupported import refuse_changed_meaning
 from sgsst_core.scene.rendering import Rendering
 
 #: Properties of the scene's tensors; opacity and f_rest_* follow.
@@ -93,6 +94,7 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
     """
     vertex = header.vertex if "vertex" in header.names else None
     kinds = {prop.name: prop.kind for prop in vertex.properties if not prop.length_kind} if vertex else {}
+    refuse_changed_meaning(path, kinds)
     sources = _sources(kinds)
     known = {*kinds, *sources, *(["scale_2"] if is_flat(kinds) else [])}
     missing = [name for names in (*PROPERTIES.values(), ("opacity",)) for name in names if name not in known]

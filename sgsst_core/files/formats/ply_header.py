@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from sgsst_core.errors import SceneError
+from sgsst_core.files.formats.surplus import about_surplus, number_of, refuse_text_transfer, surplus_note
 
 #: Maximum size of a header. A 3DGS header takes 2 kB; a megabyte allows long comments. The limit avoids searching a
 #: whole file that is not a PLY for `end_header`.
@@ -214,19 +215,40 @@ def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
         SceneError: If the file is shorter than declared.
     """
     check_length(path, header)
+    return {} if header.text else dict(zip(header.names, _bounds(path, header), strict=False))
+
+
+def surplus(path: Path, header: PlyHeader) -> str:
+    """Return the note on what follows the last element of a file; empty if nothing does but padding.
+
+    Raises:
+        SceneError: If the file was probably transferred as text, or is shorter than declared.
+    """
     if header.text:
-        return {}
+        with path.open(encoding="latin-1") as lines:
+            lines.seek(len(header.raw))
+            rows = sum(1 for line in lines if line.strip(" \t\r\n\x1a"))
+        rows -= sum(element.count for element in header.elements)
+        return about_surplus(number_of(rows, "row")) if rows > 0 else ""
+    end, size = _bounds(path, header)[-1], path.stat().st_size
+    refuse_text_transfer(path, len(header.raw), header.newline, end, size)
+    last = header.elements[-1]
+    return surplus_note(path, end, size, None if last.has_lists else last.dtype(header.byte_order).itemsize)
+
+
+def _bounds(path: Path, header: PlyHeader) -> list[int]:
+    """Return the byte offset of each element's rows in a binary file, and that of their end."""
     size, position = path.stat().st_size, len(header.raw)
-    offsets: dict[str, int] = {}
+    bounds = [position]
     for element in header.elements:
-        offsets[element.name] = position
         if element.has_lists and element.count:
             position = _end_of_lists(path, element, header.byte_order, position)
         elif element.count:
             position += element.count * element.dtype(header.byte_order).itemsize
         if position > size:
             raise _truncated(path, element)
-    return offsets
+        bounds.append(position)
+    return bounds
 
 
 def _end_of_lists(path: Path, element: PlyElement, byte_order: str, position: int) -> int:

@@ -19,7 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
@@ -39,6 +39,7 @@ from sgsst_core.files.formats.quantized import (
 )
 from sgsst_core.files.formats.render_tag import RenderTag, extras_of, extras_tag
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.files.formats.surplus import about_surplus, is_padding, number_of
 from sgsst_core.files.formats.unsupported import advice, is_checkpoint, is_usdz
 from sgsst_core.files.json_files import json_numbers
 from sgsst_core.scene.rendering import Rendering
@@ -114,8 +115,7 @@ class _Files:
             self._archived = file.read(4) == _ZIP_MAGIC
         self._path = path
         self.meta = META_NAME if self._archived else path.name
-        if self._archived:
-            _check_end(path)
+        self.surplus = _check_end(path) if self._archived else ""
 
     def size(self, name: str) -> int:
         """Return an upper bound for the bytes of a file: its size, or that of the archive, whose list may be wrong."""
@@ -159,8 +159,12 @@ class _Files:
                 yield member
 
 
-def _check_end(path: Path) -> None:
-    """Check the end of an archive, before its list of files is read into memory."""
+def _check_end(path: Path) -> str:
+    """Check the end of an archive, before its list of files is read into memory.
+
+    Returns:
+        The note on bytes before or after the archive; empty if there are none.
+    """
     with path.open("rb") as file:
         size = file.seek(0, io.SEEK_END)
         file.seek(max(0, size - _LOCATOR_BYTES - _END.size - _MAX_COMMENT_BYTES))
@@ -168,13 +172,17 @@ def _check_end(path: Path) -> None:
     position = tail.rfind(_END_MAGIC)
     if position < 0 or position + _END.size > len(tail):
         raise SceneError(f"{path}: is a truncated ZIP archive. Copy or export the scene again.")
-    entries, list_bytes = _END.unpack_from(tail, position)[4:6]
+    entries, list_bytes, list_offset, comment_bytes = _END.unpack_from(tail, position)[4:]
     if (
         entries > _MAX_ENTRIES
         or list_bytes > _MAX_LIST_BYTES
         or tail[max(0, position - _LOCATOR_BYTES) : position].startswith(_LOCATOR_MAGIC)
     ):
         raise SceneError(f"{path}: is a ZIP archive of {entries} files, so no SOG scene. Unpack it first.")
+    before = size - len(tail) + position - list_bytes - list_offset
+    after = tail[position + _END.size + comment_bytes :]
+    surplus = max(0, before) + (0 if is_padding(after) else len(after))
+    return about_surplus(number_of(surplus, "byte")) if surplus else ""
 
 
 def _matches(start: FileStart) -> bool:
@@ -199,7 +207,7 @@ def _read_header(start: FileStart) -> SogHeader:
             f"{start.path}: meta.json declares {header.count} Gaussians, more than {files.size(name)} bytes can hold: "
             "the file is truncated or meta.json is wrong. Copy or export the scene again."
         )
-    return header
+    return replace(header, notes=(*header.notes, files.surplus)) if files.surplus else header
 
 
 def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
@@ -224,6 +232,8 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
         if width not in _COEFFICIENTS_BY_WIDTH:
             raise ValueError(f"width of {names['shN'][0]}: {width}")
         coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"], 1)[0]
+        if COEFFICIENTS.get(meta["shN"].get("bands"), coefficients) != coefficients:
+            raise ValueError(f"bands: {meta['shN']['bands']} with {coefficients} coefficients")
     return SogHeader(
         SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, tag=_tag(meta)
     )
@@ -237,11 +247,18 @@ def _tag(meta: dict[str, Any]) -> RenderTag:
 
 
 def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
-    """Return the values of each byte, the same for all channels, [channels, 256]. Missing values are NaN."""
+    """Return the values of each byte, the same for all channels, [channels, 256]. Missing values are NaN.
+
+    Older writers left the first value of a codebook empty (null). As in PlayCanvas' reader, it is the second value less
+    the mean step of the others.
+    """
     codebook = entry["codebook"]
     if not 0 < len(codebook) <= VALUES:
         raise ValueError(f"codebook of {len(codebook)} values")
-    values = np.pad(json_numbers(codebook, len(codebook)), (0, VALUES - len(codebook)), constant_values=np.nan)
+    numbers = json_numbers(codebook, len(codebook))
+    if len(numbers) > 1 and codebook[0] is None:
+        numbers[0] = numbers[1] + (numbers[1] - numbers[-1]) / (VALUES - 1)
+    values = np.pad(numbers, (0, VALUES - len(numbers)), constant_values=np.nan)
     return np.tile(values, (channels, 1))
 
 
@@ -296,14 +313,20 @@ def _pixels(path: Path, files: _Files, name: str, least: int, most: int | None =
         raise SceneError(f"{path}: {name} is not a readable WebP image: {error}. Export the scene again.") from error
 
 
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
+    """Fill the arrays of a scene, and return the note on pixels after the last Gaussian that are no padding."""
     assert isinstance(header, SogHeader)
     path, files = file.path, _Files(file.path)
 
-    def image(name: str, index: int = 0) -> NDArray[np.uint8]:
-        return _pixels(path, files, header.names[name][index], header.count).reshape(-1, 4)[: header.count]
+    def whole(name: str, index: int = 0) -> NDArray[np.uint8]:
+        return _pixels(path, files, header.names[name][index], header.count).reshape(-1, 4)
 
-    low, high = image("means"), image("means", 1)
+    def image(name: str, index: int = 0) -> NDArray[np.uint8]:
+        return whole(name, index)[: header.count]
+
+    pixels, high = whole("means"), image("means", 1)
+    low, rest = pixels[: header.count], pixels[header.count :, :3]
+    surplus = 0 if (rest == rest[-1:]).all() else int(rest.any(axis=1).sum())  # padding repeats one pixel
     for block in _blocks(header.count):
         steps = (low[block, :3] | high[block, :3].astype(np.uint16) << 8) / 65535
         values = header.bounds[0] + (header.bounds[1] - header.bounds[0]) * steps
@@ -331,6 +354,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
                     "scene again."
                 )
             into["sh_rest"][:] = colors_of[labels]
+    return (about_surplus(number_of(surplus, "Gaussian")),) if surplus else ()
 
 
 def _blocks(count: int) -> list[slice]:

@@ -10,6 +10,7 @@ import numpy as np
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, SH_C0
 from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.files.formats.units import logarithms
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 _BLOCK_ROWS = 1 << 16
@@ -47,8 +48,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
         file.read(start * ROW.itemsize, data)
         rows = data.view(ROW)
         into["means"][block] = rows["position"]
-        with np.errstate(divide="ignore", invalid="ignore"):  # invalid values are reported later
-            into["scales"][block] = np.log(rows["scale"].astype(np.float64))
+        into["scales"][block] = logarithms(file.path, rows["scale"].astype(np.float64))
         into["sh_dc"][block] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
         into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
         into["quats"][block] = (rows["rotation"].astype(np.float64) - 128) / 128

@@ -4,12 +4,12 @@ A Gaussian takes 16 to 20 bytes before compression, and one byte per SH coeffici
 fixed-point numbers. Log scales, colors, opacities and SH coefficients have 8 bits. Rotations have three components of 8
 bits, or of 10 bits from version 3 on. The file stores one attribute after the other. Attributes are converted during
 decompression, so the decompressed data is never in memory as a whole. The layout is that of
-https://github.com/nianticlabs/spz. Versions 1 to 3 are one gzip stream. Version 4 has an uncompressed header and one
-zstd stream per attribute. SH coefficients of degree 4 are skipped.
+https://github.com/nianticlabs/spz. Versions 1 to 3 are one gzip stream, which a few programs leave out. Version 4 has
+an uncompressed header and one zstd stream per attribute. SH coefficients of degree 4 are skipped.
 
 Axes are a matter of convention. Most programs store those of the PLY (RDF: x right, y down, z forward) unchanged; the
 format's library stores RUB (x right, y up, z backward) by default. An extension of the format states them. Written
-files have the axes of the PLY, and say so. Files that state nothing are read as RDF.
+files have the axes of the PLY, and say so. Files that state nothing are read as RDF unless RUB is requested.
 
 A flag states that a scene was trained antialiased. Spark sets it for all scenes. It writes versions up to 3 without
 extension records, so the flag counts only in other files.
@@ -39,6 +39,7 @@ from sgsst_core.files.formats.scene_format import (
     SceneFormat,
     SceneHeader,
 )
+from sgsst_core.files.formats.surplus import about_surplus, is_padding, number_of, surplus_note
 from sgsst_core.files.formats.unsupported import advice
 from sgsst_core.scene.rendering import Rendering
 
@@ -48,6 +49,8 @@ SpzAxes = Literal["auto", "rub", "rdf"]
 
 _MAGIC = b"NGSP"
 _GZIP_MAGIC = b"\x1f\x8b"
+#: Version field of files of one stream.
+_OLD_VERSIONS = tuple(struct.pack("<I", version) for version in (1, 2, 3))
 #: Maximum compression ratio of deflate: 258 bytes for every two bits.
 _DEFLATE_RATIO = 1032
 
@@ -118,8 +121,9 @@ class SpzHeader(SceneHeader):
         degree: SH degree of the file, 0 to 4.
         sections: Decompressed sizes in bytes of positions, opacities, colors, scales, rotations and spherical
             harmonics.
-        streams: Streams of version 4, one per section that is not empty. Empty for other versions, which have one gzip
+        streams: Streams of version 4, one per section that is not empty. Empty for other versions, which have one
             stream.
+        zipped: Whether the stream of version 1 to 3 is compressed by gzip.
         extended: Whether extension records follow the Gaussians of version 1 to 3.
         stated_axes: Axes that a file of version 4 states; None if it does not, and for other versions.
         axes: Requested axes.
@@ -131,31 +135,43 @@ class SpzHeader(SceneHeader):
     fractional_bits: int
     sections: tuple[int, ...]
     streams: tuple[SpzSection, ...] = ()
+    zipped: bool = True
     extended: bool = False
     stated_axes: Axes | None = None
     axes: SpzAxes = "auto"
 
 
-def _gzip_header(file_start: FileStart) -> SpzHeader:
-    """Read the header of version 1 to 3, which stores header and sections in one gzip stream."""
+def _is_version_4(start: FileStart) -> bool:
+    """Return whether a file is SPZ of version 4, or of one that cannot be read."""
+    return start.head.startswith(_MAGIC) and start.head[4:8] not in _OLD_VERSIONS
+
+
+def _is_old_version(start: FileStart) -> bool:
+    """Return whether a file is SPZ of version 1 to 3, or another gzip stream."""
+    return start.head.startswith(_GZIP_MAGIC) or (start.head.startswith(_MAGIC) and not _is_version_4(start))
+
+
+def _old_header(file_start: FileStart) -> SpzHeader:
+    """Read the header of version 1 to 3, which stores header and sections in one stream."""
     path, head, size = file_start.path, file_start.head, file_start.size
+    zipped = head.startswith(_GZIP_MAGIC)
     try:
-        start = zlib.decompressobj(31).decompress(head, 16)
+        start = zlib.decompressobj(31).decompress(head, 16) if zipped else head[:16]
     except zlib.error as error:
         raise SceneError(f"{path}: is a damaged gzip file: {error}. Copy or export it again.") from error
     if not start.startswith(_MAGIC):
         raise SceneError(f"{path}: is a gzip file, but no SPZ scene. Unpack it first (gunzip), and give what is in it.")
     version, count, degree, fractional_bits, sections = _shared_fields(path, start, (1, 2, 3))
     needed = 16 + sum(sections)
-    if needed > _DEFLATE_RATIO * size:
+    if needed > (_DEFLATE_RATIO if zipped else 1) * size:
         raise SceneError(
             f"{path}: the header declares {count} Gaussians, which take {needed} bytes, more than the file's {size} "
-            "compressed bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
+            "bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
         )
     extended = bool(start[14] & _HAS_EXTENSIONS)
     drawn = COEFFICIENTS[min(degree, 3)]
     return SpzHeader(
-        SPZ,
+        SPZ_3,
         count,
         drawn,
         size,
@@ -163,6 +179,7 @@ def _gzip_header(file_start: FileStart) -> SpzHeader:
         degree,
         fractional_bits,
         sections,
+        zipped=zipped,
         extended=extended,
         tag=_tag(start[14], believed=extended),
     )
@@ -183,7 +200,8 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
         )
     with path.open("rb") as file:
         file.seek(32)
-        records = file.read(min(table - 32, _EXTENSION_BYTES)) if head[14] & _HAS_EXTENSIONS else b""
+        gap = file.read(min(table - 32, _EXTENSION_BYTES))
+        records = gap if head[14] & _HAS_EXTENSIONS else b""
         axes = _stated_axes(path, records)
         file.seek(table)
         listed = list(struct.iter_unpack("<QQ", file.read(16 * number)))
@@ -197,8 +215,9 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
             )
         streams.append(SpzSection(position, compressed, decompressed))
         position += compressed
+    surplus = (_about_rest(gap, records), surplus_note(path, position, size))
     return SpzHeader(
-        SPZ_4,
+        SPZ,
         count,
         COEFFICIENTS[min(degree, 3)],
         size,
@@ -208,7 +227,7 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
         sections,
         tuple(streams),
         stated_axes=axes,
-        notes=_notes(degree, records),
+        notes=(*_notes(degree, records), *filter(None, surplus)),
         tag=_tag(head[14], believed=True),
     )
 
@@ -238,6 +257,12 @@ def _extension_records(data: bytes) -> list[tuple[int, bytes]]:
         if position <= len(data):
             records.append((kind, data[position - length : position]))
     return records
+
+
+def _about_rest(data: bytes, records: bytes) -> str:
+    """Return the note on bytes in place of extension records, or after them; empty if there is only padding."""
+    rest = data[sum(8 + len(content) for _, content in _extension_records(records)) :]
+    return "" if is_padding(rest) else about_surplus(number_of(len(rest), "byte"))
 
 
 def _stated_axes(path: Path, data: bytes) -> Axes | None:
@@ -308,11 +333,11 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
         (into["sh_rest"], lambda data: _decode_harmonics(data, _STORED_COEFFICIENTS[spz.degree])),
     ]
-    records = bytearray()
+    tail = _Tail(spz.size)
     streams = (
         _zstd_streams(path, file, spz.streams)
         if spz.streams
-        else _gzip_stream(path, file, spz.size, sum(map(bool, spz.sections)), records)
+        else (_gzip_stream if spz.zipped else _plain_stream)(path, file, spz, tail)
     )
     for (array, decode), size in zip(decoders, spz.sections, strict=True):
         if not size:
@@ -323,12 +348,14 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
             block = array[start : start + _BLOCK_ROWS]
             block[:] = decode(np.frombuffer(take(len(block) * row_bytes), np.uint8))
     next(streams, None)  # reach the end of the last stream, where its checksum is verified
-    stated_axes = spz.stated_axes or (_stated_axes(path, bytes(records)) if spz.extended else None)
+    extensions = tail.content if spz.extended else b""
+    stated_axes = spz.stated_axes or _stated_axes(path, extensions)
     axes = stated_axes if spz.axes == "auto" else spz.axes
     if axes == "rub":
         _rotate(into)
-    notes = () if spz.streams else _notes(spz.degree, bytes(records) if spz.extended else b"")
-    return notes if axes else (*notes, _ASSUMED_AXES)
+    notes = () if spz.streams else _notes(spz.degree, extensions)
+    surplus = (_about_rest(tail.content, extensions), surplus_note(path, tail.end, spz.size))
+    return (*notes, *filter(None, surplus), *(() if axes else (_ASSUMED_AXES,)))
 
 
 def _rotate(arrays: Arrays) -> None:
@@ -338,13 +365,49 @@ def _rotate(arrays: Arrays) -> None:
     arrays["sh_rest"] *= _FLIP_HARMONICS[: arrays["sh_rest"].shape[1], None]
 
 
-def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int, records: bytearray) -> Iterator[Take]:
-    """Yield, for each section, a function that reads its bytes from the common gzip stream.
+@dataclass
+class _Tail:
+    """What follows the sections of version 1 to 3.
 
-    `records` receives the bytes after the last section, in which extensions are stored.
+    Attributes:
+        end: Byte offset of the end of the stream in the file.
+        content: Bytes of the stream after the last section, in which extensions are stored.
     """
+
+    end: int
+    content: bytes = b""
+
+
+def _plain_stream(path: Path, file: OpenScene, spz: SpzHeader, tail: _Tail) -> Iterator[Take]:
+    """Yield, for each section, a function that reads its bytes from the common uncompressed stream."""
+    position = 16
+
+    def take(count: int) -> bytes:
+        nonlocal position
+        if position + count > spz.size:
+            raise _ends_early(path)
+        position += count
+        return _read_bytes(file, position - count, count)
+
+    for _ in filter(None, spz.sections):
+        yield take
+    tail.content = take(min(spz.size - position, _EXTENSION_BYTES))
+    if position < spz.size:
+        raise _too_much(path)
+    _check_rest(path, spz, tail)
+
+
+def _check_rest(path: Path, spz: SpzHeader, tail: _Tail) -> None:
+    """Raise a SceneError if what follows the sections is no extension, but as much as a Gaussian takes."""
+    rest = tail.content[sum(8 + len(content) for _, content in _extension_records(tail.content)) * spz.extended :]
+    if len(rest) >= sum(spz.sections) // spz.count and not is_padding(rest):
+        raise _too_much(path, f" by {number_of(len(rest), 'byte')}")
+
+
+def _gzip_stream(path: Path, file: OpenScene, spz: SpzHeader, tail: _Tail) -> Iterator[Take]:
+    """Yield, for each section, a function that reads its bytes from the common gzip stream."""
     inflate = zlib.decompressobj(31)
-    position = 0
+    position, size = 0, spz.size
 
     def take(count: int) -> bytes:
         nonlocal position
@@ -369,20 +432,23 @@ def _gzip_stream(path: Path, file: OpenScene, size: int, sections: int, records:
         return content
 
     take(16)
-    for _ in range(sections):
+    for _ in filter(None, spz.sections):
         yield read_exactly
-    records += take(_EXTENSION_BYTES)
-    if len(records) == _EXTENSION_BYTES and not inflate.eof:
+    tail.content = take(_EXTENSION_BYTES)
+    if len(tail.content) == _EXTENSION_BYTES and not inflate.eof:
         raise _too_much(path)
     if not inflate.eof:
         raise _ends_early(path)
+    tail.end = position - len(inflate.unused_data)
+    _check_rest(path, spz, tail)
 
 
 def _zstd_streams(path: Path, file: OpenScene, streams: tuple[SpzSection, ...]) -> Iterator[Take]:
     """Yield, for each section, a function that reads its own zstd stream; check that the stream ends there."""
     for stream in streams:
         decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
-        with decompressor.stream_reader(_StreamSource(file, stream), read_size=_READ_BYTES) as reader:  # type: ignore[arg-type]
+        source: Any = _StreamSource(file, stream)
+        with decompressor.stream_reader(source, read_size=_READ_BYTES, read_across_frames=True) as reader:
 
             def take(count: int, reader: Any = reader) -> bytes:
                 try:
@@ -427,14 +493,14 @@ def _damaged(path: Path, error: Exception) -> SceneError:
 
 def _ends_early(path: Path) -> SceneError:
     return SceneError(
-        f"{path}: the compressed data ends before all Gaussians that the header declares: the file is truncated or its "
+        f"{path}: the data ends before all Gaussians that the header declares: the file is truncated or its "
         "header is wrong. Copy or export it again."
     )
 
 
-def _too_much(path: Path) -> SceneError:
+def _too_much(path: Path, surplus: str = "") -> SceneError:
     return SceneError(
-        f"{path}: the compressed data continues after all Gaussians that the header declares: the header is wrong. "
+        f"{path}: the data continues{surplus} after all Gaussians that the header declares: the header is wrong. "
         "Export it again."
     )
 
@@ -468,23 +534,7 @@ def _decode_harmonics(data: NDArray[np.uint8], stored: int) -> NDArray[Any]:
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write SPZ version 3, which most programs can read, with all 8 bits of SH coefficients.
-
-    Raises:
-        OutputError: If a position is too far from the origin.
-    """
-    deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
-    bits = _fractional_bits(arrays["means"])
-    output.write(deflate.compress(_first_fields(3, arrays, bits, rendering) + bytes(1)))
-    for section in _encoded_sections(arrays, bits):
-        for block in section:
-            output.write(deflate.compress(block))
-    output.write(deflate.compress(_AXES_RECORD))
-    output.write(deflate.flush())
-
-
-def _write_version_4(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write SPZ version 4, with all 8 bits of SH coefficients.
+    """Write SPZ version 4, the newest, with all 8 bits of SH coefficients.
 
     Raises:
         OutputError: If a position is too far from the origin.
@@ -506,6 +556,22 @@ def _write_version_4(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> 
         output.write(struct.pack("<QQ", len(compressed), size))
     for _, compressed in streams:
         output.write(compressed)
+
+
+def _write_version_3(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
+    """Write SPZ version 3, for programs that cannot read version 4, with all 8 bits of SH coefficients.
+
+    Raises:
+        OutputError: If a position is too far from the origin.
+    """
+    deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
+    bits = _fractional_bits(arrays["means"])
+    output.write(deflate.compress(_first_fields(3, arrays, bits, rendering) + bytes(1)))
+    for section in _encoded_sections(arrays, bits):
+        for block in section:
+            output.write(deflate.compress(block))
+    output.write(deflate.compress(_AXES_RECORD))
+    output.write(deflate.flush())
 
 
 def _first_fields(version: int, arrays: Arrays, bits: int, rendering: Rendering) -> bytes:
@@ -563,20 +629,20 @@ def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
 SPZ = SceneFormat(
     name="spz",
     title="SPZ",
-    matches=lambda start: start.head.startswith(_GZIP_MAGIC),
-    read_header=_gzip_header,
+    matches=_is_version_4,
+    read_header=_zstd_header,
     bytes_per_gaussian=25,
     read=_read,
     write=_write,
     shown=True,
 )
-SPZ_4 = SceneFormat(
-    name="v4.spz",
-    title="SPZ 4",
-    matches=lambda start: start.head.startswith(_MAGIC),
-    read_header=_zstd_header,
+SPZ_3 = SceneFormat(
+    name="v3.spz",
+    title="SPZ 3",
+    matches=_is_old_version,
+    read_header=_old_header,
     bytes_per_gaussian=25,
     read=_read,
-    write=_write_version_4,
+    write=_write_version_3,
     shown=True,
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NoReturn
 
@@ -87,6 +87,40 @@ _KNOWN: tuple[tuple[Callable[[bytes, str], bool], str], ...] = (
         "an OBJ mesh without Gaussians. Train Gaussians on renders of it first.",
     ),
 )
+
+
+#: Properties that change what the usual ones mean: why the usual ones alone are not the scene, and what to do.
+_CHANGED_MEANING: tuple[tuple[re.Pattern[str], str], ...] = (
+    (
+        re.compile(
+            r"t|times?|t_(center|mean|scale|sigma)|trbf_\w+|motion_\d+|omega_\d+|f_t_\d+|(scale|scales|scaling)_t"
+            r"|(rot|rotation)_r(_\d+)?|velocit(y|ies)(_\w+)?|durations?|life(span|time)"
+        ),
+        "a dynamic scene, whose Gaussians move or exist at certain moments only. Export one moment as a static scene",
+    ),
+    (
+        re.compile(r"binding(_\d+)?|f_offset_\d+|f_anchor_feat_\d+"),
+        "a scene whose Gaussians are relative to a mesh or to anchors. Export them in world coordinates",
+    ),
+    (
+        re.compile(r"beta(_\d+)?|sb_params_\d+|shape(_\d+)?|scale_[3-9]|rot_[4-9]"),
+        "a scene of another kernel than 3D Gaussians. Export it as one of 3D Gaussians",
+    ),
+)
+
+
+def refuse_changed_meaning(path: Path, names: Iterable[str]) -> None:
+    """Raise a SceneError if a file has properties that change what the usual ones of a 3DGS scene mean.
+
+    Args:
+        path: Path of the file.
+        names: Names of its properties, or of the attributes of a glTF primitive, which may have a prefix.
+    """
+    for name in names:
+        plain = name.rpartition(":")[2].lstrip("_").lower()
+        for pattern, text in _CHANGED_MEANING:
+            if pattern.fullmatch(plain):
+                raise SceneError(f"{path}: has the property {name!r}, so it is {text}.")
 
 
 def refuse_unsupported(start: FileStart) -> None:

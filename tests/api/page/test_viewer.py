@@ -74,7 +74,7 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
     [
         ("compressed.ply", "playbot_synthetic_sh2"),
         ("spz", "snowmiku_plush"),
-        ("v4.spz", "snowmiku_plush"),
+        ("v3.spz", "snowmiku_plush"),
         ("glb", "snowmiku_plush"),
         ("splat", "broche"),
     ],
@@ -96,7 +96,7 @@ def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("eps2d", [0.3, 0.1])
-@pytest.mark.parametrize("form", ["ply", "compressed.ply", "spz", "v4.spz", "glb"])
+@pytest.mark.parametrize("form", ["ply", "compressed.ply", "spz", "v3.spz", "glb"])
 def test_antialiased_scenes_are_shown_as_such(visit: Visit, tmp_path: Path, form: str, eps2d: float) -> None:
     scene = replace(dust(), rendering=Rendering("antialiased", eps2d))
     ply, _, _ = write_files(tmp_path, scene, cameras(2, 120, 90))
@@ -113,9 +113,43 @@ def test_filtered_and_flat_scenes_are_shown(visit: Visit, tmp_path: Path) -> Non
     assert_shown_like(watched, tmp_path, ply, differs=False)
 
 
+def test_glb_of_several_sets_and_spz_without_gzip_are_shown(visit: Visit, tmp_path: Path) -> None:
+    ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
+    watched = visit("/#/jobs")
+    write_scene(ply, replace(dust(), rendering=Rendering("antialiased")), by_name("v3.spz"))
+    ply.write_bytes(gzip.decompress(ply.read_bytes()))
+    assert_shown_like(watched, tmp_path, ply, differs=True)
+    write_scene(ply, replace(dust(), rendering=Rendering("antialiased")), by_name("glb"))
+    ply.write_bytes(with_two_sets(ply.read_bytes()))
+    assert len(read_scene(ply).scene) == 616
+    assert_shown_like(watched, tmp_path, ply, differs=True)
+
+
+def with_two_sets(data: bytes) -> bytes:
+    """Return a GLB of one set of Gaussians as one of two sets: the first 300, and the others."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    document, binary = json.loads(data[20 : 20 + size]), data[20 + size :]
+    accessors = document["accessors"]
+    widths = {"SCALAR": 4, "VEC3": 12, "VEC4": 16}
+    second = [
+        entry | {"count": 316, "byteOffset": 300 * (4 if entry["componentType"] == 5121 else widths[entry["type"]])}
+        for entry in accessors
+    ]
+    (primitive,) = document["meshes"][0]["primitives"]
+    other = primitive | {"attributes": {name: len(second) + at for name, at in primitive["attributes"].items()}}
+    document["accessors"] = [entry | {"count": 300} for entry in accessors] + second
+    document["meshes"] = [{"primitives": [primitive]}, {"primitives": [other]}]
+    document["nodes"] = [{"mesh": 0}, {"mesh": 1}]
+    document["scenes"] = [{"nodes": [0, 1]}]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(binary), len(text), 0x4E4F534A)
+    return head + text + binary
+
+
 def test_flag_that_spark_sets_is_ignored(visit: Visit, tmp_path: Path) -> None:
     ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
-    write_scene(ply, replace(dust(), rendering=Rendering("antialiased")), by_name("spz"))
+    write_scene(ply, replace(dust(), rendering=Rendering("antialiased")), by_name("v3.spz"))
     data = bytearray(gzip.decompress(ply.read_bytes())[:-12])
     data[14] = 1
     ply.write_bytes(gzip.compress(bytes(data)))

@@ -228,7 +228,7 @@ def test_children_of_split_gaussians_inherit_all_properties(
         row |= {"label": 40 + i, "y": row["y"] + 1e-12, "scale_0": -1.0 - i, "scale_1": -2.0, "scale_2": -3.0}
     if dropped:
         rows[1]["opacity"] = math.nan
-    behind = b"" if form == "ascii" else b"behind"
+    behind = b"" if form == "ascii" or dropped else b"behind"
     source = read_scene(save(tmp_path, file.to_bytes() + behind), drop_invalid=dropped)
     pieces = torch.ones(len(source.scene), 3, dtype=torch.uint8)
     pieces[-1], pieces[0, 1] = torch.tensor([3, 4, 1]), 5

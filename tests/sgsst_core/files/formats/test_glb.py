@@ -14,6 +14,7 @@ import torch
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.glb import GLB
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import assert_close, check_documents, encoded, refused
 from tests.sgsst_core.splat_scenes import cloud
 
@@ -160,6 +161,47 @@ def test_node_transformations_are_applied(tmp_path: Path) -> None:
         torch.testing.assert_close(scene.scales[0].exp(), torch.tensor([2.0, 4, 8]))
 
 
+def test_all_sets_of_gaussians_become_one_scene(tmp_path: Path) -> None:
+    """Two primitives of a mesh, another mesh with harmonics that two nodes show, and a mesh that no node shows."""
+    document, data = split(by_hand())
+    (primitive,) = document["meshes"][0]["primitives"]
+    colors = primitive["attributes"][PREFIX + "SH_DEGREE_0_COEF_0"]
+    harmonics = {f"{PREFIX}SH_DEGREE_1_COEF_{index}": colors for index in range(3)}
+    second = primitive | {"attributes": primitive["attributes"] | harmonics}
+    points = {"attributes": {"POSITION": 0}, "mode": 0}
+    document["meshes"] = [{"primitives": [primitive, points, primitive]}, {"primitives": [second]}]
+    document["meshes"].append({"primitives": [primitive] * 3})
+    document["nodes"] = [
+        {"mesh": 0, "translation": [0, 10, 0]},
+        {"children": [2, 3], "scale": [2, 2, 2]},
+        {"mesh": 1},
+        {"mesh": 1, "translation": [1, 0, 0]},
+    ]
+    path = tmp_path / "scene.glb"
+    path.write_bytes(joined(document, data + bytes(60)))
+    file = read_scene(path)
+    assert len(file.scene) == read_scene_header(path).count == 8
+    assert file.notes == ("3 sets of Gaussians that no node shows are left out",)
+    y_up = torch.tensor([[1.0, 12, 3], [-1, 10, 5]] * 2 + [[2, 4, 6], [-2, 0, 10], [4, 4, 6], [0, 0, 10]])
+    torch.testing.assert_close(file.scene.means, y_up * torch.tensor([-1.0, -1, 1]))
+    torch.testing.assert_close(file.scene.scales[:, 0].exp(), torch.tensor([1, 0.5, 1, 0.5, 2, 1, 2, 1]))
+    assert file.scene.sh_degree == 1
+    rest = held(file.scene.sh_rest)
+    assert not rest[:4].any()
+    assert rest[4:].abs().sum() == 2 * 3 * (0.5 + 0.5 + 1 + 2)
+
+
+@pytest.mark.parametrize("name", ["KHR_materials_unlit", "EXT_texture_webp", "KHR_lights_punctual", "KHR_xmp_json_ld"])
+def test_required_extensions_of_other_objects_are_harmless(tmp_path: Path, name: str) -> None:
+    required = ["KHR_gaussian_splatting", name]
+    assert len(read(tmp_path, by_hand(extensionsRequired=required))) == 2
+
+
+def test_animations_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "scene.glb").write_bytes(by_hand(animations=[{"channels": [], "samplers": []}]))
+    assert read_scene(tmp_path / "scene.glb").notes == ("animations are left out",)
+
+
 def test_infinite_opacities_are_clamped(tmp_path: Path) -> None:
     document, data = split(by_hand())
     rows = bytearray(data)
@@ -186,7 +228,6 @@ FIRST = "meshes__0__primitives__0__"
         (joined(MESH, b""), "holds 1 meshes but no Gaussians"),
         (joined({}, b""), "holds 0 meshes but no Gaussians"),
         (joined({"meshes": 3}, b""), "not a valid GLB scene"),
-        (by_hand(meshes__0__primitives=2 * split(by_hand())[0]["meshes"][0]["primitives"]), "2 sets of Gaussians"),
         (by_hand(extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression, which cannot be read"),
         (
             by_hand(
@@ -219,7 +260,7 @@ FIRST = "meshes__0__primitives__0__"
         (by_hand(bufferViews__0__byteStride=0), "not a valid GLB scene"),
         (by_hand(bufferViews__0__byteOffset=2**70), "not a valid GLB scene"),
         (by_hand(buffers__0__uri="../../etc/passwd"), "is not in the file"),
-        (by_hand(nodes=[{"mesh": 0}, {"mesh": 0}]), r"scene\.glb: 2 nodes show its Gaussians; one can be read"),
+        (by_hand(nodes=[{"mesh": 0}] * 51), r"scene\.glb: its nodes show 102 Gaussians, more than its 100 bytes"),
         (by_hand(nodes=[{"mesh": 0, "scale": [1, 2, 1]}]), "distorts the scene"),
         (by_hand(nodes=[{"mesh": 0, "scale": [1, 1, -1]}]), r"scene\.glb: the transformation mirrors or distorts"),
         (by_hand(nodes=[{"mesh": 0, "scale": [1e200, 1e200, 1e200]}]), "not finite"),

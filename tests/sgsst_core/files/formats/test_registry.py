@@ -17,7 +17,7 @@ from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.splat import SPLAT
-from sgsst_core.files.formats.spz import SPZ, SPZ_4
+from sgsst_core.files.formats.spz import SPZ, SPZ_3
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.quality.compression import measure_compression
@@ -75,7 +75,7 @@ def test_sh_bands_of_zeros_are_omitted(tmp_path: Path) -> None:
         assert read_scene(path).scene.sh_degree == 1
 
 
-@pytest.mark.parametrize("format", [COMPRESSED_PLY, SPZ, SPZ_4, SOG], ids=lambda format: format.name)
+@pytest.mark.parametrize("format", [COMPRESSED_PLY, SPZ, SPZ_3, SOG], ids=lambda format: format.name)
 def test_opacities_of_0_and_1_are_finite_and_round_trip(tmp_path: Path, format: SceneFormat) -> None:
     scene = replace(wall(), opacities=torch.cat([torch.full((308,), 1e4), torch.full((308,), -1e4)]))
     path = tmp_path / f"scene.{format.name}"
@@ -86,7 +86,7 @@ def test_opacities_of_0_and_1_are_finite_and_round_trip(tmp_path: Path, format: 
     assert torch.equal(read_scene(path).scene.opacities.sort().values, back.opacities.sort().values)
 
 
-@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53), (SPZ_4, 53), (SOG, 46)])
+@pytest.mark.parametrize(("format", "bound"), [(COMPRESSED_PLY, 48), (SPZ, 53), (SPZ_3, 53), (SOG, 46)])
 def test_real_scene_round_trips_with_small_loss(
     shared_data: Path, tmp_path: Path, format: SceneFormat, bound: float
 ) -> None:
@@ -137,7 +137,7 @@ def test_suffix_determines_the_format() -> None:
     assert format_of_name("a.ply") is format_of_name("a.PLY") is PLY
     assert format_of_name("a.b.compressed.ply") is COMPRESSED_PLY
     assert format_of_name("a.SPZ") is SPZ
-    assert format_of_name("a.v4.spz") is SPZ_4
+    assert format_of_name("a.v3.spz") is SPZ_3
     assert format_of_name("a.splat") is SPLAT
     assert format_of_name("ply") is None
 

@@ -93,9 +93,9 @@ def test_classic_scenes_state_no_render_mode(tmp_path: Path, format: SceneFormat
     if format.name == "sog":
         with zipfile.ZipFile(path) as archive:
             assert not {"model", "extras"} & json.loads(archive.read("meta.json")).keys()
-    elif format.name == "spz":
+    elif format.name == "v3.spz":
         assert gzip.decompress(data)[14] == 2
-    elif format.name == "v4.spz":
+    elif format.name == "spz":
         assert data[14] == 2
     else:
         assert b"comment" not in data[:4000]
@@ -104,7 +104,7 @@ def test_classic_scenes_state_no_render_mode(tmp_path: Path, format: SceneFormat
 
 def test_flag_of_old_spz_files_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "scene.spz"
-    write_scene(path, replace(wall(), rendering=AA), by_name("spz"))
+    write_scene(path, replace(wall(), rendering=AA), by_name("v3.spz"))
     data = bytearray(gzip.decompress(path.read_bytes()))
     assert data[14] == 3
     data[14] = 1  # as by Spark: no extension records

@@ -98,6 +98,26 @@ def test_values_match_those_computed_by_hand(tmp_path: Path, version: int, metho
         assert scene.opacities.tolist() == [-4, 6]
 
 
+def test_missing_first_value_of_a_codebook_is_extrapolated(tmp_path: Path) -> None:
+    """Older writers left it empty (null); it lies a mean step below the second value, as in PlayCanvas' reader."""
+    path, files = tmp_path / "scene.sog", by_hand(2)
+    path.write_bytes(zipped(files))
+    complete = read_scene(path).scene
+    meta = json.loads(files["meta.json"])
+    for name in ("scales", "sh0", "shN"):
+        meta[name]["codebook"][0] = None
+    path.write_bytes(zipped(files | {"meta.json": json.dumps(meta).encode()}))
+    scene = read_scene(path).scene
+    step = 254 / 255
+    values = torch.tensor([-4 - step, -4, -3])
+    torch.testing.assert_close(scene.scales, torch.stack([values, values.flip(0)]))
+    torch.testing.assert_close(scene.sh_dc[1], values)
+    expected = torch.where(held(complete.sh_rest) == -5, -4 - step, held(complete.sh_rest).double())
+    torch.testing.assert_close(held(scene.sh_rest), expected.float())
+    meta["scales"]["codebook"][1] = None
+    refused(tmp_path, zipped(files | {"meta.json": json.dumps(meta).encode()}), "NaN")
+
+
 def test_folder_is_read_by_its_meta_json(tmp_path: Path) -> None:
     data = encoded(tmp_path, SOG, degree=3)
     folder = tmp_path / "folder"

@@ -17,7 +17,7 @@ from gsply.spz import read_spz, write_spz
 from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.scene_format import SceneFormat
-from sgsst_core.files.formats.spz import SPZ, SPZ_4
+from sgsst_core.files.formats.spz import SPZ, SPZ_3
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import basis
@@ -59,14 +59,14 @@ def rotated(scene: Scene) -> Scene:
 def test_gsply_files_are_read_as_by_gsply(tmp_path: Path, degree: int, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=degree)), version=version)
-    assert read_scene_header(path).format is (SPZ if version == 3 else SPZ_4)
+    assert read_scene_header(path).format is (SPZ_3 if version == 3 else SPZ)
     loaded = read_scene(path)
     assert loaded.scene.sh_degree == degree
     assert_close(loaded.scene, scene_of(read_spz(path)))
     assert_close(rotated(read_scene(path, spz_axes="rub").scene), scene_of(read_spz(path)))
 
 
-@pytest.mark.parametrize("format", [SPZ, SPZ_4], ids=lambda format: format.name)
+@pytest.mark.parametrize("format", [SPZ, SPZ_3], ids=lambda format: format.name)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gsply_reads_written_files(tmp_path: Path, degree: int, format: SceneFormat) -> None:
     path = tmp_path / "scene"
@@ -117,7 +117,10 @@ def test_unknown_extensions_are_noted(tmp_path: Path, version: int) -> None:
     assert not read_scene(path, spz_axes="rdf").notes
     records = axes_record(6) + struct.pack("<II", 0xADBE0002, 3) + b"abc" + struct.pack("<II", 7, 0)
     path.write_bytes(with_records(data, records + struct.pack("<II", 9, 1000)))
-    assert read_scene(path).notes == ("SPZ extensions 0x7, 0xadbe0002 are unknown and left out",)
+    assert read_scene(path).notes == (
+        "SPZ extensions 0x7, 0xadbe0002 are unknown and left out",
+        "the file has 8 bytes more than its header declares, which are not read; copy or export it again",
+    )
 
 
 @pytest.mark.parametrize("version", [3, 4])
@@ -133,25 +136,41 @@ def test_unknown_axes_are_refused_and_broken_records_ignored(tmp_path: Path, ver
 
 
 def test_written_file_states_the_axes_of_a_ply(tmp_path: Path) -> None:
-    raw = gzip.decompress(encoded(tmp_path, SPZ))
+    raw = gzip.decompress(encoded(tmp_path, SPZ_3))
     assert raw[14] == 2
     assert raw.endswith(axes_record(6))
-    raw = encoded(tmp_path, SPZ_4)
+    raw = encoded(tmp_path, SPZ)
     assert raw[14] == 2
     assert raw[32:44] == axes_record(6)
 
 
 def test_both_versions_store_the_same_values(tmp_path: Path) -> None:
-    paths = [tmp_path / format.name for format in (SPZ, SPZ_4)]
-    for path, format in zip(paths, (SPZ, SPZ_4), strict=True):
+    paths = [tmp_path / format.name for format in (SPZ, SPZ_3)]
+    for path, format in zip(paths, (SPZ, SPZ_3), strict=True):
         write_scene(path, cloud(700, degree=3), format)
     first, second = (read_scene(path).scene for path in paths)
     assert_close(first, second, opacities=0, others=0)
 
 
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_files_without_their_gzip_layer_are_read(tmp_path: Path, version: int) -> None:
+    raw = gzip.decompress(encoded(tmp_path, SPZ_3))
+    if version < 3:
+        sections = (bytes(range(6 if version == 1 else 9)) * 700, bytes(700), bytes(2100), bytes(2100), bytes(2100))
+        raw = gzip.decompress(spz_bytes(version, 700, sections=b"".join(sections)))
+    scenes = []
+    for data in (raw, gzip.compress(raw)):
+        (tmp_path / "scene").write_bytes(data)
+        assert read_scene_header(tmp_path / "scene").format is SPZ_3
+        scenes.append(read_scene(tmp_path / "scene"))
+    assert_close(scenes[0].scene, scenes[1].scene, opacities=0, others=0)
+    assert scenes[0].notes == scenes[1].notes
+    refused(tmp_path, raw[:-40], "the file is truncated")
+
+
 def test_degree_4_is_read_as_degree_3(tmp_path: Path) -> None:
     """Each Gaussian has 15 coefficients per channel of degree 1 to 3, and then 9 of degree 4."""
-    write_scene(tmp_path / "three", cloud(700, degree=3), SPZ)
+    write_scene(tmp_path / "three", cloud(700, degree=3), SPZ_3)
     raw = gzip.decompress((tmp_path / "three").read_bytes())[:-12]
     body, harmonics = raw[: 16 + 700 * 20], np.frombuffer(raw[16 + 700 * 20 :], np.uint8).reshape(700, 45)
     more = np.concatenate([harmonics, np.full((700, 27), 200, np.uint8)], axis=1)
@@ -242,13 +261,13 @@ def test_false_header_is_refused(tmp_path: Path, data: bytes, message: str) -> N
 
 
 def test_wrong_checksum_or_damaged_data_is_refused(tmp_path: Path) -> None:
-    data = encoded(tmp_path, SPZ)
+    data = encoded(tmp_path, SPZ_3)
     refused(tmp_path, data[:-5] + bytes([data[-5] ^ 1]) + data[-4:], "damaged: .*incorrect data check")
     refused(tmp_path, data[:200] + bytes(50) + data[250:], "the compressed data")
 
 
 def test_extensions_after_the_data_are_skipped(tmp_path: Path) -> None:
-    raw = bytearray(gzip.decompress(encoded(tmp_path, SPZ)))
+    raw = bytearray(gzip.decompress(encoded(tmp_path, SPZ_3)))
     raw[14] = 2
     (tmp_path / "more").write_bytes(gzip.compress(bytes(raw) + bytes(1000)))
     first, second = (read_scene(tmp_path / name).scene for name in ("good", "more"))
@@ -268,6 +287,6 @@ def test_false_streams_of_version_4_are_refused(tmp_path: Path) -> None:
 
 def test_random_damage_never_crashes_the_reader(tmp_path: Path) -> None:
     """The damage is within the gzip stream, or in a file of version 4."""
-    check_damage(tmp_path / "scene", zlib.decompress(encoded(tmp_path, SPZ), 31), wrap=gzip.compress)
+    check_damage(tmp_path / "scene", zlib.decompress(encoded(tmp_path, SPZ_3), 31), wrap=gzip.compress)
     write_spz(tmp_path / "four", gsply_of(wall(sh_degree=1)), version=4)
     check_damage(tmp_path / "scene", (tmp_path / "four").read_bytes())
