@@ -269,7 +269,7 @@ def _joined(path: Path, parts: list[GlbPart], data_bytes: int, notes: tuple[str,
 
 
 def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data: tuple[int, int]) -> list[str]:
-    """Return notes on bytes after the binary data, and after positions that fill a buffer view alone.
+    """Return notes on bytes after the binary data, and on rows of buffer views that only Gaussians are read from.
 
     Args:
         path: Path of the file.
@@ -281,12 +281,18 @@ def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data
     if type(declared) is not int or declared < 0:
         raise ValueError(f"byteLength: {declared}")
     spans = [(data[0] + declared, data[1]), (data[1], path.stat().st_size)]
+    ends = {
+        accessor: accessor.offset + (part.count - 1) * accessor.stride + accessor.value_bytes
+        for part in parts
+        for accessor in (*part.accessors.values(), *part.harmonics)
+    }
     readers = Counter(entry.get("bufferView") for entry in document["accessors"])
-    for part in parts:
-        positions = part.accessors["means"]
-        last = positions.offset + (part.count - 1) * positions.stride
-        if readers[positions.view] == 1:
-            spans.append((last + positions.value_bytes, positions.view_end))
+    views = {accessor.view: accessor for accessor in reversed(ends)}
+    for view, first in views.items():
+        read = [end for accessor, end in ends.items() if accessor.view == view]
+        if len(read) == readers[view] and first.view_end - max(read) >= first.stride:
+            spans.append((max(read), first.view_end))
+            break  # other attributes have as many rows
     return [note for span in dict.fromkeys(spans) if (note := surplus_note(path, *span))]
 
 

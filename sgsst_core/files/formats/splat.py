@@ -26,7 +26,7 @@ def _matches(start: FileStart) -> bool:
         return False
     length = np.linalg.norm((rows["rotation"].astype(np.float64) - 128) / 128, axis=1)
     fits = np.isfinite(rows["position"]).all(axis=1) & (np.abs(length - 1) < 0.05)
-    fits &= ((rows["scale"] >= 0) & (rows["scale"] < 1e9)).all(axis=1)
+    fits &= (np.abs(rows["scale"]) < 1e9).all(axis=1)  # logarithms are refused when they are read
     return bool(fits.mean() > 0.9)
 
 

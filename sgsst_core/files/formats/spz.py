@@ -367,7 +367,7 @@ def _rotate(arrays: Arrays) -> None:
 
 @dataclass
 class _Tail:
-    """What follows the sections of version 1 to 3.
+    """Content after the sections of version 1 to 3.
 
     Attributes:
         end: Byte offset of the end of the stream in the file.

@@ -253,6 +253,11 @@ def test_logarithms_in_a_glb_are_refused(tmp_path: Path, attribute: str, values:
     refused(tmp_path, data[:start] + raw + data[start + len(raw) :], message, "scene.glb")
 
 
+def test_logarithms_in_a_splat_are_refused(tmp_path: Path) -> None:
+    row = struct.pack("<6f8B", 1, 2, 3, -4, -5, -2, 0, 255, 51, 128, 255, 128, 128, 128)
+    refused(tmp_path, 40 * row, "scales are negative", "scene.splat")
+
+
 @pytest.mark.parametrize("level", [0, 1])
 def test_logarithms_in_a_ksplat_are_refused(tmp_path: Path, level: int) -> None:
     scene = wall()
