@@ -30,6 +30,7 @@ from sgsst_core.files.formats import (
     format_of_name,
     result_name,
 )
+from sgsst_core.number_format import duration
 from sgsst_core.stylizing.progress_bar import clock, live_bar
 from worker.outputs import check_folder, check_is_not_input, result_format
 from worker.region_requests import RegionOptions, RegionRequest, region_requests
@@ -469,6 +470,6 @@ def _plan_text(plan: Any) -> str:
     lines += [f"warning: {text}" for text in plan["warnings"]]
     lines += [f"{item['item']}: {item['decision']}: {item['reason']}" for item in plan["plan"]["decisions"]]
     if plan["total_seconds"]:
-        whole, steps = clock(plan["total_seconds"]), clock(plan["estimated_seconds"])
+        whole, steps = duration(plan["total_seconds"], " "), duration(plan["estimated_seconds"], " ")
         lines.append(f"predicted: {whole} for the whole job, {steps} of them for its steps")
     return "\n".join(lines)

@@ -17,6 +17,7 @@ from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
+from sgsst_core.number_format import duration
 from sgsst_core.stylizing.progress_bar import clock, job_bar, live_bar
 from worker.options import StylizeOptions, VideoOptions, ViewOptions
 
@@ -48,10 +49,10 @@ def plan(
     out_console.print(_decisions_table(plan))
     if plan.prediction:
         seconds, peak = plan.prediction.seconds, plan.prediction.peak_bytes / 1e9
-        coarse = f" ({plan.prediction.seconds_coarse:.2g} s in phase 1)" if plan.steps_coarse else ""
+        coarse = f" ({duration(plan.prediction.seconds_coarse, ' ')} in phase 1)" if plan.steps_coarse else ""
         on_device = plan.prediction.device_bytes
         gpu = f" (GPU: {on_device / 1e9:.1f} GB)" if on_device is not None else ""
-        expected = f"{seconds:.2g} s per step on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
+        expected = f"{duration(seconds, ' ')} per step on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
         out_console.print(f"Predicted: {expected}")
     if sheet is not None:
         print_field("views", sheet)
@@ -61,7 +62,7 @@ def plan(
 def _decisions_table(plan: Plan) -> Table:
     table = Table(Column("item", no_wrap=True), "decision and reason", Column("saves", no_wrap=True), show_lines=True)
     for item in plan.decisions:
-        saved = [f"{item.seconds:.2g} s per step"] if item.seconds is not None else []
+        saved = [f"{duration(item.seconds, ' ')} per step"] if item.seconds is not None else []
         saved += [f"{item.bytes / 1e6:.1f} MB"] if item.bytes is not None else []
         error = "" if item.error == "none" else f" Costs: {item.error}."
         table.add_row(item.item, f"{item.decision}: {item.reason}.{error}", "\n".join(saved))

@@ -19,6 +19,7 @@ from sgsst_core.loss.convergence import LEAST_FALL, window_length
 from sgsst_core.loss.nearest import MOST_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.statistics_terms import has_statistics
+from sgsst_core.number_format import duration
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.cost import CostModel
 from sgsst_core.planning.facts import LEAST_VISITS, LaunchCost, Link, Probe, RasterCost
@@ -175,7 +176,7 @@ def about_training_background(
         reason = f"{_uncovered(survey)}: colors would be fitted to a fixed background"
     cost = model.views.content.always + model.views.images.always
     if cost:
-        reason += f"; content features are recomputed with it, {cost:.2g} s per step"
+        reason += f"; content features are recomputed with it, {duration(cost, ' ')} per step"
     return [Decision("training_background", f"{color} each time", reason, error=ANOTHER_LOSS)]
 
 
@@ -314,7 +315,7 @@ def about_network(model: CostModel, probe: Probe, settings: Settings) -> list[De
         what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
         distance = (
             f"the distance of relu3 features to the nearest of at most {MOST_VECTORS:,} style features {what}, with "
-            f"weight {weight:.3g}; the search takes {work.pairs * network.rate.search:.2g} s per view"
+            f"weight {weight:.3g}; the search takes {duration(work.pairs * network.rate.search, ' ')} per view"
         )
         lines.append(Decision("style loss", distance, f"{settings.style_loss} was requested", error=ANOTHER_LOSS))
     if not settings.content_weight:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from sgsst_core.decision import Decision
+from sgsst_core.number_format import duration
 from sgsst_core.planning import choices
 from sgsst_core.planning.cost import CostModel, tiling_of
 from sgsst_core.planning.facts import Probe
@@ -94,7 +95,7 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
 def _about_measuring(plan: Plan, expected: Prediction, settings: Settings) -> Decision:
     """Return the decision about measurements outside the steps and their cost."""
     steps = expected.job - expected.measuring
-    cost = f"about {expected.measuring:.2g} s in addition to {steps:.3g} s of steps"
+    cost = f"about {duration(expected.measuring, ' ')} in addition to {duration(steps, ' ')} of steps"
     losses = f"the initial loss on {_count(plan.loss_views, 'view')}"
     if not settings.measure:
         return Decision("measuring", f"{losses} only", f"requested; {cost}")
@@ -102,11 +103,12 @@ def _about_measuring(plan: Plan, expected: Prediction, settings: Settings) -> De
     moments = level.moments(plan.steps_coarse + settings.steps_sos)
     when = f"at {len(moments)} moments" if len(moments) > 1 else "at the end"
     novel = f", and {when} up to {_count(level.views, 'novel view')}" if moments else " only"
-    allowed = f"{allowed_seconds(settings.measure, steps):.3g} s are allowed, {settings.measure:.0%} of the steps' time"
+    allowed = duration(allowed_seconds(settings.measure, steps), " ")
     return Decision(
         "measuring",
         f"{losses}{novel}",
-        f"{cost}; {allowed} or {LEAST_ALLOWED:.0f} s, and less is measured if the first novel view takes longer",
+        f"{cost}; {allowed} is allowed, {settings.measure:.0%} of the steps' time or {LEAST_ALLOWED:.0f} s, and less "
+        "is measured if the first novel view takes longer",
     )
 
 

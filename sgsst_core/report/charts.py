@@ -81,6 +81,7 @@ def draw_loss(figure: Figure, against: Against, history: History, moments: Seque
     draw_points(axes, x[shown], gram[shown], marker="D", linestyle="", color=INK, markerfacecolor="none", label=label)
     set_log_x(axes, history.limits[against], against)
     set_log_y(axes, [*(values for _, values, _ in lines), gram[shown]])
+    axes.set_ylabel(RELATIVE_LOSS)
     draw_legend(figure)
 
 
@@ -96,7 +97,6 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
     """
     with png_chart(path, (8, 4.8), dpi=120) as figure:
         draw_loss(figure, "seconds", history_of(report), novel_view_moments(report))
-        figure.axes[0].set_ylabel(RELATIVE_LOSS)
 
 
 @contextmanager

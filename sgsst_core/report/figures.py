@@ -44,7 +44,8 @@ from sgsst_core.report.svg import inline
 #: Size in inches. At this width, text is legible on a phone, and two charts fit side by side on a desktop screen.
 _WIDTH, _HEIGHT = 5.6, 3.5
 _REACHES = {"short": color_of(0), "long": color_of(1)}
-_METRICS = {"rmse": "RMSE", "lpips": "LPIPS"}
+#: Labels of the y axes of consistency; both have no unit.
+_METRICS = {"rmse": "RMSE of colors, 0 to 1", "lpips": "LPIPS"}
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,8 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
         set_log_y(axes, everything)
     for axes in grid[: max(count - 2, 0)]:  # another panel is below
         axes.set_xlabel("")
+    for axes in grid[::2]:
+        axes.set_ylabel("loss")
     for axes in grid[count:]:
         axes.set_visible(False)
     draw_legend(figure, in_row=4)
@@ -172,7 +175,7 @@ def _draw_consistency(figure: Figure, against: Against, history: History, moment
             draw_points(axes, x[shown], values[shown], **options)
             if moments[0].get("step") == 0 and np.isfinite(values[0]):
                 axes.axhline(values[0], color=color, linestyle="--", linewidth=1)
-        axes.set_title(_METRICS[metric])
+        axes.set_ylabel(_METRICS[metric])
         axes.set_ylim(bottom=0)
         set_log_x(axes, history.limits[against], against)
     draw_legend(figure)
@@ -206,7 +209,7 @@ def _draw_memory(figure: Figure, against: Against, history: History, predicted: 
             label = f"peak{where}, predicted by the plan"
             axes.axhline(peak / 1e9, color=dashed, linestyle="--", linewidth=1, label=label)
     axes.set_ylim(bottom=0)
-    axes.set_ylabel("GB")
+    axes.set_ylabel("memory in GB")
     mark_phases(axes, history, against)
     set_log_x(axes, history.limits[against], against)
     draw_legend(figure)

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sgsst_core.number_format import NOTHING, byte_count, duration, number, percent
 from sgsst_core.report.history import consistency_at, novel_view_moments
-from sgsst_core.report.number_format import NOTHING, byte_count, duration, number, percent
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from sgsst_core.number_format import duration
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import RasterCost
 from sgsst_core.planning.measurement_choice import (
@@ -96,7 +98,9 @@ def test_planned_measuring_stays_within_the_allowed_time() -> None:
         prediction = expected(plan)
         allowed = max(LEAST_ALLOWED, 0.1 * (prediction.job - prediction.measuring))
         assert prediction.measuring <= allowed
-        assert f"{prediction.measuring:.2g} s in addition to" in text_of(plan, "measuring")
+        text = text_of(plan, "measuring")
+        assert f"{duration(prediction.measuring, ' ')} in addition to" in text
+        assert not re.search(r"\de[+-]\d|\d{4} s", text), "seconds are given in minutes or hours where they are many"
     assert [plan_of(SLOW, steps_sos=steps).measuring for steps in (16, 20_000)] == [NOTHING, 0]
     assert text_of(plan_of(SLOW), "measuring").startswith("the initial loss on 4 views only: about ")
     least = expected(plan_of(VERY_SLOW, steps_sos=4))

@@ -190,6 +190,19 @@ def test_heading_states_why_the_job_stopped(stopped: str, words: str) -> None:
     assert words in parsed_without_figures(report).text
 
 
+def test_axes_of_every_figure_are_labeled() -> None:
+    upward = {
+        "loss": {"loss, relative to the unstylized scene"},
+        "split": {"loss"},
+        "consistency": {"RMSE of colors, 0 to 1", "LPIPS"},
+        "approximations": {"relative error"},
+        "memory": {"memory in GB"},
+    }
+    for figure in draw_figures(sample_report()):
+        for against, svg in figure.svg.items():
+            assert {*upward[figure.name], against} <= {piece.strip() for piece in Page(svg).pieces}
+
+
 def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
     page = sample_page()
     figures = [attributes["id"] for tag, attributes in page.elements if tag == "figure"]

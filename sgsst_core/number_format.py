@@ -24,18 +24,17 @@ def percent(fraction: float | None, digits: int = 2) -> str:
     return NOTHING if fraction is None else f"{number(100 * fraction, digits)}{_GAP}%"
 
 
-def duration(seconds: float | None) -> str:
-    """Format seconds as seconds, minutes or hours."""
+def duration(seconds: float | None, gap: str = _GAP) -> str:
+    """Format seconds as seconds, minutes or hours, with `gap` between numbers and units."""
     if seconds is None or not math.isfinite(seconds):
         return NOTHING
     if seconds < 60:
-        return f"{number(round(seconds, 4))}{_GAP}s"
-    minutes, rest = divmod(round(seconds), 60)
-    return _GAP.join(
-        (f"{minutes}", "min", f"{rest:02}", "s")
-        if minutes < 60
-        else (f"{minutes // 60}", "h", f"{minutes % 60:02}", "min")
-    )
+        return f"{number(round(seconds, 4))}{gap}s"
+    whole = round(seconds)
+    if whole < 3600:
+        return gap.join((f"{whole // 60}", "min", f"{whole % 60:02}", "s"))
+    minutes = round(seconds / 60)
+    return gap.join((f"{minutes // 60}", "h", f"{minutes % 60:02}", "min"))
 
 
 def byte_count(count: float | None) -> str:
