@@ -5,7 +5,7 @@ import { rough, words } from "./words.js";
 
 /** @typedef {{attempt: number, stage: string, step: number, seconds: number | null, loss: number | null, scales?: number[] | null, mean_loss?: number | null, mean_scales?: number[] | null}} Point */
 
-const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 12, BOTTOM = 34;
+const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 26, BOTTOM = 34;
 
 /**
  * Return the values to label on a logarithmic axis; the fewer decades, the more values in each.
@@ -109,6 +109,7 @@ export class LossChart {
       ...upward.flatMap((value) => [svg("path.grid", { d: `M${LEFT} ${y(value).toFixed(1)}H${width - RIGHT}` }), svg("text", { x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, short(value))]),
       ...across.map((value) => svg("text", { x: x(value), y: HEIGHT - BOTTOM + 18, "text-anchor": "middle" }, short(value))),
       svg("text.axis", { x: width - RIGHT, y: HEIGHT - 2, "text-anchor": "end" }, words.chart.seconds),
+      svg("text.axis", { x: 0, y: 11 }, words.chart.loss),
     ];
   }
 

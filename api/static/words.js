@@ -177,7 +177,7 @@ export const words = {
     unplayable: "This browser can't play H.264 video. Download it instead.",
   },
   chart: {
-    seconds: "seconds", all: "mean of all views", single: "single views", coarse: "coarse", scale: (/** @type {number} */ n) => (n ? `1/${2 ** n}` : "full size"),
+    seconds: "seconds of steps", loss: "loss", all: "mean of all views", single: "single views", coarse: "coarse", scale: (/** @type {number} */ n) => (n ? `1/${2 ** n}` : "full size"),
     told: (/** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ s) => `Loss over time: from ${three.format(from)} to ${three.format(to)} in ${seconds(s)}`,
   },
   jobs: {
