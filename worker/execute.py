@@ -19,10 +19,8 @@ from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.quality.compression import CompressionLoss, measure_compression
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
-from sgsst_core.report.charts import write_loss_chart
 from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, sent_json
-from sgsst_core.report.page import write_page
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation
 from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
@@ -258,6 +256,10 @@ def _write_reports(
     """Write the reports beside the PLY. Return an error instead of raising it, because the PLY is already written."""
     stylizer, outputs = job.stylizer, job.outputs
     try:
+        # Matplotlib scans all fonts when it is first imported on a machine, for which no step should wait.
+        from sgsst_core.report.charts import write_loss_chart
+        from sgsst_core.report.page import write_page
+
         if job.request.colors and _only_colors_change(job):
             write_colors(outputs.colors, stylizer.stylized())
         near, survey = stylizer.job.settings.near, stylizer.job.plan.survey

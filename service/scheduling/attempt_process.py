@@ -115,6 +115,7 @@ class AttemptProcess:
 
     def _run_alone(self) -> Result:
         from worker.description import describe
+        from worker.execute import execute
         from worker.prepare import prepare
         from worker.previews import Previews
         from worker.request import Resume
@@ -123,8 +124,6 @@ class AttemptProcess:
         preview = Previews(_PREVIEWS, self._task.preview_seconds, report_preview, log)
         job = prepare(self._request(), resume=resume, warn=log, show_planning=report_planning, preview=preview)
         report_prepared(describe(job))
-
-        from worker.execute import execute  # imports matplotlib, which the first preview need not wait for
 
         return execute(
             job,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,6 +74,12 @@ def test_transparent_parts_of_photos_get_the_background_of_the_job(
     assert load is not None
     assert load(1)[:, :32].unique(dim=0).unique(dim=1).flatten().tolist() == pytest.approx(list(background))
     assert load(1)[0, 40].tolist() == [0, 1, 0]
+
+
+def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
+    """Matplotlib scans all fonts when it is first imported on a machine."""
+    code = "import sys, worker.prepare, worker.execute; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 @pytest.mark.slow

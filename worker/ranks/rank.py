@@ -233,6 +233,7 @@ class RankProcess:
 
     def _job(self, task: RankTask, collectives: Collectives) -> Result:
         from worker.description import describe
+        from worker.execute import execute
         from worker.prepare import prepare
         from worker.previews import Previews
 
@@ -259,8 +260,6 @@ class RankProcess:
                 lost["seconds_lost"] = round(task.seconds_lost + since, 3)
                 lost["seconds_to_resume"] = round(task.seconds_since_loss + since, 3)
             self._update(progress=current)
-
-        from worker.execute import execute  # imports matplotlib, which the first preview need not wait for
 
         return execute(
             job,
