@@ -181,8 +181,13 @@ class AsyncClient:
 
     async def artifacts(self, job_id: str) -> list[dict[str, Any]]:
         """Return the files that a job has made so far."""
-        response = await self._transport.call("GET", f"{_job_path(job_id)}/artifacts")
-        artifacts: list[dict[str, Any]] = response.json()["artifacts"]
+        artifacts: list[dict[str, Any]] = []
+        cursor: str | None = ""
+        while cursor is not None:
+            query = f"?cursor={quote(cursor, safe='')}" if cursor else ""
+            page = (await self._transport.call("GET", f"{_job_path(job_id)}/artifacts{query}")).json()
+            artifacts += page["artifacts"]
+            cursor = page.get("next_cursor")  # services of earlier versions send all at once
         return artifacts
 
     async def download(

@@ -8,6 +8,7 @@ from typing import Any
 
 from api.http.addresses import subpath
 from api.http.multipart import BadRequestError
+from service.store.jobs import Jobs
 from service.store.states import JobStatus
 from service.store.tables import JobRow
 
@@ -22,14 +23,16 @@ def parse_reference(text: str) -> tuple[str, str] | None:
     return (match[1], match[2]) if match else None
 
 
-def input_entry(job: JobRow, name: str) -> dict[str, Any] | None:
-    """Return a job's entry for an input such as "scene" or "style:1"; None if it is missing or was released."""
+def parse_input(name: str) -> tuple[str, int] | None:
+    """Return role and index of an input such as "scene" or "style:1", or None if it is not such a name."""
     match = _INPUT.fullmatch(name)
-    if match is None or job.status == JobStatus.EXPIRED:
-        return None
-    entries = [entry for entry in job.inputs if entry["role"] == match[1]]
-    index = int(match[2] or 0)
-    return entries[index] if index < len(entries) else None
+    return (match[1], int(match[2] or 0)) if match else None
+
+
+def find_input(jobs: Jobs, job: JobRow, name: str) -> dict[str, Any] | None:
+    """Return a job's entry for an input such as "scene" or "style:1"; None if it is missing or was released."""
+    place = parse_input(name)
+    return None if place is None or job.status == JobStatus.EXPIRED else jobs.input(job.id, *place)
 
 
 def uploaded_name(metadata: str) -> str:

@@ -36,7 +36,7 @@ from sgsst_core.files.formats import read_scene_header
 from worker.region_requests import MOST_REGIONS
 
 #: Maximum bytes of a text field: JSON parameters or an id.
-_MAX_TEXT = 1 << 16
+MAX_TEXT = 1 << 16
 #: Media types of the body of a new job.
 MEDIA_TYPES = "multipart/form-data or application/json"
 _TEXT_FIELDS = ("parameters", "webhook")
@@ -331,8 +331,8 @@ class _Form:
             self._file.write(data[start:end])
             return
         self._text += data[start:end]
-        if len(self._text) > _MAX_TEXT:
-            raise RefusedInputError(f"The field {self._role!r} has more than {_MAX_TEXT} bytes.", "invalid-request")
+        if len(self._text) > MAX_TEXT:
+            raise RefusedInputError(f"The field {self._role!r} has more than {MAX_TEXT} bytes.", "invalid-request")
 
     def _end(self) -> None:
         if self._file is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,6 +13,7 @@ from service.examples import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.files.artifacts import media_type
 from service.parameters import JobName, JobParameters
 from service.store.history import Point
+from service.store.jobs import ShownJob
 from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
 from sgsst_core.files.formats import ResultName
@@ -216,6 +216,7 @@ class JobView(BaseModel):
             _example_of(InputView),
             {"role": "style", "name": "style.jpg", "size": 10421, "sha256": SHA256[::-1]},
         ],
+        input_counts={"scene": 1, "style": 1},
         links=_example_of(Links),
     )
 
@@ -238,7 +239,10 @@ class JobView(BaseModel):
         description="As `JobParameters`, with defaults for omitted fields; fields of an earlier version are shown as "
         "they were stored."
     )
-    inputs: list[InputView]
+    inputs: list[InputView] = Field(
+        description="Scene, style images and camera files. `GET /v1/jobs/{job_id}/inputs` lists photos and masks too."
+    )
+    input_counts: dict[str, int] = Field(description="Number of files by role, photos and masks included.")
     links: Links
 
 
@@ -280,11 +284,12 @@ class ArtifactView(BaseModel):
 
 
 class ArtifactList(BaseModel):
-    """All files that a job has made so far."""
+    """A page of the files that a job has made so far, by name."""
 
-    model_config = _with_example(artifacts=[_example_of(ArtifactView)])
+    model_config = _with_example(artifacts=[_example_of(ArtifactView)], next_cursor=None)
 
     artifacts: list[ArtifactView]
+    next_cursor: str | None = Field(description="`cursor` of the next page; null on the last one.")
 
 
 class BlendPart(BaseModel):
@@ -320,11 +325,12 @@ class InputFileView(InputView):
 
 
 class InputList(BaseModel):
-    """The files that a job was created from, in the order in which they were sent."""
+    """A page of the files that a job was created from, in the order in which they were sent."""
 
-    model_config = _with_example(inputs=[_example_of(InputFileView)])
+    model_config = _with_example(inputs=[_example_of(InputFileView)], next_cursor="1")
 
     inputs: list[InputFileView]
+    next_cursor: str | None = Field(description="`cursor` of the next page; null on the last one.")
 
 
 class UploadView(BaseModel):
@@ -489,22 +495,24 @@ class SharedView(BaseModel):
     files: list[str] = Field(description="Files of the result.")
 
 
+#: Results that a share shows.
+SHARED_RESULTS = ("colors.f16", "stylized.ply")
 #: Parameters of a job that matter for rendering.
 _RENDERED = ("background", "near", "render_mode", "eps2d", "sh_attenuation")
 
 
-def shared_view(job: JobRow, expires_at: float, artifacts: Sequence[str]) -> SharedView:
+def shared_view(job: ShownJob, expires_at: float, artifacts: Sequence[str]) -> SharedView:
     """Return the public view of a shared job: only what the page needs to show it.
 
     Args:
-        artifacts: Names of the job's artifacts.
+        artifacts: Names of its shared results, from `SHARED_RESULTS`.
     """
     return SharedView(
-        name=job.name,
+        name=job.row.name,
         expires_at=expires_at,
-        parameters={name: job.parameters[name] for name in _RENDERED if name in job.parameters},
-        cameras=[entry["name"] for entry in job.inputs if entry["role"] == "cameras"],
-        files=[name for name in ("colors.f16", "stylized.ply") if name in artifacts],
+        parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters},
+        cameras=[entry["name"] for entry in job.inputs.named if entry["role"] == "cameras"],
+        files=list(artifacts),
     )
 
 
@@ -544,18 +552,19 @@ ANSWERS: tuple[type[BaseModel], ...] = (
 )
 
 
-def job_view(job: JobRow, queue_position: int | None, preview: str | None) -> JobView:
-    """Return a job as the API shows it; `preview` is the file name of its newest preview image."""
-    return JobView(**_job_fields(job, queue_position, preview))
+def job_view(job: ShownJob) -> JobView:
+    """Return a job as the API shows it."""
+    return JobView(**_job_fields(job))
 
 
-def job_detail(job: JobRow, queue_position: int | None, attempts: list[AttemptRow], preview: str | None) -> JobDetail:
+def job_detail(job: ShownJob, attempts: list[AttemptRow]) -> JobDetail:
     """Return a job with its attempts."""
     shown = [AttemptView.model_validate(row, from_attributes=True) for row in attempts]
-    return JobDetail(**_job_fields(job, queue_position, preview), attempts=shown)
+    return JobDetail(**_job_fields(job), attempts=shown)
 
 
-def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) -> dict[str, Any]:
+def _job_fields(shown: ShownJob) -> dict[str, Any]:
+    job = shown.row
     base = address(f"/v1/jobs/{job.id}")
     return {
         "id": job.id,
@@ -566,13 +575,14 @@ def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) ->
         "finished_at": job.finished_at,
         "expires_at": job.expires_at,
         "attempt": job.attempt,
-        "queue_position": queue_position,
-        "preview": preview,
+        "queue_position": shown.position,
+        "preview": shown.preview,
         "progress": job.progress or None,
         "result": job.result,
         "error": job.error or None,
         "parameters": JobParameters().model_dump(mode="json") | job.parameters,
-        "inputs": job.inputs,
+        "inputs": shown.inputs.named,
+        "input_counts": shown.inputs.counts,
         "links": Links(
             self=base,
             events=f"{base}/events",
@@ -582,15 +592,13 @@ def _job_fields(job: JobRow, queue_position: int | None, preview: str | None) ->
     }
 
 
-def input_views(job: JobRow) -> list[InputFileView]:
-    """Return the files that a job was created from."""
-    views, counts = [], Counter[str]()
-    for entry in job.inputs:
-        role, index = entry["role"], counts[entry["role"]]
-        counts[role] += 1
-        path = f"/v1/jobs/{job.id}/inputs/{role}" + (f":{index}" if index else "")
-        views.append(InputFileView(**entry, url=address(path)))
-    return views
+def input_views(job_id: str, entries: Sequence[tuple[int, dict[str, Any]]]) -> list[InputFileView]:
+    """Return files that a job was created from, each given with its index among those of its role."""
+    path = f"/v1/jobs/{job_id}/inputs"
+    return [
+        InputFileView(**entry, url=address(f"{path}/{entry['role']}" + (f":{index}" if index else "")))
+        for index, entry in entries
+    ]
 
 
 def progress_history(points: list[Point]) -> ProgressHistory:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Annotated, Any
@@ -14,9 +15,11 @@ import anyio
 import anyio.to_thread
 from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
+from pydantic import BaseModel
 
 from api.http.documentation import Responses, headers
 from api.http.request_memory import memory
+from api.http.threads import OwnerThreads
 from service.errors import NotFoundError, ServiceError
 from service.examples import SHA256
 
@@ -151,6 +154,70 @@ def file_answers(starts: dict[str, Any], *, always_policy: bool = False) -> Resp
             "headers": headers(*always, maybe=maybe),
         },
     }
+
+
+#: Size of the pieces in which a list is sent. No request holds more of it, except the entries that are read at once.
+_PIECE_BYTES = 1 << 16
+
+#: Function that returns up to so many entries after a cursor, and the cursor of the next ones; None for none.
+ReadEntries = Callable[[str | None, int], tuple[Sequence[BaseModel], str | None]]
+
+
+async def send_list(
+    name: str,
+    read: ReadEntries,
+    cursor: str | None,
+    limit: int,
+    threads: OwnerThreads,
+    owner: str,
+    *,
+    at_once: int = 250,
+) -> Response:
+    """Return the response with a page of a list, `{NAME: [...], "next_cursor": ...}`, which is sent as it is read.
+
+    Args:
+        name: Name of the list.
+        read: Function that reads entries.
+        cursor: Cursor of the page; None for the first one.
+        limit: Maximum number of entries on the page.
+        threads: Threads for reading, of which an owner occupies few.
+        owner: Owner of the list.
+        at_once: Number of entries to read at once.
+    """
+    pieces = _pieces(name, read, cursor, limit, at_once)
+    first, second = [await threads.run(owner, _following, pieces) for _ in range(2)]
+    if second is None:
+        return Response(first, media_type="application/json")
+
+    async def body() -> AsyncIterator[bytes]:
+        piece: bytes | None = second
+        yield first or b""
+        while piece is not None:
+            yield piece
+            piece = await threads.run(owner, _following, pieces)
+
+    return StreamingResponse(body(), media_type="application/json")
+
+
+def _following(pieces: Iterator[bytes]) -> bytes | None:
+    """Return the next piece; None after the last one."""
+    return next(pieces, None)
+
+
+def _pieces(name: str, read: ReadEntries, cursor: str | None, limit: int, at_once: int) -> Iterator[bytes]:
+    text, separator = f'{{"{name}":[', ""
+    while True:
+        entries, cursor = read(cursor, min(limit, at_once))
+        limit -= len(entries)
+        if entries:
+            text += separator + ",".join(entry.model_dump_json() for entry in entries)
+            separator = ","
+        if not limit or cursor is None:
+            yield f'{text}],"next_cursor":{json.dumps(cursor)}}}'.encode()
+            return
+        if len(text) >= _PIECE_BYTES:
+            yield text.encode()
+            text = ""
 
 
 def names_etag(header: str | None, tag: str, *, strong: bool = False) -> bool:

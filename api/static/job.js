@@ -372,8 +372,9 @@ export class JobView {
 
   showFacts() {
     const { job } = this, told = Object.entries(job.parameters).filter(([name, value]) => value !== null && value !== "" && name !== "name" && value !== false);
+    const files = Object.values(job.input_counts).reduce((sum, count) => sum + Number(count), 0);
     const fact = (/** @type {string} */ name, /** @type {string} */ value) => h("div", h("dt", name), h("dd", value));
-    put(this.facts, h("h2", say.inputs), h("dl.facts", job.inputs.slice(0, 12).map((/** @type {any} */ input) => fact(input.role, `${input.name} · ${size(input.size)}`)), job.inputs.length > 12 ? fact("", words.submit.nFiles(job.inputs.length)) : null),
+    put(this.facts, h("h2", say.inputs), h("dl.facts", job.inputs.slice(0, 12).map((/** @type {any} */ input) => fact(input.role, `${input.name} · ${size(input.size)}`)), files > Math.min(job.inputs.length, 12) ? fact("", words.submit.nFiles(files)) : null),
       h("details.fold", h("summary", say.settings), h("dl.facts", told.map(([name, value]) => fact(titleOf(name), typeof value === "object" ? JSON.stringify(value) : String(value))))));
   }
 

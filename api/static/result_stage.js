@@ -236,8 +236,8 @@ export class ResultStage {
 function filesOf(job, signal) {
   const inputs = `v1/jobs/${job.id}/inputs`;
   const cameras = async () => {
-    const found = (await get(inputs, signal)).inputs.filter((/** @type {any} */ input) => /^cameras(:|$)/.test(input.role));
-    return Promise.all(found.map(async (/** @type {any} */ file) => ({ name: file.name, blob: await (await ask("GET", `${inputs}/${file.role}`, { signal })).blob() })));
+    const found = job.inputs.filter((/** @type {any} */ input) => input.role === "cameras");
+    return Promise.all(found.map(async (/** @type {any} */ file, /** @type {number} */ i) => ({ name: file.name, blob: await (await ask("GET", `${inputs}/cameras:${i}`, { signal })).blob() })));
   };
   return { scene: `${inputs}/scene`, result: (name) => artifactPath(job.id, name), cameras };
 }

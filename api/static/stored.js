@@ -1,6 +1,6 @@
 // @ts-check
 /** Inputs that the service has from an earlier job: a new job uses them without another upload. */
-import { ask } from "./api.js";
+import { ask, get } from "./api.js";
 
 /** @typedef {File | StoredFile} Chosen file of a form: on this device, or on the service */
 
@@ -23,7 +23,7 @@ export class StoredFile {
 }
 
 /**
- * Return the inputs of a job by role, in their order.
+ * Return the scene, styles and cameras of a job by role, in their order.
  *
  * @param {any} job
  * @returns {Record<string, StoredFile[]>}
@@ -36,6 +36,23 @@ export function storedInputs(job) {
     those?.push(new StoredFile(`v1/jobs/${job.id}/inputs/${input.role}:${those.length}`, input));
   }
   return found;
+}
+
+/**
+ * Return the inputs of a job by role, with all photos and masks, whose names the job itself does not have.
+ *
+ * @param {any} job
+ * @returns {Promise<Record<string, StoredFile[]>>}
+ */
+export async function allInputs(job) {
+  if (!job.input_counts.photos && !job.input_counts.mask) return storedInputs(job);
+  const inputs = [];
+  for (let cursor = "0"; cursor !== null; ) {
+    const page = await get(`/v1/jobs/${job.id}/inputs?cursor=${cursor}`);
+    inputs.push(...page.inputs);
+    cursor = page.next_cursor;
+  }
+  return storedInputs({ id: job.id, inputs });
 }
 
 /** Return the content of a chosen file. @param {Chosen} file @returns {Promise<Blob>} */

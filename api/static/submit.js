@@ -12,7 +12,7 @@ import { accepted } from "./scene_formats.js";
 import { SelectPanel } from "./select_panel.js";
 import { droppedFiles, oneModel, Slot, sorted } from "./slots.js";
 import { Stage } from "./stage.js";
-import { contentOf, StoredFile, storedInputs } from "./stored.js";
+import { allInputs, contentOf, StoredFile } from "./stored.js";
 import { addPictures } from "./strength.js";
 import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
 import { percent, seconds, words } from "./words.js";
@@ -42,8 +42,8 @@ let kept = null;
  * @param {any} job
  * @param {{painting?: boolean}} [how] `painting`: whether to keep the job's paintings
  */
-export function startFrom(job, { painting = true } = {}) {
-  const { style_weights: weights, regions, orbit, preset, name: _, ...values } = job.parameters, inputs = storedInputs(job);
+export async function startFrom(job, { painting = true } = {}) {
+  const { style_weights: weights, regions, orbit, preset, name: _, ...values } = job.parameters, inputs = await allInputs(job);
   const taken = new Set((regions ?? []).flatMap((/** @type {any} */ region) => region.style ?? []));
   const own = inputs.style.filter(({ name }) => !taken.has(name)), gone = job.status === "expired";
   if (!painting) inputs.style = inputs.style.filter(({ name }) => taken.has(name));

@@ -150,8 +150,8 @@ class DerivedFiles:
         async with self._turn(job) as (process, folder, result):
             await asyncio.to_thread(self._check_count, job)
             others = [await asyncio.to_thread(self._result, job_id) for job_id in blend.others]
-            scene = sum(entry["size"] for entry in job.inputs if entry["role"] == "scene")
-            size = scene + sum(row.size for row in (result, *others))
+            scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
+            size = (scene["size"] if scene else 0) + sum(row.size for row in (result, *others))
             self._blobs.ensure_space(size + _BLEND_SIZE * result.size)
             staged = await asyncio.to_thread(self._stage, folder, job, [result, *others])
             parts = {RESULT: blend.weight, **{_staged_name(job, row): blend.others[row.job_id] for row in others}}
@@ -176,8 +176,9 @@ class DerivedFiles:
 
     def _stage(self, folder: Path, job: JobRow, results: list[ArtifactRow]) -> Staged:
         """Stage the job's inputs, with results beside them."""
-        rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in job.inputs}))
-        staged = stage(folder, job.inputs, self._blobs.fetch(rows, folder))
+        inputs = self._store.jobs.inputs(job.id)
+        rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in inputs}))
+        staged = stage(folder, inputs, self._blobs.fetch(rows, folder))
         for result in results:
             self._artifacts.fetch(result.location, folder / _staged_name(job, result), result.sha256)
         return staged

@@ -151,8 +151,9 @@ class VideoMaker:
 
     def _stage(self, folder: Path, job: JobRow, result: ArtifactRow) -> Staged:
         """Stage the job's inputs, with the result beside them."""
-        rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in job.inputs}))
-        staged = stage(folder, job.inputs, self._blobs.fetch(rows, folder))
+        inputs = self._store.jobs.inputs(job.id)
+        rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in inputs}))
+        staged = stage(folder, inputs, self._blobs.fetch(rows, folder))
         self._artifacts.fetch(result.location, folder / RESULT, result.sha256)
         return staged
 

@@ -237,6 +237,7 @@ def _set_pragmas(connection: Any, _record: Any, *, busy_seconds: float) -> None:
         "journal_mode=WAL",
         "synchronous=FULL",
         "foreign_keys=ON",
+        "cache_size=-512",  # kB of each connection; the system caches the file for all of them
         f"busy_timeout={busy_seconds * 1000:.0f}",
     ):
         cursor.execute(f"PRAGMA {pragma}")

@@ -11,10 +11,12 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.errors import CancelError, DeleteError, FinishError, NoJobError, NotFoundError, QueueFullError, RetryError
+from service.store import job_inputs
 from service.store.changes import add_status_event, end, forget, holder_name, job_of_owner, move
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import Point, points
 from service.store.inputs import close_receipt
+from service.store.job_inputs import InputSummary
 from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job, lock_owner
 from service.store.states import ACTIONS, ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
@@ -24,7 +26,8 @@ _JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
     Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blob_uses")
 )
 # Frequent queries are built once, because building a query takes longer than running it.
-_JOB = select(_JOBS).where(_JOBS.c.id == bindparam("job_id"))
+_SHOWN_JOBS = select(*(column for column in _JOBS.c if column.name != "inputs"))
+_JOB = _SHOWN_JOBS.where(_JOBS.c.id == bindparam("job_id"))
 _ATTEMPTS_OF = select(_ATTEMPTS).where(_ATTEMPTS.c.job_id == bindparam("job_id")).order_by(_ATTEMPTS.c.number)
 # Names of previews sort by step.
 _NEWEST_PREVIEWS = (
@@ -71,6 +74,24 @@ class Idempotency:
 
     key: str
     fingerprint: str
+
+
+@dataclass(frozen=True)
+class ShownJob:
+    """Job as users see it.
+
+    Attributes:
+        row: Its record, without inputs.
+        inputs: Summary of its inputs.
+        position: Number of queued jobs ahead by priority and age, plus one; None if it is not queued. The turns of
+            owners are ignored, because they change with every lease.
+        preview: Name of its newest preview; None if there is none.
+    """
+
+    row: JobRow
+    inputs: InputSummary
+    position: int | None
+    preview: str | None
 
 
 class Jobs:
@@ -142,7 +163,7 @@ class Jobs:
         return job, True
 
     def get(self, job_id: str, owner: str | None) -> JobRow:
-        """Return a job of this owner, or of any owner if None.
+        """Return a job of this owner, or of any owner if None, without its inputs.
 
         Raises:
             NoJobError: If there is no such job or it belongs to another owner.
@@ -150,8 +171,30 @@ class Jobs:
         with self._database.reading() as session:
             return job_of_owner(session, job_id, owner)
 
-    def detail(self, job_id: str, owner: str | None) -> tuple[JobRow, int | None, list[AttemptRow], str | None]:
-        """Return a job, its queue position, its attempts, and the name of its newest preview, all in one snapshot.
+    def inputs(self, job_id: str) -> list[dict[str, Any]]:
+        """Return `role`, `name`, `sha256` and `size` of all inputs of a job.
+
+        Raises:
+            NoJobError: If there is no such job.
+        """
+        with self._database.reading() as session:
+            inputs: list[dict[str, Any]] | None = session.scalar(select(JobRow.inputs).where(JobRow.id == job_id))
+        if inputs is None:
+            raise NoJobError(job_id)
+        return inputs
+
+    def input_page(self, job_id: str, start: int, limit: int) -> list[tuple[int, dict[str, Any]]]:
+        """Return a job's inputs from a position on, each with its index among those of its role."""
+        with self._database.reading_rows() as connection:
+            return job_inputs.page(connection, job_id, start, limit)
+
+    def input(self, job_id: str, role: str, index: int) -> dict[str, Any] | None:
+        """Return an input of a job by its role and its index among those of the role; None if there is none."""
+        with self._database.reading_rows() as connection:
+            return job_inputs.one(connection, job_id, role, index)
+
+    def detail(self, job_id: str, owner: str | None) -> tuple[ShownJob, list[AttemptRow]]:
+        """Return a job as it is shown, and its attempts, all in one snapshot.
 
         Raises:
             NoJobError: If there is no such job or it belongs to another owner.
@@ -160,33 +203,23 @@ class Jobs:
             row = connection.execute(_JOB, {"job_id": job_id}).one_or_none()
             if row is None or (owner is not None and row.owner != owner):
                 raise NoJobError(job_id)
-            job = JobRow(**row._mapping)
-            rows = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if job.attempt else ()
-            attempts = [AttemptRow(**each._mapping) for each in rows]
-            preview = _newest_previews(connection, [job_id] if job.attempt else []).get(job_id)
-            return job, _queue_position(connection, job), attempts, preview
+            (shown,) = _shown(connection, [JobRow(**row._mapping)])
+            rows = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if shown.row.attempt else ()
+            return shown, [AttemptRow(**each._mapping) for each in rows]
 
     def page(
         self, owner: str | None, *, status: Sequence[str] = (), before: str | None = None, limit: int = 50
-    ) -> list[JobRow]:
+    ) -> list[ShownJob]:
         """Return a page of an owner's jobs, newest first, starting after the job `before`."""
-        query = select(JobRow).order_by(JobRow.id.desc()).limit(limit)
+        query = _SHOWN_JOBS.order_by(_JOBS.c.id.desc()).limit(limit)
         if owner is not None:
-            query = query.where(JobRow.owner == owner)
+            query = query.where(_JOBS.c.owner == owner)
         if status:
-            query = query.where(JobRow.status.in_(status))
+            query = query.where(_JOBS.c.status.in_(status))
         if before is not None:
-            query = query.where(JobRow.id < before)
-        with self._database.reading() as session:
-            return list(session.scalars(query))
-
-    def queue_position(self, job: JobRow) -> int | None:
-        """Return the number of queued jobs ahead by priority and age, plus one; None if the job is not queued.
-
-        The turns of owners are ignored, because they change with every lease.
-        """
+            query = query.where(_JOBS.c.id < before)
         with self._database.reading_rows() as connection:
-            return _queue_position(connection, job)
+            return _shown(connection, [JobRow(**row._mapping) for row in connection.execute(query)])
 
     def finish(self, job_id: str, owner: str | None) -> JobRow:
         """Make a running job end after its current step, with its present colors as the result.
@@ -276,11 +309,11 @@ class Jobs:
                 raise DeleteError(job.status)
             return forget(session, job)
 
-    def artifacts(self, job_id: str) -> list[ArtifactRow]:
-        """Return the published files of a job by name; internal ones start with a dot."""
+    def artifacts(self, job_id: str, after: str = "", limit: int | None = None) -> list[ArtifactRow]:
+        """Return the published files of a job by name, starting after a name; internal ones start with a dot."""
+        query = select(ArtifactRow).where(ArtifactRow.job_id == job_id, ArtifactRow.name > after)
         with self._database.reading() as session:
-            query = select(ArtifactRow).where(ArtifactRow.job_id == job_id).order_by(ArtifactRow.name)
-            return list(session.scalars(query))
+            return list(session.scalars(query.order_by(ArtifactRow.name).limit(limit)))
 
     def artifact(self, job_id: str, name: str) -> ArtifactRow | None:
         """Return a published file; None if there is none."""
@@ -336,11 +369,6 @@ class Jobs:
         with self._database.reading_rows() as connection:
             return points(connection, job.id, job.progress, most)
 
-    def previews(self, job_ids: Sequence[str]) -> dict[str, str]:
-        """Return the name of the newest preview of each job; jobs without previews are left out."""
-        with self._database.reading_rows() as connection:
-            return _newest_previews(connection, job_ids)
-
     def events(self, job_id: str, after: int, limit: int = 500) -> list[EventRow]:
         """Return a job's events after the event number `after`."""
         query = select(EventRow).where(EventRow.job_id == job_id, EventRow.id > after)
@@ -379,9 +407,13 @@ def _check_queue(session: Session, owner: str, limit: int) -> None:
         raise QueueFullError(limit)
 
 
-def _newest_previews(connection: Connection, job_ids: Sequence[str]) -> dict[str, str]:
-    rows = connection.execute(_NEWEST_PREVIEWS, {"ids": list(job_ids)}) if job_ids else ()
-    return {row.job_id: row.newest for row in rows}
+def _shown(connection: Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:
+    """Return jobs as users see them, in the same snapshot."""
+    inputs = job_inputs.summaries(connection, [job.id for job in jobs])
+    started = [job.id for job in jobs if job.attempt]
+    rows = connection.execute(_NEWEST_PREVIEWS, {"ids": started}) if started else ()
+    previews = {row.job_id: row.newest for row in rows}
+    return [ShownJob(job, inputs[job.id], _queue_position(connection, job), previews.get(job.id)) for job in jobs]
 
 
 def _queue_position(connection: Connection, job: JobRow) -> int | None:

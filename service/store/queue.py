@@ -28,7 +28,7 @@ from sqlalchemy import (
     select,
     union_all,
 )
-from sqlalchemy.orm import Session, aliased
+from sqlalchemy.orm import Session, aliased, undefer
 
 from service.store.database import upsert
 from service.store.states import ACTIVE, JobStatus
@@ -113,6 +113,7 @@ def _first() -> Select[JobRow]:
     not_reserved = case((reserved_by(dispatcher), 0), else_=1)
     query = (
         select(JobRow)
+        .options(undefer(JobRow.inputs))
         .outerjoin(TurnRow, TurnRow.owner == JobRow.owner)
         .outerjoin(ReservationRow, ReservationRow.job_id == JobRow.id)
         .where(JobRow.id.in_(bindparam("candidates", type_=String, expanding=True)))

@@ -42,7 +42,7 @@ class JobRow(Base):
     status: Mapped[str] = mapped_column(String(12))
     priority: Mapped[int] = mapped_column(Integer, default=0)
     parameters: Mapped[dict[str, Any]]
-    inputs: Mapped[list[Any]]
+    inputs: Mapped[list[Any]] = mapped_column(deferred=True)  # may be long; see `service.store.job_inputs`
     created_at: Mapped[float] = mapped_column(Float)
     queued_at: Mapped[float] = mapped_column(Float)
     not_before: Mapped[float] = mapped_column(Float)

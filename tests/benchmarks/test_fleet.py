@@ -48,7 +48,7 @@ def test_failing_hosts_lose_time_but_no_jobs(tmp_path: Path) -> None:
     assert fleet.failures > 5
     assert sum(record.attempts for record in records) > len(records) == 12
     assert all(record.ended is not None for record in records)
-    assert {row.status for row in fleet.store.jobs.page(None)} == {JobStatus.SUCCEEDED}
+    assert {job.row.status for job in fleet.store.jobs.page(None)} == {JobStatus.SUCCEEDED}
     assert all(0 < record.lost < record.held for record in records if record.attempts > 1)
     fleet.store.close()
 

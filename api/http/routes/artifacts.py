@@ -13,8 +13,9 @@ from fastapi.responses import StreamingResponse
 
 from api.http.context import Caller, CallerDep, Context, ContextDep
 from api.http.documentation import Responses, invalid, links, problems
+from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import ArtifactList, artifact_view
+from api.http.schemas import ArtifactList, ArtifactView, artifact_view
 from api.http.sending import (
     ChangedError,
     ConditionsDep,
@@ -23,6 +24,7 @@ from api.http.sending import (
     SentFile,
     file_answers,
     send_file,
+    send_list,
 )
 from service.errors import (
     BusyError,
@@ -61,15 +63,28 @@ _SANDBOX = (
                 "get_artifact", "head_artifact", job_id="$request.path.job_id", name="$response.body#/artifacts/0/name"
             )
         },
-        **problems(NoJobError),
+        **problems(NoJobError, invalid("query.limit", "Input should be less than or equal to 1000")),
     },
     operation_id="list_artifacts",
 )
-def list_artifacts(job_id: JobId, context: ContextDep, caller: CallerDep) -> ArtifactList:
-    """List all files that a job has made so far. A running job has its plan and previews."""
-    find(context, caller, job_id)
-    rows = context.store.jobs.artifacts(job_id)
-    return ArtifactList(artifacts=[artifact_view(row) for row in rows if not row.name.startswith(".")])
+async def list_artifacts(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    cursor: Annotated[
+        str, Query(max_length=200, description="`next_cursor` of a page.", examples=["previews/step_0000100.jpg"])
+    ] = "",
+    limit: Annotated[Digits, Query(ge=1, le=1000, description="Files on a page.", examples=[1000])] = 1000,
+) -> Response:
+    """List the files that a job has made so far, by name. A running job has its plan and previews."""
+    await asyncio.to_thread(find, context, caller, job_id)
+
+    def read(after: str | None, most: int) -> tuple[list[ArtifactView], str | None]:
+        page = context.store.jobs.artifacts(job_id, after or "", most + 1)
+        following = page[most - 1].name if len(page) > most else None
+        return [artifact_view(row) for row in page[:most] if not row.name.startswith(".")], following
+
+    return await send_list("artifacts", read, cursor, limit, context.threads, caller.owner)
 
 
 #: Media types of results (`service.files.artifacts`), and how the content of each starts.

@@ -7,14 +7,15 @@ from functools import partial
 from pathlib import PurePosixPath
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.context import Caller, CallerDep, Context, ContextDep
-from api.http.documentation import Responses, links, problems
-from api.http.input_references import input_entry
+from api.http.documentation import Responses, invalid, links, problems
+from api.http.input_references import find_input
+from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import InputList, input_views
+from api.http.schemas import InputFileView, InputList, input_views
 from api.http.sending import (
     ChangedError,
     ConditionsDep,
@@ -23,6 +24,7 @@ from api.http.sending import (
     SentFile,
     file_answers,
     send_file,
+    send_list,
 )
 from service.errors import DamagedFileError, LostFileError, NoJobError, NotFoundError, StoreError
 from service.examples import JOB_ID
@@ -81,13 +83,26 @@ _ANSWERS: Responses = {
                 "get_input", "head_input", job_id="$request.path.job_id", role="$response.body#/inputs/0/role"
             )
         },
-        **problems(NoJobError),
+        **problems(NoJobError, invalid("query.limit", "Input should be less than or equal to 1000")),
     },
     operation_id="list_inputs",
 )
-def list_inputs(job_id: JobId, context: ContextDep, caller: CallerDep) -> InputList:
-    """List the files that a job was created from."""
-    return InputList(inputs=input_views(find(context, caller, job_id)))
+async def list_inputs(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    cursor: Annotated[Digits, Query(ge=0, lt=2**31, description="`next_cursor` of a page.", examples=[0])] = 0,
+    limit: Annotated[Digits, Query(ge=1, le=1000, description="Files on a page.", examples=[1000])] = 1000,
+) -> Response:
+    """List the files that a job was created from, photos and masks included."""
+    await asyncio.to_thread(find, context, caller, job_id)
+
+    def read(start: str | None, most: int) -> tuple[list[InputFileView], str | None]:
+        position = int(start or 0)
+        page = context.store.jobs.input_page(job_id, position, most + 1)
+        return input_views(job_id, page[:most]), str(position + most) if len(page) > most else None
+
+    return await send_list("inputs", read, str(cursor), limit, context.threads, caller.owner)
 
 
 @router.head("/{job_id}/inputs/{role}", operation_id="head_input", response_class=Response, responses=_ANSWERS)
@@ -144,7 +159,7 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
         NoInputError: If the job has no such input, or has expired and released its inputs.
     """
     job = find(context, caller, job_id)
-    entry = input_entry(job, role)
+    entry = find_input(context.store.jobs, job, role)
     if entry is not None:
         row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
         if row is not None:

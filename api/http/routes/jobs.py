@@ -16,8 +16,9 @@ from api.http.addresses import address
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, invalid, links, problems
 from api.http.fetching import file_name, is_url
-from api.http.input_references import input_entry, parse_reference, uploaded_name
+from api.http.input_references import parse_input, parse_reference, uploaded_name
 from api.http.multipart import (
+    MAX_TEXT,
     BodyTypeError,
     NotUtf8Error,
     Received,
@@ -47,7 +48,7 @@ from api.http.schemas import (
     poll_seconds,
     progress_history,
 )
-from api.http.sending import IfNoneMatch, names_etag
+from api.http.sending import IfNoneMatch, names_etag, send_list
 from api.http.submission import BODY, REFUSALS, JobFromUploads
 from service.errors import (
     CancelError,
@@ -71,6 +72,7 @@ from service.inspection.inspector import Show
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
 from service.store.jobs import Idempotency, NewJob
+from service.store.states import JobStatus
 from service.store.tables import BlobRow, JobRow, UploadRow
 from service.weights import check_weights
 
@@ -236,8 +238,7 @@ def _queue_job(
     response_headers = {"Location": address(f"/v1/jobs/{job.id}"), "Retry-After": "2"}
     if not created:
         response_headers["Idempotency-Replayed"] = "true"
-    preview = None if created else jobs.previews([job.id]).get(job.id)
-    body = job_view(job, jobs.queue_position(job), preview).model_dump_json()
+    body = job_view(jobs.detail(job.id, caller.owner)[0]).model_dump_json()
     return Response(body, 202, response_headers, media_type="application/json")
 
 
@@ -255,6 +256,8 @@ async def _from_form(request: Request, context: Context, receipt: Receipt) -> Pa
 async def _from_json(request: Request, context: Context) -> Parts:
     job = JobFromUploads.model_validate(await read_json(request, context.settings, _MAX_JSON))
     job.parameters.settings()
+    if len(job.parameters.model_dump_json(exclude_unset=True)) > MAX_TEXT:
+        raise RefusedInputError(f"parameters: has more than {MAX_TEXT} bytes.", "invalid-request", input="parameters")
     styles = [job.style] if isinstance(job.style, str) else job.style
     named = [("scene", job.scene), *(("style", each) for each in styles)]
     named += [(role, each) for role in ("cameras", "photos", "mask") for each in getattr(job, role)]
@@ -275,7 +278,7 @@ def _resolve_inputs(
     inputs = list(received.files)
     ids = [text for _, _, text in received.uploads if is_id(text)]
     uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
-    jobs: dict[str, JobRow] = {}
+    jobs: dict[str, list[dict[str, Any]]] = {}
     resolved: list[tuple[str, str]] = []
     for _, role, text in received.uploads:
         if is_url(text):
@@ -301,24 +304,27 @@ def _resolve_inputs(
 
 
 def _referred_input(
-    context: Context, caller: Caller, job_id: str, name: str, role: str, jobs: dict[str, JobRow]
+    context: Context, caller: Caller, job_id: str, name: str, role: str, jobs: dict[str, list[dict[str, Any]]]
 ) -> dict[str, Any]:
     """Return the entry of an input of one of the caller's jobs.
 
     Args:
-        jobs: Jobs that were read for other references, to which this one is added.
+        jobs: Inputs of jobs that were read for other references, to which this one's are added.
 
     Raises:
         UnknownInputError: If the input does not exist, or was released.
     """
     try:
-        job = jobs.setdefault(job_id, jobs.get(job_id) or find(context, caller, job_id))
+        if job_id not in jobs:
+            released = find(context, caller, job_id).status == JobStatus.EXPIRED
+            jobs[job_id] = [] if released else context.store.jobs.inputs(job_id)
     except NoJobError:
         raise UnknownInputError(job_id, name, role) from None
-    entry = input_entry(job, name)
-    if entry is None:
+    place = parse_input(name)
+    entries = [entry for entry in jobs[job_id] if place and entry["role"] == place[0]]
+    if place is None or place[1] >= len(entries):
         raise UnknownInputError(job_id, name, role)
-    return entry
+    return entries[place[1]]
 
 
 def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
@@ -351,7 +357,7 @@ def _idempotency(
     },
     operation_id="list_jobs",
 )
-def list_jobs(
+async def list_jobs(
     context: ContextDep,
     caller: CallerDep,
     status: Annotated[
@@ -362,14 +368,15 @@ def list_jobs(
         str | None, Query(pattern="^job_[0-9a-f]{31}$", description="`next_cursor` of a page.", examples=[JOB_ID])
     ] = None,
     limit: Annotated[Digits, Query(ge=1, le=200, description="Jobs on a page.", examples=[20])] = 50,
-) -> JobPage:
+) -> Response:
     """List the jobs of this key, newest first."""
-    jobs = context.store.jobs
-    rows = jobs.page(caller.owner, status=status or (), before=cursor, limit=limit + 1)  # one more shows if more follow
-    page = rows[:limit]
-    previews = jobs.previews([job.id for job in page])
-    views = [job_view(job, jobs.queue_position(job), previews.get(job.id)) for job in page]
-    return JobPage(jobs=views, next_cursor=page[-1].id if len(rows) > limit else None)
+
+    def read(before: str | None, most: int) -> tuple[list[JobView], str | None]:
+        page = context.store.jobs.page(caller.owner, status=status or (), before=before, limit=most + 1)
+        following = page[most - 1].row.id if len(page) > most else None  # one more shows if more follow
+        return [job_view(job) for job in page[:most]], following
+
+    return await send_list("jobs", read, cursor, limit, context.threads, caller.owner, at_once=16)
 
 
 @router.get(
@@ -423,8 +430,9 @@ async def change_job(request: Request, job_id: JobId, context: ContextDep, calle
 
 
 def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Response:
-    job = find(context, caller, job_id)
-    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs))
+    check_id(job_id)
+    job, _ = context.store.jobs.detail(job_id, caller.owner)
+    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs.named))
     return _job_response(context, caller, job_id)
 
 
@@ -546,12 +554,12 @@ def check_id(job_id: str) -> None:
 def _job_response(
     context: Context, caller: Caller, job_id: str, if_none_match: str | None = None, status: int = 200
 ) -> Response:
-    job, position, attempts, preview = context.store.jobs.detail(job_id, caller.owner)
-    view = job_detail(job, position, attempts, preview)
+    job, attempts = context.store.jobs.detail(job_id, caller.owner)
+    view = job_detail(job, attempts)
     body = view.model_dump_json().encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     response_headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    wait = poll_seconds(job)
+    wait = poll_seconds(job.row)
     if wait is not None:
         response_headers["Retry-After"] = str(wait)
     if names_etag(if_none_match, tag):

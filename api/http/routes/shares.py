@@ -12,12 +12,12 @@ from fastapi.responses import StreamingResponse
 from api.http.addresses import address
 from api.http.context import CallerDep, Context, ContextDep, ForeignSiteError, check_site, is_id
 from api.http.documentation import Responses, headers, invalid, links, problems
-from api.http.input_references import input_entry
+from api.http.input_references import find_input
 from api.http.multipart import BodyTypeError, NotUtf8Error, TooSlowError, check_media_type, read_json
 from api.http.routes.artifacts import check_artifact
 from api.http.routes.inputs import check_input
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, ShareView, shared_view
+from api.http.schemas import SHARED_RESULTS, NewShare, ShareCreated, SharedView, ShareList, ShareView, shared_view
 from api.http.sending import ChangedError, ConditionsDep, RangeError, SentFile, file_answers, send_file
 from service.errors import (
     DamagedFileError,
@@ -32,6 +32,7 @@ from service.errors import (
     TooManySharesError,
 )
 from service.examples import SHARE_ID, SHARE_TOKEN
+from service.store.jobs import ShownJob
 from service.store.quotas import Quotas
 from service.store.shares import Shared
 
@@ -167,9 +168,22 @@ def revoke_share(
 )
 async def show_shared(shared: SharedDep, context: ContextDep) -> Response:
     """Get what the viewer of a shared result needs to know. The token of the link replaces a key."""
-    artifacts = await asyncio.to_thread(context.store.jobs.artifacts, shared.job.id)
-    view = shared_view(shared.job, shared.share.expires_at, [row.name for row in artifacts])
+    job, names = await asyncio.to_thread(_find_shown, context, shared)
+    view = shared_view(job, shared.share.expires_at, names)
     return Response(view.model_dump_json(), headers=_SECRET, media_type="application/json")
+
+
+def _find_shown(context: Context, shared: Shared) -> tuple[ShownJob, list[str]]:
+    """Return the shared job, and those of the names in `SHARED_RESULTS` that it has.
+
+    Raises:
+        NoShareError: If the job was deleted meanwhile.
+    """
+    jobs, job_id = context.store.jobs, shared.job.id
+    try:
+        return jobs.detail(job_id, None)[0], [name for name in SHARED_RESULTS if jobs.artifact(job_id, name)]
+    except NoJobError:
+        raise NoShareError from None
 
 
 #: Files that a share gives access to: the scene and its cameras as they were sent, and the result.
@@ -223,7 +237,7 @@ def _find_file(context: Context, shared: Shared, name: str) -> SentFile:
         NoSharedFileError: If the job has no such file, such as `colors.f16` after Gaussians were split.
     """
     check: partial[None]
-    entry = input_entry(shared.job, name)
+    entry = find_input(context.store.jobs, shared.job, name)
     if entry is not None:
         blob = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
         if blob is None:

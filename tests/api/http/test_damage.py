@@ -90,7 +90,7 @@ def refused(answer: httpx.Response, code: str) -> None:
 
 
 def blob_of(service: Service, store: Store, job_id: str, role: str) -> Path:
-    (sha256,) = (entry["sha256"] for entry in store.jobs.get(job_id, None).inputs if entry["role"] == role)
+    (sha256,) = (entry["sha256"] for entry in store.jobs.inputs(job_id) if entry["role"] == role)
     return service.data / "blobs" / store.inputs.blobs([sha256])[sha256].location
 
 

@@ -15,6 +15,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -34,6 +35,7 @@ from service.files.artifacts import Artifacts
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store, open_store
+from service.store.jobs import NewJob
 from service.store.tables import UploadRow
 from sgsst_core.files.formats import EXTRA_FORMATS, FORMATS
 from sgsst_core.files.formats.ply import PLY
@@ -963,6 +965,41 @@ def test_malformed_upload_creation_is_rejected(client: httpx.Client) -> None:
         422,
         "invalid-request",
     )
+
+
+def test_lists_of_many_photos_take_little_memory(client: httpx.Client, service: Service, store: Store) -> None:
+    """Six lists at once of jobs with 2,000 photos each, and lists that are not read; pages have every name once."""
+    sha256 = store.jobs.inputs(store.jobs.page(None, limit=1)[0].row.id)[0]["sha256"]
+    entry = {"name": "scene.ply", "sha256": sha256, "size": 1}
+    photos = [{**entry, "role": "photos", "name": f"images/left/IMG_2026_{number:06d}.jpg"} for number in range(2000)]
+    inputs = [*photos, {**entry, "role": "scene"}]
+    ids = [store.jobs.create(NewJob("local", "", 0, {}, inputs), limit=10**6)[0].id for _ in range(60)]
+    with ThreadPoolExecutor(6) as threads:
+        answers = list(threads.map(lambda _: client.get("/v1/jobs?limit=200"), range(6)))
+    for answer in answers:
+        jobs = answer.json()["jobs"][:60]
+        assert [job["id"] for job in jobs] == ids[::-1]
+        assert jobs[0]["input_counts"] == {"photos": 2000, "scene": 1}
+        assert [each["role"] for each in jobs[0]["inputs"]] == ["scene"]
+        assert len(answer.content) < MB
+    address = urlsplit(service.url)
+    with contextlib.ExitStack() as stack:
+        for path in ("/v1/jobs?limit=200", f"/v1/jobs/{ids[0]}/inputs") * 20:
+            unread = stack.enter_context(socket.create_connection((address.hostname, address.port or 80)))
+            unread.sendall(f"GET {path} HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n".encode())
+        assert client.get("/v1/jobs?limit=1").json()["next_cursor"] == ids[-1]
+    names, cursor = [], "0"
+    while cursor is not None:
+        page = client.get(f"/v1/jobs/{ids[0]}/inputs?limit=700&cursor={cursor}").json()
+        names += [each["name"] for each in page["inputs"]]
+        cursor = page["next_cursor"]
+    assert names == [each["name"] for each in inputs]
+    assert page["inputs"][-2]["url"] == f"/v1/jobs/{ids[0]}/inputs/photos:1999"
+    large = {"scene": UPLOAD_ID, "style": UPLOAD_ID, "parameters": {"name": "x", "background": [0.0] * 40_000}}
+    assert client.post("/v1/jobs", json=large).status_code == 422
+    for job_id in ids:
+        store.jobs.cancel(job_id, None)
+        store.jobs.delete(job_id, None)
 
 
 def test_upload_names_cannot_escape_folder(client: httpx.Client, service: Service) -> None:

@@ -112,7 +112,7 @@ def test_all_pairs_of_operations_on_one_job(settings: ServiceSettings, tmp_path:
         store = open_store(settings)
         sent = {"scene": ply, "cameras": cameras, "style": style}
         first = client.post("/v1/jobs", files={role: (path.name, path.read_bytes()) for role, path in sent.items()})
-        inputs = store.jobs.get(first.json()["id"], None).inputs
+        inputs = store.jobs.inputs(first.json()["id"])
         assert client.post(f"/v1/jobs/{first.json()['id']}/cancel").status_code == 200
 
         def new_job() -> Job:

@@ -41,5 +41,5 @@ def test_uncallable_webhook_urls_are_rejected(service: Service, tmp_path: Path) 
             assert (problem["code"], problem["input"]) == ("invalid-webhook", "webhook")
         assert submit("https://example.com/hook").status_code == 202
     store = open_store(ServiceSettings(data=service.data))
-    assert [job.webhook for job in store.jobs.page(None, limit=10)] == ["https://example.com/hook"]
+    assert [job.row.webhook for job in store.jobs.page(None, limit=10)] == ["https://example.com/hook"]
     store.close()

@@ -29,7 +29,7 @@ def test_queue_order_equals_a_plain_sort(store: Store, clock: Clock, seed: int) 
         clock.now += chance.choice([0, 1, LEASE / 4])
         for _ in range(chance.randrange(4)):
             queue(store, chance.choice("abcdef"), chance.choice([0, 0, 0, 1]))
-        expected = sorted_queue(store.jobs.page(None, limit=1000), served, clock.now)
+        expected = sorted_queue([job.row for job in store.jobs.page(None, limit=1000)], served, clock.now)
         lease = store.leases.take("one")
         assert (lease and lease.job_id) == (expected and expected.id)
         if lease is None:

@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -81,12 +82,12 @@ def test_detail_is_one_snapshot(store: Store) -> None:
             store.leases.release(held)
 
     event.listen(store.database.engine, "after_cursor_execute", release)
-    job, position, attempts, _ = store.jobs.detail(held.job_id, None)
+    shown, attempts = store.jobs.detail(held.job_id, None)
     event.remove(store.database.engine, "after_cursor_execute", release)
     assert released
-    assert (job.status, position, attempts[0].outcome) == ("starting", None, None)
-    job, position, attempts, _ = store.jobs.detail(held.job_id, None)
-    assert (job.status, position, attempts[0].outcome) == ("queued", 1, "released")
+    assert (shown.row.status, shown.position, attempts[0].outcome) == ("starting", None, None)
+    shown, attempts = store.jobs.detail(held.job_id, None)
+    assert (shown.row.status, shown.position, attempts[0].outcome) == ("queued", 1, "released")
 
 
 def test_rows_that_vanish_are_conflicts(store: Store) -> None:
@@ -114,7 +115,7 @@ def test_queue_positions_match_the_order_of_leases(store: Store, clock: Clock) -
         clock.now += number % 2  # two jobs at a time
         ids.append(queue(store, priority=priority))
     by_position = {store.jobs.detail(job_id, "local")[1]: job_id for job_id in ids}
-    assert {store.jobs.queue_position(store.jobs.get(job_id, None)): job_id for job_id in ids} == by_position
+    assert {store.jobs.detail(job_id, None)[0].position: job_id for job_id in ids} == by_position
     assert [lease(store).job_id for _ in ids] == [by_position[place] for place in range(1, len(ids) + 1)]
     assert store.jobs.detail(ids[0], "local")[1] is None
 
@@ -479,10 +480,27 @@ def test_newest_preview_of_each_job(store: Store) -> None:
         names = ["previews/step_0000009.jpg", "previews/step_0000100.jpg", "views.jpg", "previewsx.jpg"]
         store.leases.publish(held, [Published(name, f"{number}/{name}", 1, SHA) for name in names[number:]])
     newest = "previews/step_0000100.jpg"
-    assert store.jobs.previews(jobs) == {jobs[0]: newest, jobs[1]: newest}
-    assert store.jobs.detail(jobs[0], None)[3] == newest
-    assert store.jobs.detail(jobs[2], None)[3] is None
-    assert store.jobs.previews([]) == {}
+    assert [job.preview for job in store.jobs.page(None)] == [None, newest, newest]
+    assert store.jobs.detail(jobs[0], None)[0].preview == newest
+    assert store.jobs.detail(jobs[2], None)[0].preview is None
+
+
+def test_inputs_are_read_in_pieces(store: Store) -> None:
+    """Lists have the scene, styles and cameras, and count photos and masks, whose names are read by page."""
+    roles = ["photos", "scene", "photos", "style", "mask", "style", "cameras", "photos"]
+    entries = [
+        {"role": role, "name": f"{number}\u00e9'.png", "sha256": SHA, "size": 3} for number, role in enumerate(roles)
+    ]
+    job_id = store.jobs.create(replace(new_job(), inputs=entries), limit=10)[0].id
+    (shown,) = store.jobs.page(None)
+    assert shown.inputs == store.jobs.detail(job_id, None)[0].inputs
+    assert [entries.index(entry) for entry in shown.inputs.named] == [1, 3, 5, 6]
+    assert shown.inputs.counts == {"scene": 1, "style": 2, "cameras": 1, "photos": 3, "mask": 1}
+    assert store.jobs.input_page(job_id, 2, 4) == [(1, entries[2]), (0, entries[3]), (0, entries[4]), (1, entries[5])]
+    assert store.jobs.input_page(job_id, 8, 4) == []
+    assert store.jobs.input(job_id, "photos", 2) == entries[7]
+    assert store.jobs.input(job_id, "photos", 3) is None
+    assert store.jobs.inputs(job_id) == lease(store).job.inputs == entries
 
 
 def test_unused_blobs_are_deleted(store: Store, clock: Clock) -> None:
@@ -687,7 +705,7 @@ class StoreMachine(RuleBasedStateMachine):
 
     @invariant()
     def as_the_model_says(self) -> None:
-        assert {job.id: job.status for job in self.store.jobs.page(None, limit=1000)} == self.status
+        assert {job.row.id: job.row.status for job in self.store.jobs.page(None, limit=1000)} == self.status
         assert all(count == 1 for count in self.published.values())
         for job_id, status in self.status.items():
             names = [row.name for row in self.store.jobs.artifacts(job_id)]
