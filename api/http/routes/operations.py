@@ -31,7 +31,13 @@ async def livez() -> Health:
                     "schema": {"$ref": "#/components/schemas/Health"},
                     "example": {
                         "status": "unavailable",
-                        "checks": {"database": "ok", "artifacts": "ok", "disk": "NoSpaceError", "weights": "ok"},
+                        "checks": {
+                            "database": "ok",
+                            "artifacts": "ok",
+                            "disk": "NoSpaceError",
+                            "weights": "ok",
+                            "dispatchers": "1",
+                        },
                     },
                 }
             },
@@ -54,10 +60,12 @@ async def readyz(context: ContextDep) -> Response:
         name: type(outcome).__name__ if isinstance(outcome, BaseException) else "ok"
         for name, outcome in outcomes.items()
     }
-    if not all(value == "ok" for value in checks.values()):
+    ready, alive = set(checks.values()) == {"ok"}, outcomes["database"]
+    if not isinstance(alive, BaseException):
+        checks["dispatchers"] = str(alive or "none")
+    if not ready:
         return JSONResponse(Health(status="unavailable", checks=checks).model_dump(), 503, {"Retry-After": "5"})
-    alive = outcomes["database"]
-    view = Health(status="ok" if alive else "waiting", checks={**checks, "dispatchers": str(alive or "none")})
+    view = Health(status="ok" if alive else "waiting", checks=checks)
     return JSONResponse(view.model_dump())
 
 

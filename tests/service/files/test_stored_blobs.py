@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -221,6 +222,17 @@ def test_cache_is_evicted_for_incoming_files(fleet: Fleet, monkeypatch: pytest.M
         with pytest.raises(NoSpaceError):
             host.ensure_space(7001)
     host.ensure_space(10_000)
+
+
+def test_disk_without_a_free_byte_is_full(tmp_path: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    blobs = BlobFolder(tmp_path / "data", fleet.store.inputs, 0)
+    for free, full in ((0, True), (1, False)):
+        monkeypatch.setattr("service.files.blobs.shutil.disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        assert (blobs.missing_space(0) > 0) == full
+        with pytest.raises(NoSpaceError) if full else nullcontext():
+            blobs.ensure_space(0)
+    with pytest.raises(NoSpaceError):
+        blobs.ensure_space(2)
 
 
 def test_disk_without_inodes_rejects_files(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
