@@ -32,7 +32,9 @@ ANSWER_SECONDS = 30.0
 #: Timeout of health checks and of queries of the server's time, on separate connections, in seconds.
 _RESERVED_SECONDS = 2.0
 #: Connection options for PostgreSQL: an unreachable server is detected within seconds rather than by TCP's own timeout.
-_LOST_AFTER = {
+#: Nothing is prepared on the server, since pgbouncer may run each transaction on another of its connections.
+_POSTGRESQL: dict[str, int | None] = {
+    "prepare_threshold": None,
     "connect_timeout": 5,
     "keepalives_idle": 5,
     "keepalives_interval": 2,
@@ -85,7 +87,7 @@ class Database:
         if self.sqlite:
             options["connect_args"] = {"timeout": bound, "check_same_thread": False}
         else:
-            options |= {"pool_pre_ping": True, "connect_args": _LOST_AFTER}
+            options |= {"pool_pre_ping": True, "connect_args": _POSTGRESQL}
         engine = create_engine(self.url, **options)
         if self.sqlite:
             event.listen(engine, "connect", partial(_set_pragmas, busy_seconds=bound))
