@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import ROOT, Service
+from tests.full_disk import full_disk
 from tests.http_servers import serve
 from tests.small_scenes import wall, write_files
 
@@ -253,12 +253,8 @@ def test_download_to_a_full_disk_leaves_nothing(
     job_id = submit(files, capsys)
     finish(service, job_id, bytes(200_000), tmp_path)
     out = tmp_path / "new" / "out.ply"
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-    try:
+    with full_disk(100_000):
         assert main(["download", job_id, "--out", str(out)]) == 2
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert f"error: {out}: cannot be written: File too large." in capsys.readouterr().err
     assert list(out.parent.iterdir()) == []
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import signal
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from api.cli.main import main
+from tests.full_disk import full_disk
 from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -69,7 +69,6 @@ def test_ctrl_c_while_writing_leaves_no_file(command: str, tmp_path: Path, capsy
 def test_full_disk_is_one_message_and_leaves_no_file(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The limit of a file's size stands for a full disk, which only root can make."""
     scene, views, style = map(str, write_files(tmp_path, wall()))
     out = tmp_path / "out"
     seen = ["--cameras", views]
@@ -83,12 +82,8 @@ def test_full_disk_is_one_message_and_leaves_no_file(
         "plan": ["plan", scene, *seen, "--style", style, "--out", str(out / "plan.json")],
         "study": ["study", "make", f"a={scene}", f"b={scene}", "--style", style, *seen, "--out", str(out / "a.html")],
     }[command]
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
-    try:
+    with full_disk(1000):
         assert main(arguments) == 2
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1
     assert errors[0].startswith(f"error: {out}")
