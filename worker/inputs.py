@@ -6,6 +6,7 @@ interpret the files in the same way.
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from torch import Tensor
 from sgsst_core.decision import Decision
 from sgsst_core.errors import SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
-from sgsst_core.files.images import WHITE, Color, load_image
+from sgsst_core.files.images import WHITE, Color, image_size, load_image
 from sgsst_core.files.photos import Photo, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
@@ -40,6 +41,10 @@ from worker.selecting import select_regions
 from worker.styles import StyleFile
 
 T = TypeVar("T")
+#: Maximum number of pixels of all images of a style: as float32 they take 400 MB, and up to as much again while one of
+#: them is resized to the views.
+STYLE_PIXELS = 1 << 25
+_REDUCED = "{}: was reduced when it was read, because the style has more than 33 megapixels"
 
 
 @dataclass(frozen=True)
@@ -146,6 +151,8 @@ def read_regions(
 def load_styles(files: Sequence[StyleFile], background: Color = WHITE) -> Style:
     """Read the images of a style and normalize their weights.
 
+    If they have more than `STYLE_PIXELS` together, those with more than their share of it are reduced first.
+
     Args:
         background: sRGB color behind transparent parts, in 0..1.
 
@@ -156,7 +163,10 @@ def load_styles(files: Sequence[StyleFile], background: Color = WHITE) -> Style:
     weights = normalized([file.weight for file in files])  # raises before any image is read
     names = tuple(file.path.name for file in files)
     notes: list[str] = []
-    images = tuple(load_image(file.path, background=background, warn=notes.append) for file in files)
+    sizes = [math.prod(image_size(file.path)) for file in files]
+    most = STYLE_PIXELS // len(files) if sum(sizes) > STYLE_PIXELS else STYLE_PIXELS
+    notes += [_REDUCED.format(file.path.name) for file, size in zip(files, sizes, strict=True) if size > most]
+    images = tuple(load_image(file.path, background=background, warn=notes.append, most_pixels=most) for file in files)
     return Style(images, weights, names, tuple(notes))
 
 

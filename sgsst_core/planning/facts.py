@@ -225,6 +225,7 @@ class Probe:
         device_bytes: GPU memory in bytes, with scene and network loaded; 0 on a CPU.
         launches: Cost of launching a view's loss on a GPU; None on a CPU, or if no decision depends on it.
         styles: Number of images in the style mixture.
+        style_bytes: Size of the largest style image in bytes, which is copied while it is resized.
         frozen: [N] bool, frozen Gaussians; None if there are none.
         maps: Number of maps of regions, and of content weights, that are rendered in each view.
     """
@@ -241,5 +242,6 @@ class Probe:
     device_bytes: int = 0
     launches: LaunchCost | None = None
     styles: int = 1
+    style_bytes: int = 0
     frozen: Tensor | None = None
     maps: int = 0

@@ -101,7 +101,9 @@ class PeakMemory:
         matching = matching_bytes(self.sizes, self.tiling, probe.network.vector_channels, probe.machine.device)
         budget = memory_for("activations", self._memory)
         colors = int(self.plan.seen.sum()) * COLOR_BYTES
-        return image + matching + colors + reference_activations(self.plan, self.activations, budget)
+        return (
+            image + matching + colors + probe.style_bytes + reference_activations(self.plan, self.activations, budget)
+        )
 
     @property
     def _memory(self) -> int:

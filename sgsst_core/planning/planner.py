@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from torch import Tensor
+
 from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
@@ -100,7 +102,9 @@ def make_plan(
         def decide_here() -> Plan:
             probe = measure(planning_context, survey, link, maps)
             frozen = None if resolved is None else resolved.frozen
-            probe = replace(probe, styles=_style_count(style, resolved), frozen=frozen, maps=maps + weighted)
+            images = _style_images(style, resolved)
+            largest = max((4 * image.numel() for image in images if image is not None), default=0)
+            probe = replace(probe, styles=len(images), style_bytes=largest, frozen=frozen, maps=maps + weighted)
             return decide(probe, settings, measured=measured)
 
         # Timings differ between ranks, so one rank decides for all.
@@ -115,10 +119,10 @@ def make_plan(
     return replace(plan, refinement=refinement, decisions=(*request_lines, *plan.decisions)), planning_context
 
 
-def _style_count(style: Style | None, regions: Regions | None) -> int:
-    """Return the number of style images of a job, including those of regions as resolved by `Regions.resolved`."""
+def _style_images(style: Style | None, regions: Regions | None) -> list[Tensor | None]:
+    """Return all style images of a job; `regions` are those of `Regions.resolved`. None stands for an unknown image."""
     mixtures = [style] if regions is None else [regions.every[index].style or style for index in regions.active]
-    return sum(len(mixture.images) if mixture else 1 for mixture in mixtures)
+    return [image for mixture in mixtures for image in (mixture.images if mixture else (None,))]
 
 
 def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> list[Decision]:

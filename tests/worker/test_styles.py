@@ -3,8 +3,11 @@
 from pathlib import Path
 
 import pytest
+import torch
+from PIL import Image
 
 from sgsst_core.errors import SettingsError
+from worker.inputs import load_styles
 from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style, parse_styles, split_weight
 
 
@@ -48,3 +51,17 @@ def test_number_of_styles_is_limited() -> None:
     for count in (0, MOST_STYLE_IMAGES + 1):
         with pytest.raises(SettingsError, match=f"There are {count} style images"):
             parse_styles(["a.jpg"] * count)
+
+
+def test_only_styles_of_many_pixels_are_reduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, size in (("large", (80, 60)), ("small", (20, 20))):
+        Image.linear_gradient("L").resize(size).save(tmp_path / f"{name}.png")
+    files = [StyleFile(tmp_path / "large.png"), StyleFile(tmp_path / "small.png")]
+    whole = load_styles(files)
+    assert [image.shape[:2] for image in whole.images] == [(60, 80), (20, 20)]
+    assert not whole.notes
+    monkeypatch.setattr("worker.inputs.STYLE_PIXELS", 5000)
+    style = load_styles(files)
+    assert [image.shape[:2] for image in style.images] == [(30, 40), (20, 20)]
+    assert torch.equal(style.images[1], whole.images[1])
+    assert [note.partition(":")[0] for note in style.notes] == ["large.png"]

@@ -25,6 +25,7 @@ from sgsst_core.files.images import (
     save_png,
     stored_size,
 )
+from sgsst_core.scene.pyramid import downscale
 from tests.small_scenes import LFS_POINTER
 
 
@@ -322,3 +323,25 @@ def test_invalid_images_are_not_written(tmp_path: Path) -> None:
 
 def test_real_paintings_are_read(shared_data: Path) -> None:
     assert load_image(shared_data / "styles" / "starry_night.jpg").shape == (1520, 1920, 3)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "P", "RGBA", "I;16", "CMYK"])
+def test_large_images_are_reduced_before_they_are_floats(tmp_path: Path, mode: str) -> None:
+    """Squares of pixels are averaged; an image that is small enough is read as it is."""
+    values = (np.add.outer(np.arange(60), 2 * np.arange(80)) + 10).astype(np.uint8)
+    gray = Image.fromarray(values)
+    image = Image.fromarray(values.astype(np.uint16) * 257) if mode == "I;16" else gray.convert("RGB").convert(mode)
+    path = tmp_path / ("a.tif" if mode == "CMYK" else "a.png")
+    image.save(path)
+    whole = load_image(path, color_managed=False)
+    assert torch.equal(load_image(path, color_managed=False, most_pixels=80 * 60), whole)
+    small = load_image(path, color_managed=False, most_pixels=80 * 60 - 1)
+    assert small.shape == (30, 40, 3)
+    assert (small - downscale(whole, 1)).abs().max() <= (4 if mode == "P" else 1.01) / 255
+
+
+def test_large_jpegs_are_decoded_at_a_lower_resolution(tmp_path: Path) -> None:
+    Image.linear_gradient("L").convert("RGB").save(tmp_path / "a.jpg", quality=95)
+    small = load_image(tmp_path / "a.jpg", most_pixels=64 * 64)
+    assert small.shape == (64, 64, 3)
+    assert (small - downscale(load_image(tmp_path / "a.jpg"), 2)).abs().max() < 0.02
