@@ -324,15 +324,15 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
     def image(name: str, index: int = 0) -> NDArray[np.uint8]:
         return whole(name, index)[: header.count]
 
-    pixels, high = whole("means"), image("means", 1)
-    low, rest = pixels[: header.count], pixels[header.count :, :3]
-    surplus = 0 if (rest == rest[-1:]).all() else int(rest.any(axis=1).sum())  # padding repeats one pixel
+    low, high = image("means"), image("means", 1)
     for block in _blocks(header.count):
         steps = (low[block, :3] | high[block, :3].astype(np.uint16) << 8) / 65535
         values = header.bounds[0] + (header.bounds[1] - header.bounds[0]) * steps
         with np.errstate(over="ignore", invalid="ignore"):  # non-finite results are reported later
             into["means"][block] = np.sign(values) * np.expm1(np.abs(values))
-    quats = image("quats")
+    quats = whole("quats")
+    surplus = int((quats[header.count :, 3] >= _FIRST_TAG).sum())  # padding has no valid rotations
+    quats = quats[: header.count]
     for block in _blocks(header.count):
         index = quats[block, 3].astype(np.int64) - _FIRST_TAG
         if index.min() < 0:

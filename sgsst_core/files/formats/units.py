@@ -117,7 +117,7 @@ def _fits_as_deviations(means: NDArray[np.float32], scales: NDArray[np.float32])
     low, high = np.nanquantile(means[::step], (0.05, 0.95), axis=0)
     extent = float((high - low).max())
     size = float(np.nanmedian(scales[::step].max(axis=1)))
-    if not extent > 0 or not size > 0:
+    if not 0 < size < extent:
         return False
     distance = np.log(extent / np.sqrt(len(means)))
     return bool(abs(np.log(size) - distance) < abs(size - distance))

@@ -98,6 +98,17 @@ def test_values_match_those_computed_by_hand(tmp_path: Path, version: int, metho
         assert scene.opacities.tolist() == [-4, 6]
 
 
+def test_padding_may_have_any_colors(tmp_path: Path) -> None:
+    """Writers may change the colors of transparent pixels, with which images are padded."""
+    padding = [[9, 8, 7, 0], [5, 6, 7, 0]]
+    files = by_hand(2)
+    for name in ("low", "high", "quats", "scales", "sh0", "labels"):
+        pixels = np.asarray(Image.open(io.BytesIO(files[name])).convert("RGBA"))
+        files[name] = webp(np.concatenate([pixels, [padding]]))
+    (tmp_path / "scene.sog").write_bytes(zipped(files))
+    assert read_scene(tmp_path / "scene.sog").notes == ()
+
+
 def test_missing_first_value_of_a_codebook_is_extrapolated(tmp_path: Path) -> None:
     """Older writers left it empty (null); it lies a mean step below the second value, as in PlayCanvas' reader."""
     path, files = tmp_path / "scene.sog", by_hand(2)

@@ -227,6 +227,12 @@ def test_scenes_in_small_units_are_read(tmp_path: Path) -> None:
     assert torch.equal(read_scene(tmp_path / "scene.ply").scene.scales, large.scales)
 
 
+def test_gaussians_larger_than_the_scene_are_read(tmp_path: Path) -> None:
+    """They are neither plausible as logarithms nor as they are."""
+    write_scene(tmp_path / "scene.ply", replace(wall(), scales=torch.full((616, 3), 6.0)))
+    assert len(read_scene(tmp_path / "scene.ply").scene) == 616
+
+
 def test_colors_in_place_of_coefficients_are_noticed(tmp_path: Path) -> None:
     path, colors = tmp_path / "scene.ply", torch.rand(616, 3, generator=torch.Generator().manual_seed(1))
     write_scene(path, replace(wall(), sh_dc=colors * 255))
