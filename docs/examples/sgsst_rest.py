@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import os
-import shutil
 import time
 import urllib.error
 import urllib.request
@@ -77,10 +77,20 @@ class Service:
             time.sleep(float(answer.headers["Retry-After"]))
 
     def download(self, job_id: str, name: str, out: Path) -> None:
-        """Write a file of a job to `out`, which is replaced once the file is complete."""
+        """Write a file of a job to `out`, which is replaced once the file is complete.
+
+        Raises:
+            RuntimeError: If the connection was lost, or the SHA-256 of the file is not the one of its ETag.
+        """
         part = out.with_name(out.name + ".part")
+        digest = hashlib.sha256()
         with self.request("GET", f"/v1/jobs/{job_id}/artifacts/{name}") as answer, part.open("wb") as file:
-            shutil.copyfileobj(answer, file)
+            while block := answer.read(1 << 20):
+                file.write(block)
+                digest.update(block)
+        if digest.hexdigest() not in answer.headers.get("ETag", ""):
+            part.unlink()
+            raise RuntimeError(f"The download of {name} was truncated or damaged. Try again.")
         part.replace(out)
 
     def request(self, method: str, path: str, body: object = None, headers: dict[str, str] | None = None) -> Any:

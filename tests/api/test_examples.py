@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import os
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,6 +23,7 @@ from PIL import Image
 
 from sgsst_core.files.scene_file import read_scene
 from tests.api.service import ROOT, Service
+from tests.http_servers import serve
 from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow
@@ -88,6 +91,29 @@ def test_comfyui_node(node: ModuleType, service: Service, files: tuple[Path, Pat
     with pytest.raises(RuntimeError, match="Both 'cameras'"):
         node.Service(service.url).stylize(scene, style, tmp_path / "b.ply", [cameras], orbit=3)
     assert not (tmp_path / "b.ply").exists()
+
+
+def test_truncated_download_is_no_result(node: ModuleType, tmp_path: Path) -> None:
+    class Truncating(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("ETag", f'"{hashlib.sha256(b"content").hexdigest()}"')
+            self.send_header("Content-Length", "7")
+            self.end_headers()
+            self.wfile.write(b"cont" if self.path.endswith("truncated") else b"content")
+
+        def log_message(self, *arguments: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Truncating) as server:
+        serve(server)
+        service = node.Service(f"http://127.0.0.1:{server.server_port}")
+        with pytest.raises(RuntimeError, match="truncated or damaged"):
+            service.download("job", "truncated", tmp_path / "out.ply")
+        assert list(tmp_path.iterdir()) == []
+        service.download("job", "whole", tmp_path / "out.ply")
+        assert (tmp_path / "out.ply").read_bytes() == b"content"
+        server.shutdown()
 
 
 def test_handoff_to_a_viewer(service: Service, files: tuple[Path, Path, Path], tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import logging
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import tempfile
 import threading
@@ -34,6 +35,8 @@ OBJECT_STORE_BYTES = 512 << 20
 _LONGEST_FOLDER = 40
 #: Token of every Ray instance that this process starts. Ray reads the token only once.
 _SECRET = secrets.token_hex(32)
+#: Seconds in which a cluster must answer, and type of the frame that starts every HTTP/2 connection.
+_ANSWER_SECONDS, _SETTINGS = 10.0, 4
 #: Ray processes without which a local instance does not work.
 _DAEMONS = ("raylet", "gcs_server")
 
@@ -94,6 +97,7 @@ class Cluster:
 
         _silence_ray()
         try:
+            _check_answers(str(self.address))
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.CRITICAL)
         except Exception as error:  # Ray raises errors of many types here, some of them built-in
             raise ClusterAwayError(
@@ -155,6 +159,19 @@ class Cluster:
         if self._sweeper is not None:
             sweeper.dismiss(self._sweeper)
             self._sweeper = None
+
+
+def _check_answers(address: str) -> None:
+    """Raise an OSError if nothing speaks HTTP/2, as Ray does, at HOST:PORT. Ray itself would wait for minutes."""
+    host, _, port = address.rpartition("//")[2].rpartition(":")
+    if not port.isdecimal():  # "auto", which Ray looks up
+        return
+    with socket.create_connection((host.strip("[]"), int(port)), _ANSWER_SECONDS) as connection:
+        if os.environ.get("RAY_USE_TLS", "0") != "0":
+            return
+        connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, _SETTINGS, 0, 0, 0, 0, 0]))
+        if connection.recv(4)[3:] != bytes([_SETTINGS]):
+            raise ConnectionError("what listens there is not Ray")
 
 
 def _is_daemon(process: psutil.Process) -> bool:
