@@ -68,11 +68,10 @@ class ExtensionError(ServiceError):
     """A header of an extension of the tus protocol that is not supported."""
 
     code, status = "unsupported-tus-extension", 400
-    headers = MappingProxyType({"Tus-Extension": EXTENSIONS})
     example = ("Upload-Concat", "concatenation")
 
     def __init__(self, header: str, extension: str) -> None:
-        super().__init__(f"{header}: the extension {extension!r} is not supported. Tus-Extension lists those that are.")
+        super().__init__(f"{header}: the extension {extension!r} is not supported. Those supported are {EXTENSIONS}.")
 
 
 class EmptyFileError(BadRequestError):
