@@ -16,6 +16,7 @@ export class SelectPanel {
   /** @param {Stage} stage */
   constructor(stage) {
     this.stage = stage;
+    this.leaving = new AbortController();
     /** @type {Tool} */
     this.tool = "move";
     /** @type {"add" | "subtract"} */
@@ -96,7 +97,7 @@ export class SelectPanel {
     surface.addEventListener("pointerleave", () => !this.drawn.length && this.paint());
     surface.addEventListener("contextmenu", (/** @type {Event} */ event) => event.preventDefault());
     surface.addEventListener("wheel", (/** @type {WheelEvent} */ event) => (event.preventDefault(), stage.controls?.wheel(event)), { passive: false });
-    stage.element.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => this.key(event));
+    document.addEventListener("keydown", (event) => this.key(event), { signal: this.leaving.signal });
   }
 
   /**
@@ -317,9 +318,10 @@ export class SelectPanel {
     }
   }
 
-  /** @param {KeyboardEvent} event */
+  /** Undo or redo, except while a text outside of the panel is edited. @param {KeyboardEvent} event */
   key(event) {
-    if (!this.selection || !(event.ctrlKey || event.metaKey)) return;
+    const text = event.target instanceof HTMLInputElement && !["radio", "checkbox", "range"].includes(event.target.type);
+    if (!this.selection || !(event.ctrlKey || event.metaKey) || (text && !this.element.contains(event.target))) return;
     const key = event.key.toLowerCase(), redo = key === "y" || (key === "z" && event.shiftKey);
     if (!redo && key !== "z") return;
     event.preventDefault();
@@ -334,6 +336,7 @@ export class SelectPanel {
   }
 
   end() {
+    this.leaving.abort();
     this.selection = null;
   }
 }

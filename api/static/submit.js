@@ -5,7 +5,7 @@ import { readCameras, ringCameras } from "./cameras.js";
 import { announce, h, icon, newId, put } from "./dom.js";
 import { Gallery } from "./gallery.js";
 import { defaultName } from "./names.js";
-import { GROUPS, optionControl, plainly } from "./options.js";
+import { GROUPS, optionControl, plainly, showWrong } from "./options.js";
 import { costCard } from "./plan.js";
 import { RegionList } from "./regions.js";
 import { accepted } from "./scene_formats.js";
@@ -157,6 +157,7 @@ export class SubmitView {
     this.apart = this.choice("paintings", say.apart, false, () => this.styleChanged());
     this.together = h("fieldset.segments.wide", { hidden: true }, h("legend.away", say.paintings), this.blended.element, this.apart.element);
     this.shares = h("div.options.shares", { hidden: true });
+    this.shareError = h("p.wrong", { hidden: true });
     this.lookOptions = h("div.options");
     this.expertOptions = h("div.options");
     this.search = h("input", { type: "search", "aria-label": say.find, placeholder: say.find, oninput: () => this.filter() });
@@ -411,7 +412,7 @@ export class SubmitView {
     this.together.hidden = files.length < 2;
     this.shares.hidden = files.length < 2 || !!this.apart?.input.checked;
     this.startButton.textContent = this.jobs > 1 ? say.startAll(this.jobs) : say.start;
-    put(this.shares, h("p.help", say.weights), files.length > 1 ? files.map((file, i) => h("div.option.inline", h("span", file.name), this.weights[i])) : null);
+    put(this.shares, h("p.help", say.weights), files.length > 1 ? files.map((file, i) => h("div.option.inline", h("span", file.name), this.weights[i])) : null, this.shareError);
   }
 
   /** Number of jobs to create: one, or one per painting that belongs to no region. */
@@ -462,6 +463,7 @@ export class SubmitView {
     for (const slot of Object.values(this.slots)) slot.wrong("");
     for (const control of this.controls.values()) control.wrong("");
     this.regions.clearWrong();
+    for (const weight of this.weights) showWrong(weight, this.shareError, "");
     if (this.problem) this.problem.hidden = true;
   }
 
@@ -483,27 +485,19 @@ export class SubmitView {
     return values;
   }
 
-  /** Mark the slots of missing inputs, as far as the page can check them. Return whether there are any. */
-  missing() {
+  /** Mark the slots of missing inputs, as far as the page can check them. */
+  markMissing() {
     const { scene, style, cameras } = this.slots;
     /** @type {[Slot, string, boolean][]} */
     const needed = [[scene, say.needScene, !scene.files.length], [style, say.needStyle, !style.files.length], [cameras, say.needCameras, !this.orbiting && !cameras.files.length]];
-    const wrong = needed.filter(([, , absent]) => absent);
-    wrong.forEach(([slot, text]) => slot.wrong(text));
-    wrong[0]?.[0].input.focus();
-    return wrong.length > 0;
+    for (const [slot, text, absent] of needed) if (absent) slot.wrong(text);
   }
 
-  /** Mark inputs whose text is not what they ask for. Return whether there are any. */
-  invalid() {
-    const used = [...this.controls.values()].filter(({ name }) => this.orbiting || !ORBIT.includes(name));
-    const wrong = used.filter((control) => control.problem());
-    for (const control of [...wrong].reverse()) this.tell(control, control.problem());
+  /** Mark inputs whose text is not what they ask for. */
+  markInvalid() {
+    for (const control of this.controls.values()) if (this.orbiting || !ORBIT.includes(control.name)) control.wrong(control.problem());
     const weight = this.jobs === 1 && this.weights.find((input) => !(Number(input.value) > 0) || !Number.isFinite(Number(input.value)));
-    if (!weight) return wrong.length > 0;
-    this.slots.style.wrong(words.refusals.weight(weight.getAttribute("aria-label")));
-    weight.focus();
-    return true;
+    if (weight) showWrong(weight, this.shareError, words.refusals.weight(weight.getAttribute("aria-label")));
   }
 
   /** Stop sending and planning; the form stays as it is. */
@@ -517,7 +511,9 @@ export class SubmitView {
   async act(dry) {
     if (this.busy) return;
     this.clearWrong();
-    if (this.missing() || this.invalid()) return;
+    this.markMissing();
+    this.markInvalid();
+    if (this.reveal()) return;
     this.setBusy(true, dry);
     this.stopping = new AbortController();
     this.planningText = "";
@@ -662,15 +658,12 @@ export class SubmitView {
     if (error instanceof Problem) {
       if (error.code === "unknown-upload") this.uploads.clear();
       if (error.code === "unknown-input") this.askAgain(error.input);
-      const [first] = error.errors, told = first ? plainly(first.message) : text;
-      const region = this.regions.refuse(first?.at ?? "", told);
-      if (region) return this.reveal(region, told);
-      const at = this.placeOf(error);
-      if (at) return this.tell(at, told);
+      const told = error.errors.length ? error.errors : [{ at: "", message: text }];
+      const placed = [...told].reverse().map(({ at, message }) => this.mark(error.input, at, plainly(message)));
+      if (this.reveal() && placed.every(Boolean)) return;
     }
     this.problem.hidden = false;
     this.problem.textContent = text;
-    this.problem.scrollIntoView({ block: "nearest" });
   }
 
   /** Ask for files of a slot that have expired on the service. @param {string | undefined} role */
@@ -680,35 +673,32 @@ export class SubmitView {
     slot?.changed();
   }
 
-  /** @param {Problem} problem @returns {Slot | Control | undefined} */
-  placeOf({ input, errors, message }) {
-    if (input && input in this.slots) return this.slots[/** @type {keyof typeof this.slots} */ (input)];
-    const names = [input, ...(errors[0]?.at ?? "").split(".").reverse(), ...(/^Settings? (\w+)/.exec(message)?.slice(1) ?? [])];
-    return names.map((name) => this.controls.get(name ?? "")).find((control) => control);
-  }
-
   /**
-   * @param {Slot | Control} place
-   * @param {string} text
-   */
-  tell(place, text) {
-    place.wrong(text);
-    place.element.hidden = false;
-    this.reveal(place.element, text);
-  }
-
-  /**
-   * Scroll to an element with a refusal, and focus its wrong input.
+   * Mark the input that the service has refused. Return whether the form has it.
    *
-   * @param {HTMLElement} element
-   * @param {string} text
+   * @param {string | undefined} role role of the refused file, or name of the refused parameter
+   * @param {string} at path of the refused parameter, such as "regions.0.select"
+   * @param {string} message
    */
-  reveal(element, text) {
-    const fold = element.closest("details");
-    if (fold) fold.hidden = !(fold.open = true);
-    const input = element.querySelector("[aria-invalid=true]") ?? element.querySelector("input, select");
-    if (input instanceof HTMLElement) input.focus();
-    announce(text);
+  mark(role, at, message) {
+    if (this.regions.refuse(at, message)) return true;
+    const names = [role, ...at.split(".").reverse(), /^Settings? (\w+)/.exec(message)?.[1]];
+    const places = names.map((name) => this.slots[/** @type {keyof typeof this.slots} */ (name)] ?? this.controls.get(name ?? ""));
+    const place = places.find((each) => each?.element.isConnected);
+    place?.wrong(message);
+    return !!place;
+  }
+
+  /** Scroll to the first input that is marked as wrong, focus it and announce why. Return whether there is one. */
+  reveal() {
+    const input = this.form.querySelector("[aria-invalid=true]"), place = input?.closest(".region") ?? input?.closest(".option, .slot, .shares");
+    if (!input || !place) return false;
+    for (let fold = input.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.hidden = !(fold.open = true);
+    place.hidden = false;
+    place.scrollIntoView({ block: "center" });
+    input.focus({ preventScroll: true });
+    announce(place.querySelector(".wrong:not([hidden])")?.textContent ?? "");
+    return true;
   }
 
   end() {

@@ -8,6 +8,8 @@ import { words } from "./words.js";
 const TUS = { "Tus-Resumable": "1.0.0" };
 const KEPT = "sgsst.uploads", MOST_KEPT = 60;
 const SMALLEST = 1 << 20, LARGEST = 1 << 26;
+/** Most milliseconds between attempts while there is no connection. */
+const AGAIN = 2000;
 /** Target duration of a part in milliseconds. */
 const PART = 1500;
 const SAMPLES = 64, SAMPLE = 4096;
@@ -123,7 +125,7 @@ export class Upload {
     this.print = await fingerprint(this.file);
     const before = kept()[this.print];
     if (before) this.id = before.id;
-    let wait = 1000;
+    let wait = AGAIN / 4;
     for (;;) {
       try {
         if (this.over) throw new DOMException("", "AbortError");
@@ -132,7 +134,7 @@ export class Upload {
         this.known = this.sent === this.file.size && this.part === SMALLEST && !this.sending;
         while (this.sent < this.file.size && this.state !== "paused") {
           await this.sendPart();
-          wait = 1000;
+          wait = AGAIN / 4;
         }
         if (this.state === "paused") continue;
         this.enter("done");
@@ -141,10 +143,21 @@ export class Upload {
         if (!this.canGoOn(error)) throw error;
         if (/** @type {State} */ (this.state) === "paused") continue;
         this.enter("offline");
-        await new Promise((done) => setTimeout(done, wait));
-        wait = Math.min(wait * 2, 15000);
+        await this.waited(wait);
+        wait = Math.min(wait * 2, AGAIN);
       }
     }
+  }
+
+  /** Wait for this time, or until the browser is online again or the user acts. @param {number} wait milliseconds */
+  async waited(wait) {
+    const back = new AbortController();
+    await new Promise((done) => {
+      this.goOn = () => done(null);
+      setTimeout(done, wait);
+      addEventListener("online", done, { signal: back.signal });
+    });
+    back.abort();
   }
 
   /** @param {unknown} error */

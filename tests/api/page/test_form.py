@@ -165,6 +165,45 @@ def test_refusals_of_the_service_stand_at_their_place(visit: Visit, files: dict[
     watched.check(REFUSED)
 
 
+def in_view(watched: Watched, message: str) -> bool:
+    """Return whether a message is neither outside of the window nor under the bar of buttons."""
+    page = watched.page
+    text, bar = page.locator(".wrong:visible", has_text=message).bounding_box(), page.locator(".actions").bounding_box()
+    return bool(text["y"] >= 0 and text["y"] + text["height"] <= bar["y"])
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
+def test_first_refused_field_is_in_view_and_focused(
+    visit: Visit, files: dict[str, Path], width: int, height: int
+) -> None:
+    """Both the page's own refusals and those of the service, from any position of the page."""
+    watched = visit(width=width, height=height)
+    page = watched.page
+    focused = """() => document.activeElement.closest("[data-name]")?.dataset.name
+      ?? document.activeElement.labels[0].innerText"""
+    choose(watched, {"scene": files["scene"], "style": files["style"]})
+    set_options(watched, target_loss=1, resolution=99999)
+    page.evaluate("() => scrollTo(0, 0)")
+    page.get_by_role("button", name="Start").click()
+    assert in_view(watched, "Choose camera files, or orbit the object.")
+    assert page.evaluate(focused) == "Cameras"
+    choose(watched, {"cameras": files["cameras"]})
+    page.get_by_text("3 cameras shown in the scene").wait_for()
+    page.evaluate("() => scrollTo(0, document.body.scrollHeight)")
+    page.get_by_role("button", name="Start").click()
+    assert in_view(watched, "Must be at most 16,384.")
+    assert page.evaluate(focused) == "resolution"
+    assert page.locator(".wrong:visible", has_text="Must be less than 1.").count() == 1
+    set_options(watched, target_loss=0.5, resolution=480, background="pink", style_background="pink")
+    page.evaluate("() => scrollTo(0, 0)")
+    page.get_by_role("button", name="Start").click()
+    page.locator("[data-name=style_background] .wrong:visible").wait_for()
+    page.locator("[data-name=style_background] .wrong").evaluate("(text) => text.remove()")
+    assert in_view(watched, "'pink' is not a color.")
+    assert page.evaluate(focused) == "background"
+    watched.check(REFUSED)
+
+
 def test_defaults_are_those_of_the_chosen_preset(visit: Visit) -> None:
     watched = visit()
     page = watched.page

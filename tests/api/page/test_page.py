@@ -157,6 +157,23 @@ def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_pat
     watched.check("net::ERR", "423")  # the first part's request may still hold the upload
 
 
+def test_upload_resumes_as_soon_as_the_browser_is_online(visit: Visit, files: dict[str, Path]) -> None:
+    """Timers never end here: the upload does not wait for its next attempt."""
+    watched = visit()
+    page = watched.page
+    set_options(watched, **LONG)
+    choose(watched, files)
+    page.get_by_text("3 cameras shown in the scene").wait_for()
+    watched.context.set_offline(True)
+    page.evaluate("() => { window.setTimeout = () => 0; }")
+    page.get_by_role("button", name="Start").click()
+    page.get_by_text("no connection").wait_for()
+    watched.context.set_offline(False)
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".badge", has_text="Canceled").wait_for()
+    watched.check("net::ERR")
+
+
 def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     """After a restart of the server, the event stream resumes where it stopped, and the loss history is complete."""
     job_id = submit(service, files, **LONG)

@@ -44,6 +44,7 @@ def test_result_is_downloaded_in_every_format(visit: Visit, finished: str) -> No
         assert download.value.suggested_filename == f"scene_style-stylized{each.suffix}"
         assert read_scene_header(download.value.path()).format.title == each.title
     watched.settled()
+    fill_the_screen(watched)
     with page.expect_download() as download:
         page.get_by_role("button", name="Save image").click()
     assert download.value.suggested_filename == "scene_style-view_0.png"
@@ -84,8 +85,24 @@ def test_result_comes_before_deletion_on_a_phone(visit: Visit, finished: str) ->
     ]
     tops = [place.bounding_box()["y"] for place in places]
     assert tops == sorted(tops)
+    assert tops[0] < 300, "the view is at the top of the page"
+    fill_the_screen(watched)
     page.get_by_role("heading", name="How it ran").wait_for()
     watched.check()
+
+
+def fill_the_screen(watched: Watched) -> None:
+    """Show the 3D view in full screen, and check that the scene takes all but the tools."""
+    page = watched.page
+    page.get_by_role("button", name="Full screen").click()
+    page.locator(".stage:fullscreen").wait_for()
+    heights = [
+        page.locator(part).bounding_box()["height"] for part in (".stage", ".stage canvas.view", ".stage .tools")
+    ]
+    assert heights[0] == page.viewport_size["height"]
+    assert heights[1] + heights[2] > heights[0] - 40
+    page.get_by_role("button", name="Full screen").click()
+    page.locator(".stage:not(:fullscreen)").wait_for()
 
 
 def test_no_remaining_time_is_shown_while_views_are_analyzed(visit: Visit, finished: str) -> None:
