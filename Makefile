@@ -77,7 +77,7 @@ $(VENV)/created:
 
 $(VENV)/installed: $(VENV)/created pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time"
-	$(PIP_INSTALL) --editable ".[service]"
+	$(PIP_INSTALL) --editable ".[service,video,heif]"
 	@touch $@
 
 $(VENV)/installed-dev: $(VENV)/created pyproject.toml constraints.txt

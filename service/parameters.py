@@ -11,14 +11,12 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.options import RENAMED, Option
 from sgsst_core.settings import checked
 from worker.options import JobVideo, StylizeOptions
-from worker.region_requests import MOST_REGIONS, RegionOptions, RegionRequest, region_requests
+from worker.region_requests import MOST_REGIONS, NO_CONTROLS, RegionOptions, RegionRequest, region_requests
 from worker.styles import MOST_STYLE_IMAGES
 
-#: Names without control characters: they are shown in terminals, and some databases cannot store zero bytes.
-_NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
 #: Maximum number of characters of a job's name.
 MAX_JOB_NAME = 200
-JobName = Annotated[str, Field(max_length=MAX_JOB_NAME, pattern=_NO_CONTROLS)]
+JobName = Annotated[str, Field(max_length=MAX_JOB_NAME, pattern=NO_CONTROLS)]
 
 
 class JobParameters(StylizeOptions):

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.option_parsers import parse_strength
@@ -32,7 +32,10 @@ REST = "rest"
 MOST_REGIONS = 16
 #: Maximum weight of a region. Larger ones can raise the gradient beyond `LARGEST_GRADIENT`.
 MOST_REGION_WEIGHT = 1e6
-_NAME = r"[A-Za-z][A-Za-z0-9_-]{0,31}"
+#: Text without control characters: it is shown in terminals, and some databases cannot store zero bytes.
+NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
+#: Name of a region, which is a label: any text.
+RegionName = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=64, pattern=NO_CONTROLS)]
 _COMPARISON = re.compile(r"(?P<name>[^<>=!]+)(?P<sign>>=|<=|!=|>|<|=)(?P<value>.+)", re.DOTALL)
 _COUNTS = {"box": 6, "sphere": 4, "half-space": 4}
 Kind = Literal["box", "sphere", "half-space", "property", "mask", "masks"]
@@ -89,7 +92,7 @@ class RegionOptions(BaseModel):
         json_schema_extra={"examples": [{"name": "face", "select": "sphere=0,1.4,0,0.3", "style": "wave.jpg"}]},
     )
 
-    name: Annotated[str, Field(pattern=f"^{_NAME}$")] = Field(
+    name: RegionName = Field(
         description="Name of the region; `rest` stands for the Gaussians that no region selects.", examples=["face"]
     )
     select: Annotated[str, Field(max_length=1000)] | None = Field(
@@ -137,7 +140,7 @@ class RegionOptions(BaseModel):
         Raises:
             SettingsError: If the selection or a style is invalid.
         """
-        selection = None if self.select is None else parse_selection(self.select, f"region {self.name}")
+        selection = None if self.select is None else parse_selection(self.select, f"region {self.name!r}")
         styles = tuple(parse_style(text, exists) for text in self.style_texts)
         return RegionRequest(self.name, selection, styles, self.weight, self.freeze, self.content_weight)
 
@@ -213,7 +216,8 @@ def region_options(
     by_name: dict[str, RegionOptions] = {}
     for text in regions:
         name, separator, spec = text.partition(":")
-        if not separator or not re.fullmatch(_NAME, name):
+        name = name.strip()
+        if not separator or not name or "=" in name:
             raise SettingsError(f"--region {text}: expected NAME:SPEC, such as face:sphere=0,1.4,0,0.3. {_HOW}")
         if name in by_name:
             raise SettingsError(f"--region {text}: a region {name} already exists. Give each region a unique name.")

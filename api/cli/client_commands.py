@@ -117,14 +117,14 @@ def _styles_and_parameters(
 
 def _masks(regions: Sequence[RegionOptions]) -> dict[str, Path]:
     """Return the mask file or folder of each region that has one, by the name under which it is sent."""
-    requests = region_requests(regions)
-    return {_mask_name(each): each.selection.path for each in requests if each.selection and each.selection.path}
+    numbered = enumerate(region_requests(regions))
+    return {_mask_name(i, each): each.selection.path for i, each in numbered if each.selection and each.selection.path}
 
 
-def _mask_name(region: RegionRequest) -> str:
+def _mask_name(number: int, region: RegionRequest) -> str:
     """Return the name under which the mask of a region is sent; its suffix determines the format."""
     suffix = region.selection.path.suffix if region.selection and region.selection.path else ""
-    return f"{region.name}{suffix}"
+    return f"region_{number}{suffix}"
 
 
 def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> list[dict[str, Any]]:
@@ -135,9 +135,9 @@ def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> 
     """
     objects = {region.name: region.model_dump(mode="json", exclude_defaults=True) for region in regions}
     unused_names = iter(names)
-    for request in region_requests(regions):
+    for number, request in enumerate(region_requests(regions)):
         if request.selection and request.selection.path:
-            objects[request.name]["select"] = f"{request.selection.kind}={_mask_name(request)}"
+            objects[request.name]["select"] = f"{request.selection.kind}={_mask_name(number, request)}"
         if request.styles:
             objects[request.name]["style"] = [f"{next(unused_names)}:{file.weight!r}" for file in request.styles]
     return list(objects.values())

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 
 from service.file_permissions import keep_private
+from service.optional import missing_extras
 from service.settings import ServiceSettings
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError
@@ -94,6 +95,8 @@ def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
             raise ServeError(
                 "No feature network is installed, so no job can run. `sgsst weights list` shows where to get one."
             )
+        for line in missing_extras():
+            announce(line)
         _run([api, dispatcher], settings, announce, _address(settings, listener))
 
 

@@ -22,8 +22,10 @@ from fastapi import FastAPI, Request, Response
 from api.http.addresses import path_of
 from api.http.sending import names_etag
 from service.errors import NotFoundError
+from service.optional import installed_extras
 from service.store.states import ACTIONS, TITLES, UNFINISHED
 from sgsst_core.files.formats import FORMATS, RESULT_FORMATS
+from sgsst_core.option_parsers import STRENGTHS
 
 FOLDER = Path(__file__).parents[1] / "static"
 #: Placeholder in pages for the URL prefix of the files.
@@ -118,6 +120,8 @@ def _filled_modules() -> dict[str, tuple[bytes, object]]:
     states = {"titles": TITLES, "unfinished": UNFINISHED, "actions": actions}
     return {
         "scene_formats.js": (b'"{{scene_formats}}"', formats),
+        "installed.js": (b'"{{installed_extras}}"', installed_extras()),
+        "strength.js": (b'"{{strengths}}"', STRENGTHS),
         "statuses.js": (b'"{{job_states}}"', states),
     }
 

@@ -99,10 +99,12 @@ def _safe(part: str) -> str:
     return f"_{plain[1:]}" if plain.startswith(".") else plain
 
 
-def default_job_name(inputs: Sequence[Mapping[str, Any]]) -> str:
-    """Return the name of a job whose request has none: "scene · painting", from the names of its files."""
+def default_job_name(inputs: Sequence[Mapping[str, Any]], regions: Sequence[RegionRequest] = ()) -> str:
+    """Return the name of a job whose request has none: "scene · painting", without the paintings of regions."""
     scene = next(entry["name"] for entry in inputs if entry["role"] == "scene")
-    styles = [PurePosixPath(entry["name"]).stem for entry in inputs if entry["role"] == "style"]
+    taken = region_styles(regions)
+    names = [entry["name"] for entry in inputs if entry["role"] == "style" and entry["name"] not in taken]
+    styles = [PurePosixPath(name).stem for name in names]
     format = format_of_name(scene)
     plain = scene[: -len(format.suffix)] if format else PurePosixPath(scene).stem
     return f"{plain} · {' + '.join(styles)}"[:MAX_JOB_NAME]

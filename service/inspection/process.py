@@ -37,6 +37,7 @@ from service.errors import (
 )
 from service.files.staging import ROLES, Staged
 from service.inspection.sandbox import confine, installation
+from service.optional import install_command
 from service.parameters import JobParameters
 from service.request import scene_request, stylize_request
 from sgsst_core.budget import default_memory_limit
@@ -352,7 +353,7 @@ def _check_encoder() -> None:
         import av  # noqa: F401
     except ImportError as error:
         raise SettingsError(
-            "The service cannot encode videos: its operator has to install the extra `video`."
+            f"The service cannot encode videos: its operator has to run `{install_command('video')}`."
         ) from error
 
 

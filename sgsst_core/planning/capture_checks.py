@@ -62,7 +62,10 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
         raise nothing_seen(scene.means, cameras, near)
     if uncovered <= _MUCH_UNCOVERED or hidden:
         return hidden
-    text = f"a typical view has {shown.typical:.1%} of the Gaussians in its frame and {uncovered:.0%} uncovered pixels"
+    text = (
+        f"a typical view has {shown.typical:.1%} of the Gaussians in its frame and shows nothing in {uncovered:.0%} of "
+        "its pixels"
+    )
     advice = (
         "use the cameras of the scene's own training run and world. With nerfstudio, put the run's "
         "dataparser_transforms.json beside transforms.json; for a scene trained on COLMAP's model, give that model"

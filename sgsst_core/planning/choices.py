@@ -66,7 +66,7 @@ def about_gaussians(probe: Probe, rendered: Tensor, settings: Settings) -> list[
     line = Decision(
         "unseen Gaussians",
         f"{unseen:,} of {probe.scene.gaussians:,} are neither rendered nor optimized; they {change}",
-        "their blend weights are 0 in every pixel of every view",
+        "no pixel of any view shows them",
         bytes=unseen * OPTIMIZER_BYTES,
     )
     return [line, *harmonics]
@@ -177,7 +177,7 @@ def about_training_background(
     cost = model.views.content.always + model.views.images.always
     if cost:
         reason += f"; content features are recomputed with it, {duration(cost, ' ')} per step"
-    return [Decision("training_background", f"{color} each time", reason, error=ANOTHER_LOSS)]
+    return [Decision("training background", f"{color} each time", reason, error=ANOTHER_LOSS)]
 
 
 def warm_start(survey: Survey, settings: Settings, *, scan: bool) -> tuple[bool, list[Decision]]:

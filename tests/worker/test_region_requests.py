@@ -75,7 +75,9 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
     ("texts", "message"),
     [
         ((["a"], [], [], []), "expected NAME:SPEC"),
-        ((["1a:sphere=0,0,0,1"], [], [], []), "expected NAME:SPEC"),
+        (([" :sphere=0,0,0,1"], [], [], []), "expected NAME:SPEC"),
+        ((["a=b:sphere=0,0,0,1"], [], [], []), "expected NAME:SPEC"),
+        ((["\x1b[31m:sphere=0,0,0,1"], [], [], []), "String should match pattern"),
         ((["a:sphere=0,0,0,1", "a:sphere=0,0,0,2"], [], [], []), "a region a already exists"),
         (([], ["b=x.jpg"], [], []), "there is no region 'b'. Use one of rest"),
         ((["a:sphere=0,0,0,1"], ["a"], [], []), "expected NAME=FILE"),
@@ -107,6 +109,14 @@ def test_command_line_options_are_combined(tmp_path: Path) -> None:
 def test_invalid_options_are_refused(texts: tuple[list[str], ...], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         region_requests(region_options(*texts))
+
+
+@pytest.mark.parametrize("name", ["1a", "Grandma's face", "50% [bold]", "ü/../x"])
+def test_names_of_regions_are_labels(name: str) -> None:
+    (region,) = region_requests(region_options([f" {name} :sphere=0,0,0,1"], [], [f"{name}=2"], []))
+    assert (region.name, region.weight) == (name, 2)
+    with pytest.raises(SettingsError, match=r"region .* is not a known selection"):
+        RegionOptions(name=name, select="cube=1").request()
 
 
 def test_json_regions_have_content_weights_by_name_or_number() -> None:

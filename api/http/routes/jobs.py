@@ -223,7 +223,7 @@ def _queue_job(
     parameters, webhook = job_request.parameters, job_request.webhook
     idempotency = _idempotency(idempotency_key, job_request.inputs, parameters, webhook)
     values = parameters.model_dump(mode="json", exclude_unset=True)
-    name = parameters.name or default_job_name(job_request.inputs)
+    name = parameters.name or default_job_name(job_request.inputs, parameters.region_requests)
     new = NewJob(caller.owner, name, caller.priority, values, job_request.inputs, webhook or None)
     jobs = context.store.jobs
     job, created = jobs.create(
@@ -432,7 +432,8 @@ async def change_job(request: Request, job_id: JobId, context: ContextDep, calle
 def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Response:
     check_id(job_id)
     job, _ = context.store.jobs.detail(job_id, caller.owner)
-    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs.named))
+    regions = JobParameters(**job.parameters).region_requests
+    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs.named, regions))
     return _job_response(context, caller, job_id)
 
 

@@ -160,7 +160,7 @@ def test_training_background_and_start_follow_coverage_and_settings(
 ) -> None:
     plan = plan_of(probe(uncovered_fraction=uncovered), **values)
     assert (plan.training_background, plan.warm_start) == (training_background, warm)
-    behind, start = line(plan, "training_background"), line(plan, "start")
+    behind, start = line(plan, "training background"), line(plan, "start")
     assert (behind is not None, start is not None) == (training_background != "background", warm)
     for value, setting in ((behind, "training_background"), (start, "warm_start")):
         if value:
@@ -180,10 +180,10 @@ def test_random_background_costs_a_content_pass_and_disables_early_stop() -> Non
     pixels = HEIGHT * WIDTH * (1 + 1 / 4)
     assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 0.5e-6, rel=0.01)
     assert drawn.prediction.first_visit < fixed.prediction.first_visit
-    assert "0.3 s per step" in text_of(drawn, "training_background")
+    assert "0.3 s per step" in text_of(drawn, "training background")
     assert text_of(drawn, "early stop").startswith("none: all steps are run: losses on different backgrounds")
     without = plan_of(probe(uncovered_fraction=0.5), training_background="random", content_weight=0.0)
-    assert "per step" not in text_of(without, "training_background")
+    assert "per step" not in text_of(without, "training background")
     uncached = plan_of(probe(uncovered_fraction=0.5), training_background="random", keep=("content",))
     assert uncached.prediction is not None
     assert uncached.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # also a render of the content
@@ -664,7 +664,7 @@ def test_decisions_have_a_fixed_order() -> None:
         "views",
         "uncovered pixels",
         "position weights",
-        "training_background",
+        "training background",
         "start",
         "network layers",
         "content",

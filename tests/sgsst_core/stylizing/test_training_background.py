@@ -166,7 +166,7 @@ def test_covered_scene_ignores_the_training_background(tiny_weights: BackboneWei
     assert torch.equal(plain.sh_dc, automatic.sh_dc)
     items = [[line.item for line in stylizer.job.plan.decisions] for stylizer in (plain, automatic)]
     assert items[0] == items[1]
-    assert "training_background" not in items[0]
+    assert "training background" not in items[0]
 
 
 def test_paper_preset_uses_a_fixed_background_for_scans(tiny_weights: BackboneWeights) -> None:
