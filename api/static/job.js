@@ -3,13 +3,14 @@
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { LossChart } from "./chart.js";
 import { announce, h, icon, put } from "./dom.js";
+import { startFrom } from "./draft.js";
+import { installed } from "./installed.js";
 import { labels, nameOf } from "./names.js";
-import { decisions } from "./plan.js";
+import { planOf } from "./plan.js";
 import { ResultStage } from "./result_stage.js";
 import { ShareCard } from "./share_card.js";
-import { titleOf } from "./options.js";
+import { titleOf, valueText } from "./options.js";
 import { resultFormats } from "./scene_formats.js";
-import { startFrom } from "./submit.js";
 import { actionsOf, titles, UNFINISHED } from "./statuses.js";
 import { VideoCard } from "./video_card.js";
 import { size, time, words } from "./words.js";
@@ -303,7 +304,7 @@ export class JobView {
     if (names.has("plan.json") && this.plan.hidden) await this.loadPlan();
     const result = found.find(({ name }) => name === "stylized.ply"), video = found.find(({ name }) => name === "video.mp4");
     if (names.has("live/colors.f16")) this.showLive(names);
-    if (this.job.status === "succeeded" && result) this.offerVideo(video);
+    if (this.job.status === "succeeded" && result && (installed.video || video)) this.offerVideo(video);
     if (this.job.status !== "succeeded" || !result || this.result || this.finishing) return;
     this.finishing = true;
     this.offerDownload(result.size);
@@ -355,7 +356,7 @@ export class JobView {
     try {
       const plan = await get(artifactPath(this.id, "plan.json"), this.leaving.signal);
       this.plan.hidden = false;
-      put(this.plan, this.planTitle, decisions(plan.decisions ?? []));
+      put(this.plan, planOf(this.planTitle, plan.decisions ?? []));
     } catch {
       // the job is shown without its plan
     }
@@ -375,7 +376,7 @@ export class JobView {
     const files = Object.values(job.input_counts).reduce((sum, count) => sum + Number(count), 0);
     const fact = (/** @type {string} */ name, /** @type {string} */ value) => h("div", h("dt", name), h("dd", value));
     put(this.facts, h("h2", say.inputs), h("dl.facts", job.inputs.slice(0, 12).map((/** @type {any} */ input) => fact(input.role, `${input.name} · ${size(input.size)}`)), files > Math.min(job.inputs.length, 12) ? fact("", words.submit.nFiles(files)) : null),
-      h("details.fold", h("summary", say.settings), h("dl.facts", told.map(([name, value]) => fact(titleOf(name), typeof value === "object" ? JSON.stringify(value) : String(value))))));
+      h("details.fold", h("summary", say.settings), h("dl.facts", told.map(([name, value]) => fact(titleOf(name), valueText(name, value))))));
   }
 
   /**

@@ -1,6 +1,7 @@
 // @ts-check
 /** Inputs for a job's parameters, generated from the API's OpenAPI document. */
 import { h, newId } from "./dom.js";
+import { strengthName } from "./strength.js";
 import { words } from "./words.js";
 
 /**
@@ -86,6 +87,23 @@ export function problemOf(kinds, value) {
   if (exclusiveMinimum !== undefined && value <= exclusiveMinimum) return words.refusals.above(exclusiveMinimum);
   if (exclusiveMaximum !== undefined && value >= exclusiveMaximum) return words.refusals.below(exclusiveMaximum);
   return "";
+}
+
+/**
+ * Return the value of a parameter of a job as text.
+ *
+ * @param {string} name
+ * @param {any} value
+ * @returns {string}
+ */
+export function valueText(name, value) {
+  if (name === "content_weight") return strengthName(value);
+  if (/background$/.test(name) && Array.isArray(value)) return value.map((part) => Math.round(255 * part)).join(", ");
+  if (Array.isArray(value)) return value.map((each) => valueText("", each)).join(typeof value[0] === "object" ? "; " : ", ");
+  if (value === true) return words.submit.on;
+  if (typeof value !== "object") return String(value);
+  const { name: own, ...parts } = value, shown = Object.entries(parts).filter(([, part]) => part !== null && part !== false);
+  return [own && `${own}: `, shown.map(([key, part]) => `${titleOf(key).toLowerCase()} ${valueText(key, part)}`).join(", ")].filter(Boolean).join("");
 }
 
 /** Return a message of the service's schema in words for users. @param {string} message */

@@ -3,10 +3,11 @@
 import { ask, get, whenKeyIsNeeded } from "./api.js";
 import { CompareView } from "./compare.js";
 import { announce, h, icon, put } from "./dom.js";
+import { forgetDraft } from "./draft.js";
 import { JobView } from "./job.js";
 import { JobsView } from "./jobs.js";
 import { SignInView } from "./signin.js";
-import { forgetDraft, SubmitView } from "./submit.js";
+import { SubmitView } from "./submit.js";
 import { words } from "./words.js";
 
 /** @typedef {{title: string, element: HTMLElement, end: () => void}} View */

@@ -9,19 +9,33 @@ const say = words.plan;
 export function costCard(view) {
   const figure = (/** @type {string} */ name, /** @type {string} */ value, note = "") => h("div", h("dt", name), h("dd", value, note && h("small", note)));
   return h("section.card.cost", { "aria-label": say.title }, h("h2", say.title),
-    view.warnings.length ? h("ul.warnings", { role: "alert" }, view.warnings.map((/** @type {string} */ text) => h("li", text))) : null,
+    warnings(view.warnings),
     h("dl.figures",
       figure(say.seconds, view.total_seconds === null ? say.unknown : seconds(view.total_seconds), view.total_seconds === null ? "" : say.wholeJob),
       figure(say.memory, view.memory_bytes === null ? say.unknown : size(view.memory_bytes)),
       view.device_memory_bytes ? figure(say.gpuMemory, size(view.device_memory_bytes)) : null,
-      figure(say.workers, view.workers === null ? say.byService : String(view.workers)),
+      view.workers === null ? null : figure(say.workers, String(view.workers)),
       figure(say.gaussians, count(view.gaussians), view.dropped ? say.dropped(view.dropped) : ""),
       figure(say.views, count(view.views), say.pixels(view.pixels))),
-    decisions(view.plan?.decisions ?? []));
+    h("details.fold", h("summary", say.decided), decisions(view.plan?.decisions ?? [])));
 }
 
+/** @param {string[]} texts */
+const warnings = (texts) => (texts.length ? h("ul.warnings", { role: "alert" }, texts.map((text) => h("li", text))) : null);
+
 /** @param {{item: string, decision: string, reason: string}[]} list */
-export function decisions(list) {
+function decisions(list) {
   if (!list.length) return h("p.quiet", say.none);
-  return h("ul.decisions", { tabIndex: 0, "aria-label": say.decided }, list.map(({ item, decision, reason }) => h("li", h("strong", item), h("span", decision), h("small", reason))));
+  return h("ul.decisions", { tabIndex: 0, "aria-label": say.decided }, list.map(({ item, decision, reason }) => h("li", h("strong", say.items[item] ?? item), h("span", decision), h("small", reason))));
+}
+
+/**
+ * Return the plan of a job: its warnings, and everything else folded away.
+ *
+ * @param {HTMLElement} title
+ * @param {{item: string, decision: string, reason: string}[]} list
+ */
+export function planOf(title, list) {
+  const warned = list.filter(({ decision }) => decision.startsWith("warning")).map(({ item, decision }) => `${item}: ${decision.replace(/^warning:? ?/, "")}`);
+  return [warnings(warned), h("details", h("summary", title), decisions(list))];
 }

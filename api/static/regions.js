@@ -2,99 +2,120 @@
 /** Regions of a scene, each with its own style or frozen. */
 import { h, icon, newId, put } from "./dom.js";
 import { showWrong } from "./options.js";
+import { strengthName } from "./strength.js";
 import { words } from "./words.js";
 
 const say = words.submit, hand = words.select;
+/** Name of the region of all Gaussians that no other one selects. */
+const REST = "rest";
 
 /** @typedef {import("./select_panel.js").Mask} Mask */
 /** @typedef {import("./stored.js").Chosen} Chosen */
-/** @typedef {{element: HTMLElement, value: () => any, mask: () => Mask | null, setMask: (mask: Mask | null) => void, set: (region: any) => void, setStyles: (names: string[]) => void, wrong: (text: string, field?: string) => void}} Row */
+/** @typedef {Mask & {file: Chosen}} StoredMask mask with its file, which stays the same while the mask does */
+/** @typedef {{element: HTMLElement, value: () => any, mask: () => StoredMask | null, setMask: (mask: Mask | null) => void, set: (region: any) => void, setStyles: () => void, wrong: (text: string, field?: string) => void}} Row */
+
+/** Return the names of the paintings of a region. @param {any} region @returns {string[]} */
+export const paintingsOf = ({ style }) => [style ?? []].flat().map((/** @type {string} */ text) => text.replace(/:[\d.e+-]+$/, ""));
 
 export class RegionList {
-  /** @param {(row: Row) => void} [select] called to select the Gaussians of a region in the 3D view */
-  constructor(select) {
+  /**
+   * @param {() => void} changed called after a region was added, removed or changed
+   * @param {(row: Row) => void} [select] called to select the Gaussians of a region in the 3D view
+   */
+  constructor(changed, select) {
+    this.changed = changed;
     this.select = select;
     /** @type {Row[]} */
     this.rows = [];
-    /** Files of masks, which stay the same while name and mask do. @type {Map<Uint8Array, Chosen>} */
-    this.files = new Map();
+    this.made = 0;
     /** @type {string[]} */
     this.styles = [];
     this.list = h("div.regions");
-    this.element = h("div", this.list, h("button.quiet.small", { type: "button", onclick: () => this.add().element.querySelector("input")?.focus() }, icon("plus"), say.addRegion));
+    this.element = h("div", { oninput: changed }, this.list, h("button.quiet.small", { type: "button", onclick: () => this.add().element.querySelector("button")?.focus() }, icon("plus"), say.addRegion));
   }
 
   add() {
+    const number = ++this.made;
     const field = (/** @type {string} */ title, /** @type {any} */ input) => {
       input.id = newId();
       return h("div.option", h("label", { htmlFor: input.id }, title), input);
     };
-    const name = h("input", { type: "text", placeholder: "face", pattern: "[A-Za-z][A-Za-z0-9_\\-]{0,31}", autocomplete: "off" });
+    const name = h("input", { type: "text", value: say.part(number), maxLength: 64, autocomplete: "off" });
     const select = h("input", { type: "text", placeholder: "sphere=0,1.4,0,0.3", autocomplete: "off" });
     const weight = h("input", { type: "number", min: 0, step: "any", value: "1" });
-    const strength = h("input", { type: "text", placeholder: say.ownStyle, autocomplete: "off" });
-    const style = h("select"), freeze = h("input", { type: "checkbox" });
-    const setStyles = (/** @type {string[]} */ names) => {
-      const before = style.value;
-      put(style, h("option", { value: "" }, say.ownStyle), names.map((each) => h("option", { value: each }, each)));
-      style.value = names.includes(before) ? before : "";
+    const strength = h("select"), style = h("select"), freeze = h("input", { type: "checkbox" });
+    /** Fill a chooser, and choose a value, which it offers even if it is not one of the usual. */
+    const fill = (/** @type {any} */ chooser, /** @type {[string, string][]} */ usual, /** @type {string} */ chosen, /** @type {string} */ title) => {
+      const others = chosen && !usual.some(([value]) => value === chosen) ? [[chosen, title]] : [];
+      put(chooser, h("option", { value: "" }, say.ownStyle), [...usual, ...others].map(([value, text]) => h("option", { value }, text)));
+      chooser.value = chosen;
     };
-    setStyles(this.styles);
-    /** @type {Mask | null} */
+    /** Painting of the region in JSON: a name, or a list of names with weights. */
+    const setStyle = (/** @type {string} */ chosen) => {
+      const names = paintingsOf({ style: chosen && JSON.parse(chosen) }), there = names.every((each) => this.styles.includes(each));
+      fill(style, this.styles.map((each) => [JSON.stringify(each), each]), there ? chosen : "", names.join(" + "));
+    };
+    setStyle("");
+    fill(strength, Object.entries(words.strengths.titles), "", "");
+    /** @type {StoredMask | null} */
     let mask = null;
-    const text = () => (mask ? `mask=${name.value.trim()}.bin` : select.value.trim());
-    const value = () => ({ name: name.value.trim(), ...(text() ? { select: text() } : {}), ...(freeze.checked || weight.value === "1" ? {} : { weight: Number(weight.value) }), ...(style.value && !freeze.checked ? { style: style.value } : {}), ...(strength.value.trim() && !freeze.checked ? { content_weight: Number.isNaN(Number(strength.value)) ? strength.value.trim() : Number(strength.value) } : {}), ...(freeze.checked ? { freeze: true } : {}) });
-    const selectField = field(say.regionSelect, select), picked = h("span");
-    const pick = h("button.quiet.small", { type: "button", hidden: !this.select, onclick: () => this.select?.(row) });
+    const text = () => (mask ? `mask=${mask.file.name}` : select.value.trim());
+    const value = () => ({ name: name.value.trim(), ...(text() ? { select: text() } : {}), ...(freeze.checked || weight.value === "1" ? {} : { weight: Number(weight.value) }), ...(style.value && !freeze.checked ? { style: JSON.parse(style.value) } : {}), ...(strength.value && !freeze.checked ? { content_weight: isNaN(strength.value) ? strength.value : Number(strength.value) } : {}), ...(freeze.checked ? { freeze: true } : {}) });
+    const picked = h("span");
+    const pick = h("button.small", { type: "button", hidden: !this.select, onclick: () => this.select?.(row) });
     const drop = h("button.quiet.small", { type: "button", onclick: () => setMask(null) }, hand.forget);
-    const handmade = h("div.handmade", picked, pick, drop);
-    const setMask = (/** @type {Mask | null} */ made) => {
-      mask = made;
-      selectField.hidden = !!mask;
+    const written = h("details", { open: !this.select }, h("summary", hand.written), field(say.regionSelect, select));
+    const setMask = (/** @type {Mask | StoredMask | null} */ made) => {
+      mask = made && { ...made, file: "file" in made ? made.file : new File([/** @type {BlobPart} */ (made.bits)], this.freeName(row)) };
+      written.hidden = !!mask;
       drop.hidden = !mask;
       pick.textContent = mask ? hand.change : hand.byHand;
+      pick.classList.toggle("primary", !mask);
+      pick.classList.toggle("quiet", !!mask);
       picked.textContent = mask ? hand.made(mask.total) : "";
+      this.changed();
     };
-    setMask(null);
-    const element = h("fieldset.region", h("legend", say.region(this.rows.length + 1)), field(say.regionName, name), selectField, handmade, field(say.style, style), field(hand.weight, weight), field(words.options.titles.content_weight, strength), h("label.check", freeze, h("span", say.freeze)));
     const error = h("p.wrong", { id: newId(), hidden: true });
-    const inputs = /** @type {Record<string, any>} */ ({ name, select, style, weight, content_weight: strength, freeze });
+    const remove = h("button.tool", { type: "button", "aria-label": say.remove(say.region(number)), onclick: () => ((this.rows = this.rows.filter((each) => each !== row)), element.remove(), this.changed()) }, icon("close"));
+    const element = h("fieldset.region", h("legend", say.region(number)), h("div.handmade", picked, pick, drop), field(say.regionName, name), field(say.style, style), field(say.regionStrength, strength), field(hand.weight, weight), h("label.check", freeze, h("span", say.freeze)), written, error, remove);
+    const inputs = /** @type {Record<string, any>} */ ({ name, select, style, weight, content_weight: strength, freeze, pick });
     for (const input of Object.values(inputs)) input.setAttribute("aria-describedby", error.id);
     const wrong = (/** @type {string} */ text, field = "select") => {
       for (const input of Object.values(inputs)) showWrong(input, error, "");
-      if (text) showWrong(inputs[field] ?? select, error, text);
+      const place = field === "select" && (mask || !select.value) && this.select ? pick : inputs[field] ?? select;
+      if (text) showWrong(place, error, text);
     };
     const set = (/** @type {any} */ region) => {
-      [name.value, select.value, style.value] = [region.name, region.select ?? "", region.style ?? ""];
+      name.value = region.name;
+      select.value = region.select ?? "";
       freeze.checked = !!region.freeze;
       weight.value = String(region.weight ?? 1);
-      strength.value = String(region.content_weight ?? "");
+      const paintings = paintingsOf(region);
+      setStyle(paintings.length ? JSON.stringify(paintings.length > 1 ? region.style : paintings[0]) : "");
+      const kept = String(region.content_weight ?? "");
+      fill(strength, Object.entries(words.strengths.titles), kept && strengthName(kept), kept);
+      written.open = !this.select || (!!region.select && !region.mask);
       setMask(region.mask ?? null);
       if (mask) select.value = "";
     };
-    const row = { element, value, mask: () => mask, setMask, set, setStyles, wrong };
-    const remove = h("button.tool", { type: "button", "aria-label": say.remove(say.region(this.rows.length + 1)), onclick: () => ((this.rows = this.rows.filter((each) => each !== row)), element.remove()) }, icon("close"));
-    element.append(error, remove);
+    /** @type {Row} */
+    const row = { element, value, mask: () => mask, setMask, set, setStyles: () => setStyle(style.value), wrong };
     element.addEventListener("input", () => wrong(""));
     this.rows.push(row);
     this.list.append(element);
+    setMask(null);
     return row;
   }
 
-  /** Rows that are sent; the others are empty. */
-  get sent() {
-    return this.rows.filter((row) => row.value().name || row.value().select);
+  /** Return a name for the mask of a region that no other region's has. @param {Row} row */
+  freeName(row) {
+    const used = this.rows.filter((each) => each !== row).map((each) => each.value().select);
+    for (let n = 1; ; n++) if (!used.includes(`mask=region_${n}.bin`)) return `region_${n}.bin`;
   }
 
-  /** Return the files of the masks of all sent regions. */
+  /** Return the files of all masks. */
   masks() {
-    return this.sent.flatMap((row) => {
-      const mask = row.mask(), { name } = row.value();
-      if (!mask) return [];
-      const known = this.files.get(mask.bits), file = known?.name === `${name}.bin` ? known : new File([/** @type {BlobPart} */ (mask.bits)], `${name}.bin`);
-      this.files.set(mask.bits, file);
-      return [file];
-    });
+    return this.rows.flatMap((row) => row.mask()?.file ?? []);
   }
 
   /**
@@ -107,8 +128,7 @@ export class RegionList {
   restoreMask(row, bits, file) {
     let total = 0;
     for (let byte of bits) for (; byte; byte &= byte - 1) total++;
-    row.set({ ...row.value(), mask: { bits, total } });
-    this.files.set(bits, file);
+    row.set({ ...row.value(), mask: { bits, total, file } });
   }
 
   /** Remove masks, which belong to another scene. */
@@ -130,26 +150,44 @@ export class RegionList {
     for (const row of this.rows) row.wrong("");
   }
 
+  /** Mark the regions that select nothing or have no name. */
+  markMissing() {
+    for (const row of this.rows) {
+      const { name, select } = row.value();
+      if (!name) row.wrong(say.needName, "name");
+      else if (!select && name !== REST) row.wrong(say.needSelection);
+    }
+  }
+
   /**
-   * Show a refusal in the region that caused it. Return the region's element, or undefined if none did.
+   * Show a refusal in the region that caused it. Return whether one did.
    *
    * @param {string} at path of the refused parameter, such as "regions.0.select"
    * @param {string} message
    */
   refuse(at, message) {
-    const [, number, field] = /\bregions\.(\d+)(?:\.(\w+))?/.exec(at) ?? [], named = /\b[Rr]egion '?([A-Za-z][\w-]*)/.exec(message)?.[1];
-    const row = number !== undefined ? this.sent[Number(number)] : this.rows.find((each) => named && each.value().name === named);
+    const [, number, field] = /\bregions\.(\d+)(?:\.(\w+))?/.exec(at) ?? [];
+    const named = (/** @type {Row} */ row) => ["'", '"'].some((quote) => message.includes(`egion ${quote}${row.value().name}${quote}`));
+    const row = number !== undefined ? this.rows[Number(number)] : this.rows.find(named);
     row?.wrong(message, field);
-    return row?.element;
+    return !!row;
   }
 
   /** @param {string[]} names names of the style files */
   setStyles(names) {
     this.styles = names;
-    this.rows.forEach((row) => row.setStyles(names));
+    this.rows.forEach((row) => row.setStyles());
+  }
+
+  /** Return the regions that have a painting, by its name: `{"night.jpg": ["left"]}`. @returns {Record<string, string[]>} */
+  painted() {
+    /** @type {Record<string, string[]>} */
+    const found = {};
+    for (const region of this.value()) for (const name of paintingsOf(region)) (found[name] ??= []).push(region.name);
+    return found;
   }
 
   value() {
-    return this.sent.map((row) => row.value());
+    return this.rows.map((row) => row.value());
   }
 }

@@ -1,6 +1,7 @@
 // @ts-check
 /** Slots for a job's files, which can be chosen or dropped, are listed by name, and can be removed. */
 import { h, icon, newId, put } from "./dom.js";
+import { installed } from "./installed.js";
 import { showWrong } from "./options.js";
 import { sceneSuffix } from "./scene_formats.js";
 import { StoredFile } from "./stored.js";
@@ -52,6 +53,8 @@ export class Slot {
     this.files = [];
     /** @type {string[]} */
     this.urls = [];
+    /** Notes under files, by name. @type {Record<string, string>} */
+    this.notes = {};
     const id = newId();
     this.input = h("input", { type: "file", id, accept, multiple, "aria-describedby": `${id}d ${id}e`, onchange: () => this.add([...this.input.files]) });
     this.detail = h("p.detail", { id: `${id}d` }, hint);
@@ -65,10 +68,12 @@ export class Slot {
   /** @param {Chosen[]} files */
   add(files) {
     if (!files.length) return;
-    this.files = this.multiple ? this.combined(this.files, files) : [files[0]];
+    const unread = installed.heif ? [] : files.filter(({ name }) => HEIC.test(name)), read = files.filter((file) => !unread.includes(file));
+    if (read.length) this.files = this.multiple ? this.combined(this.files, read) : [read[0]];
     this.input.value = "";
     this.show();
     this.changed();
+    if (unread.length) this.wrong(say.noHeic(unread[0].name));
   }
 
   /** @param {Chosen} file */
@@ -92,6 +97,13 @@ export class Slot {
       files.length > 1 ? h("button.quiet.small", { type: "button", onclick: () => this.clear() }, say.removeAll) : null);
   }
 
+  /** Show notes under files. @param {Record<string, string>} notes by the files' names */
+  annotate(notes) {
+    if (JSON.stringify(notes) === JSON.stringify(this.notes)) return;
+    this.notes = notes;
+    this.show();
+  }
+
   clear() {
     this.files = [];
     this.show();
@@ -112,7 +124,7 @@ export class Slot {
     if (!this.pictures) return h("div.thumb.plain", h("span", file.name), remove);
     const url = file instanceof StoredFile ? file.url : URL.createObjectURL(file);
     this.urls.push(url);
-    return h("div.thumb", h("img", { src: url, alt: file.name }), remove);
+    return h("div.thumb", h("img", { src: url, alt: file.name }), remove, this.notes[file.name] && h("small", this.notes[file.name]));
   }
 
   /** @param {string} text */
@@ -130,7 +142,8 @@ export class Slot {
   }
 }
 
-const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp|heic|heif)$/i, CAMERAS = /\.(json|bin|txt)$/i;
+const HEIC = /\.(heic|heif|hif)$/i;
+const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp|heic|heif|hif)$/i, CAMERAS = /\.(json|bin|txt)$/i;
 
 /**
  * Sort dropped files into slots. Up to four images are styles; more are photos.

@@ -3,6 +3,7 @@
 import { ask, eventsOf, get, Problem, randomKey } from "./api.js";
 import { readCameras, ringCameras } from "./cameras.js";
 import { announce, h, icon, newId, put } from "./dom.js";
+import { forgetDraft, keepDraft, keptDraft } from "./draft.js";
 import { Gallery } from "./gallery.js";
 import { defaultName } from "./names.js";
 import { GROUPS, optionControl, plainly, showWrong } from "./options.js";
@@ -12,10 +13,10 @@ import { accepted } from "./scene_formats.js";
 import { SelectPanel } from "./select_panel.js";
 import { droppedFiles, oneModel, Slot, sorted } from "./slots.js";
 import { Stage } from "./stage.js";
-import { allInputs, contentOf, StoredFile } from "./stored.js";
+import { contentOf, StoredFile } from "./stored.js";
 import { addPictures } from "./strength.js";
 import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
-import { percent, seconds, words } from "./words.js";
+import { percent, seconds, size, words } from "./words.js";
 
 /** @typedef {import("./options.js").Control} Control */
 /** @typedef {import("./stored.js").Chosen} Chosen */
@@ -24,53 +25,7 @@ const say = words.submit;
 const ORBIT = ["orbit", "up", "elevation", "radius"];
 /** Options with an input outside of the folds. */
 const PLACED = new Set(["name", "preset", "style_weights", "regions", ...ORBIT, ...GROUPS.essentials]);
-const DRAFT = "sgsst.draft";
 const UPS = /** @type {Record<string, number[]>} */ ({ x: [1, 0, 0], "-x": [-1, 0, 0], y: [0, 1, 0], "-y": [0, -1, 0], z: [0, 0, 1], "-z": [0, 0, -1] });
-
-/**
- * Files, weights of the styles and regions of the form while another view is shown. The other inputs are in the
- * session's storage, which cannot hold files.
- *
- * @type {{files: Record<string, Chosen[]>, weights: string[], regions: any[], apart?: boolean | undefined, expired?: Record<string, Chosen[]>} | null}
- */
-let kept = null;
-
-/**
- * Open the form with the inputs and parameters of a job, which replace what was entered before. Inputs that the service
- * has deleted are asked for again.
- *
- * @param {any} job
- * @param {{painting?: boolean}} [how] `painting`: whether to keep the job's paintings
- */
-export async function startFrom(job, { painting = true } = {}) {
-  const { style_weights: weights, regions, orbit, preset, name: _, ...values } = job.parameters, inputs = await allInputs(job);
-  const taken = new Set((regions ?? []).flatMap((/** @type {any} */ region) => region.style ?? []));
-  const own = inputs.style.filter(({ name }) => !taken.has(name)), gone = job.status === "expired";
-  if (!painting) inputs.style = inputs.style.filter(({ name }) => taken.has(name));
-  kept = {
-    files: gone ? { scene: [], style: [], cameras: [], photos: [] } : inputs, expired: gone ? inputs : {}, regions: regions ?? [],
-    weights: painting && weights ? inputs.style.map((file) => String(weights[own.indexOf(file)] ?? 1)) : [],
-  };
-  const draft = Object.fromEntries(Object.entries({ ...values, orbit }).filter(([, value]) => value !== null));
-  for (const color of ["background", "style_background"]) if (Array.isArray(draft[color])) draft[color] = draft[color].map((/** @type {number} */ part) => Math.round(255 * part));
-  storeDraft({ values: draft, preset, orbiting: orbit !== null && orbit !== undefined });
-  location.hash = "#/";
-}
-
-/** @param {{values: Record<string, any>, preset: string | undefined, orbiting: boolean}} draft */
-function storeDraft(draft) {
-  try {
-    sessionStorage.setItem(DRAFT, JSON.stringify(draft));
-  } catch {
-    // private windows may have no storage
-  }
-}
-
-/** Forget everything that was entered into the form. */
-export function forgetDraft() {
-  kept = null;
-  sessionStorage.removeItem(DRAFT);
-}
 
 /** View of a new job. When it ends, its uploads stop: other views have no place to show them. */
 export class SubmitView {
@@ -84,18 +39,21 @@ export class SubmitView {
       photos: new Slot(say.photos, say.photosHint, { accept: "image/*", multiple: true, ...changed(() => this.refresh()) }),
     };
     this.stage = new Stage();
+    this.draft = keptDraft();
+    /** Why the scene cannot be used, as far as the page knows; "" if it can. */
+    this.broken = "";
     this.name = optionControl("name", { type: "string" }, { title: say.name, hint: false });
     /** @type {Map<string, Control>} */
     this.controls = new Map([["name", this.name]]);
     this.leaving = new AbortController();
     /** @type {Map<File, Upload>} */
     this.uploads = new Map();
-    /** @type {any[]} */
-    this.weights = [];
+    /** Inputs for the shares of the paintings in a blend, by the paintings' names. @type {Record<string, any>} */
+    this.weights = {};
     /** Scene that the masks of the regions belong to. @type {Chosen | undefined} */
     this.shown = undefined;
     this.selecting = new SelectPanel(this.stage);
-    this.regions = new RegionList(this.stage.viewer ? (row) => this.selectRegion(row) : undefined);
+    this.regions = new RegionList(() => this.paintingsChanged(), this.stage.viewer ? (row) => this.selectRegion(row) : undefined);
     this.created = false;
     /** Masks of regions, from an earlier job. @type {Chosen[]} */
     this.masks = [];
@@ -110,15 +68,15 @@ export class SubmitView {
   }
 
   restoreFiles() {
-    if (!kept) return;
-    this.weights = kept.weights.map((value) => ({ value }));
-    for (const [role, slot] of Object.entries(this.slots)) slot.add(kept.files[role]);
-    this.masks = kept.files.mask ?? [];
-    this.regions.restore(kept.regions);
-    this.regionFold.open = kept.regions.length > 0;
-    if (kept.apart && this.apart) this.apart.input.checked = true;
-    for (const [role, files] of Object.entries(kept.expired ?? {})) if (files.length) this.slots[/** @type {keyof typeof this.slots} */ (role)].askAgain(files.map(({ name }) => name));
-    kept = null;
+    const { draft } = this;
+    if (!draft) return;
+    this.weights = Object.fromEntries(Object.entries(draft.weights).map(([name, value]) => [name, { value }]));
+    for (const [role, slot] of Object.entries(this.slots)) slot.add(draft.files[role]);
+    this.masks = draft.files.mask ?? [];
+    this.regions.restore(draft.regions);
+    this.regionFold.open = draft.regions.length > 0;
+    if (this.apart) this.apart.input.checked = draft.apart;
+    for (const [role, names] of Object.entries(draft.expired)) if (names.length) this.slots[/** @type {keyof typeof this.slots} */ (role)]?.askAgain(names);
     this.styleChanged();
     this.restoreMasks().catch(() => {}); // a region without its mask still names the file
   }
@@ -205,10 +163,13 @@ export class SubmitView {
   }
 
   showUnfinished() {
-    const [first] = unfinished();
+    const chosen = Object.values(this.slots).flatMap(({ files }) => files).filter((file) => file instanceof File);
+    const isOf = (/** @type {File} */ file, /** @type {any} */ { size, modified }) => file.size === size && file.lastModified === modified;
+    const first = unfinished().find((upload) => chosen.every((file) => file.name !== upload.name || isOf(file, upload)));
     /** @type {any} */ (this.notice).hidden = !first;
     if (!first) return;
-    put(/** @type {Element} */ (this.notice), h("p", say.resumable(first.name, percent(first.sent / first.size))),
+    const again = chosen.some(({ name }) => name === first.name), share = percent(first.sent / first.size);
+    put(/** @type {Element} */ (this.notice), h("p", again ? say.resumed(first.name, share) : say.resumable(first.name, size(first.size), share)),
       h("button.quiet", { type: "button", onclick: () => (forgetUnfinished(), this.showUnfinished()) }, say.forget));
   }
 
@@ -225,7 +186,6 @@ export class SubmitView {
       if (["name", "style_weights", "regions", "preset", "video"].includes(name)) continue;
       this.controls.set(name, optionControl(name, each, name === "orbit" ? { title: say.howMany } : {}));
     }
-    this.schema = schema;
     this.makePresets(schema.preset);
     const elements = (/** @type {string[]} */ names) => names.map((name) => this.controls.get(name)?.element).filter(Boolean);
     put(this.main, ...elements(GROUPS.essentials));
@@ -234,7 +194,8 @@ export class SubmitView {
     put(this.expertOptions, ...elements([...this.controls.keys()].filter((name) => !PLACED.has(name) && !GROUPS.look.includes(name))));
     this.ring.addEventListener("input", () => this.camerasChanged());
     const followStrength = addPictures(/** @type {Control} */ (this.controls.get("content_weight")));
-    this.restoreDraft();
+    this.schema = schema;
+    this.restoreOptions();
     followStrength();
     this.form.addEventListener("input", (/** @type {Event} */ event) => {
       this.saveDraft();
@@ -309,21 +270,20 @@ export class SubmitView {
 
   saveDraft() {
     const values = Object.fromEntries([...this.controls].map(([name, control]) => [name, control.value()]).filter(([, value]) => value !== undefined));
-    storeDraft({ values, preset: this.preset, orbiting: this.orbiting });
+    keepDraft({
+      ...(this.schema || !this.draft ? { values, preset: this.preset, orbiting: this.orbiting } : this.draft), // until the options have loaded
+      files: { ...Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, slot.files])), mask: this.masks }, expired: {}, regions: this.regions.kept(),
+      weights: Object.fromEntries(Object.entries(this.weights).map(([name, input]) => [name, input.value])), apart: !!this.apart?.input.checked,
+    });
   }
 
-  restoreDraft() {
-    let draft;
-    try {
-      draft = JSON.parse(sessionStorage.getItem(DRAFT) ?? "null");
-    } catch {
-      draft = null;
-    }
+  restoreOptions() {
+    const { draft } = this;
     if (!draft) return;
-    const given = Object.entries(draft.values ?? {}).filter(([name, value]) => JSON.stringify(value) !== JSON.stringify(this.schema?.[name]?.default));
+    const given = Object.entries(draft.values).filter(([name, value]) => JSON.stringify(value) !== JSON.stringify(this.schema?.[name]?.default));
     for (const [name, value] of given) this.controls.get(name)?.set(Array.isArray(value) ? value.join(", ") : value);
     const preset = [...this.presets.querySelectorAll("input")].find((/** @type {any} */ input) => input.value === draft.preset);
-    if (preset) {
+    if (preset && draft.preset) {
       /** @type {any} */ (preset).checked = true;
       this.choosePreset(draft.preset);
     }
@@ -368,6 +328,7 @@ export class SubmitView {
 
   async sceneChanged() {
     const [file] = this.slots.scene.files;
+    this.broken = "";
     this.refresh();
     this.selecting.close(null);
     if (file !== this.shown) this.regions.dropMasks();
@@ -397,28 +358,39 @@ export class SubmitView {
       this.stage.bar.hidden = true;
       viewer.sides = null;
       viewer.draw();
-      this.stage.message(error instanceof Error ? error.message : String(error));
+      const { message, cut } = /** @type {import("./viewer/splat_scene.js").SceneFailure} */ (error);
+      this.stage.message(message);
+      this.broken = cut ? message : "";
+      this.slots.scene.wrong(this.broken);
     }
   }
 
   styleChanged() {
-    const { files } = this.slots.style;
-    this.refresh();
-    this.regions.setStyles(files.map((file) => file.name));
-    this.weights = files.length > 1 ? files.map((file, i) => {
-      const input = h("input", { type: "number", min: 0, step: "any", value: this.weights[i]?.value ?? "1", "aria-label": file.name });
-      return input;
-    }) : [];
-    this.together.hidden = files.length < 2;
-    this.shares.hidden = files.length < 2 || !!this.apart?.input.checked;
+    this.regions.setStyles(this.slots.style.files.map(({ name }) => name));
+    this.paintingsChanged();
+  }
+
+  /** Show which paintings belong to regions, and the shares of the others in a blend. */
+  paintingsChanged() {
+    const own = this.ownStyles, several = own.length > 1;
+    this.slots.style.annotate(Object.fromEntries(Object.entries(this.regions.painted()).map(([name, regions]) => [name, say.paintingOf(regions)])));
+    this.weights = Object.fromEntries(several ? own.map(({ name }) => [name, h("input", { type: "number", min: 0, step: "any", value: this.weights[name]?.value ?? "1", "aria-label": name })]) : []);
+    this.together.hidden = !several;
+    this.shares.hidden = !several || !!this.apart?.input.checked;
     this.startButton.textContent = this.jobs > 1 ? say.startAll(this.jobs) : say.start;
-    put(this.shares, h("p.help", say.weights), files.length > 1 ? files.map((file, i) => h("div.option.inline", h("span", file.name), this.weights[i])) : null, this.shareError);
+    put(this.shares, h("p.help", say.weights), Object.entries(this.weights).map(([name, input]) => h("div.option.inline", h("span", name), input)), this.shareError);
+    this.refresh();
+  }
+
+  /** Paintings that belong to no region. */
+  get ownStyles() {
+    const painted = this.regions.painted();
+    return this.slots.style.files.filter(({ name }) => !painted[name]);
   }
 
   /** Number of jobs to create: one, or one per painting that belongs to no region. */
   get jobs() {
-    const taken = new Set(this.regions.value().flatMap((region) => region.style ?? []));
-    return this.apart?.input.checked ? Math.max(1, this.slots.style.files.filter(({ name }) => !taken.has(name)).length) : 1;
+    return this.apart?.input.checked ? Math.max(1, this.ownStyles.length) : 1;
   }
 
   async camerasChanged() {
@@ -454,16 +426,19 @@ export class SubmitView {
     if (this.result && !this.busy) put(this.result);
     this.forgetTimes();
     const scene = this.slots.scene.files[0]?.name;
-    this.name.suggest(defaultName(scene, this.slots.style.files.map(({ name }) => name)));
+    this.name.suggest(defaultName(scene, this.ownStyles.map(({ name }) => name)));
     this.stage.title = this.name.value() ?? defaultName(scene, []);
     this.clearWrong();
+    if (!this.notice) return; // the form is being built
+    this.showUnfinished();
+    if (this.schema) this.saveDraft();
   }
 
   clearWrong() {
-    for (const slot of Object.values(this.slots)) slot.wrong("");
+    for (const slot of Object.values(this.slots)) slot.wrong(slot === this.slots.scene ? this.broken : "");
     for (const control of this.controls.values()) control.wrong("");
     this.regions.clearWrong();
-    for (const weight of this.weights) showWrong(weight, this.shareError, "");
+    for (const weight of Object.values(this.weights)) showWrong(weight, this.shareError, "");
     if (this.problem) this.problem.hidden = true;
   }
 
@@ -477,26 +452,25 @@ export class SubmitView {
     }
     if (this.orbiting) values.orbit ??= "auto";
     if (this.preset) values.preset = this.preset;
-    const regions = this.regions.value(), taken = new Set(regions.flatMap((region) => region.style ?? []));
+    const regions = this.regions.value(), own = Object.values(this.weights).map((input) => Number(input.value));
     if (regions.length) values.regions = regions;
-    if (this.jobs > 1) return values;
-    const own = this.weights.filter((_, i) => !taken.has(this.slots.style.files[i]?.name)).map((input) => Number(input.value));
-    if (own.length > 1 && own.some((weight) => weight !== own[0])) values.style_weights = own;
+    if (this.jobs === 1 && own.some((weight) => weight !== own[0])) values.style_weights = own;
     return values;
   }
 
   /** Mark the slots of missing inputs, as far as the page can check them. */
   markMissing() {
-    const { scene, style, cameras } = this.slots;
+    const { scene, style, cameras } = this.slots, needStyle = style.files.length ? say.needOwnStyle : say.needStyle;
     /** @type {[Slot, string, boolean][]} */
-    const needed = [[scene, say.needScene, !scene.files.length], [style, say.needStyle, !style.files.length], [cameras, say.needCameras, !this.orbiting && !cameras.files.length]];
+    const needed = [[scene, say.needScene, !scene.files.length], [style, needStyle, !this.ownStyles.length], [cameras, say.needCameras, !this.orbiting && !cameras.files.length]];
     for (const [slot, text, absent] of needed) if (absent) slot.wrong(text);
+    this.regions.markMissing();
   }
 
   /** Mark inputs whose text is not what they ask for. */
   markInvalid() {
     for (const control of this.controls.values()) if (this.orbiting || !ORBIT.includes(control.name)) control.wrong(control.problem());
-    const weight = this.jobs === 1 && this.weights.find((input) => !(Number(input.value) > 0) || !Number.isFinite(Number(input.value)));
+    const weight = this.jobs === 1 && Object.values(this.weights).find((input) => !(Number(input.value) > 0) || !Number.isFinite(Number(input.value)));
     if (weight) showWrong(weight, this.shareError, words.refusals.weight(weight.getAttribute("aria-label")));
   }
 
@@ -565,9 +539,9 @@ export class SubmitView {
   /** Return the bodies of the jobs: the given one, or one per painting. Paintings of regions belong to all of them. @param {any} body */
   bodies(body) {
     if (this.jobs === 1) return [body];
-    const { files } = this.slots.style, taken = new Set(this.regions.value().flatMap((region) => region.style ?? []));
-    const shared = body.style.filter((/** @type {string} */ _, /** @type {number} */ i) => taken.has(files[i].name)), { name } = body.parameters;
-    return files.flatMap((file, i) => taken.has(file.name) ? [] : [{
+    const { files } = this.slots.style, own = this.ownStyles, { name } = body.parameters;
+    const shared = body.style.filter((/** @type {string} */ _, /** @type {number} */ i) => !own.includes(files[i]));
+    return files.flatMap((file, i) => !own.includes(file) ? [] : [{
       ...body, style: [body.style[i], ...shared], parameters: { ...body.parameters, ...(name ? { name: defaultName(name, [file.name]).slice(0, 200) } : {}) },
     }]);
   }
@@ -702,10 +676,7 @@ export class SubmitView {
   }
 
   end() {
-    if (!this.created) {
-      const files = { ...Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, slot.files])), mask: this.masks };
-      kept = { files, weights: this.weights.map((input) => input.value), regions: this.regions.kept(), apart: this.apart?.input.checked };
-    }
+    if (!this.created) this.saveDraft();
     this.leaving.abort();
     this.timing?.abort();
     this.selecting.end();

@@ -41,8 +41,8 @@ function keep(print, upload) {
   }
 }
 
-/** Return uploads that were started and not finished. @returns {Kept[]} */
-export const unfinished = () => Object.values(kept()).filter(({ sent, size }) => sent > 0 && sent < size);
+/** Return uploads that were started and not finished, with the modification times of their files. */
+export const unfinished = () => Object.entries(kept()).map(([print, upload]) => ({ ...upload, modified: Number(print.split("|").at(-3)) })).filter(({ sent, size }) => sent > 0 && sent < size);
 
 /** Forget all unfinished uploads. */
 export const forgetUnfinished = () => {

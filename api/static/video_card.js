@@ -2,6 +2,7 @@
 /** Card of a finished job that plays the video of its result, and has the service make one. */
 import { artifactPath, ask, eventsOf, Problem } from "./api.js";
 import { announce, h, icon, put } from "./dom.js";
+import { installed } from "./installed.js";
 import { words } from "./words.js";
 
 const say = words.video;
@@ -24,7 +25,7 @@ export class VideoCard {
     this.bar = h("progress", { max: 1, value: 0, "aria-label": say.progress, hidden: true });
     this.failure = h("p.failure", { role: "alert", hidden: true });
     this.player = h("div", { hidden: true });
-    const form = h("form", { onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.make()) },
+    const form = h("form", { hidden: !installed.video, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.make()) },
       h("div.row", this.path, this.seconds, h("label.check", this.compare, h("span", say.compare)), this.button));
     this.element = h("section.card.video", h("h2", say.title), this.player, form, this.text, this.bar, this.failure);
   }

@@ -21,8 +21,8 @@ export function size(bytes) {
 export function seconds(value) {
   if (value < 1) return "less than a second";
   if (value < 90) return `${Math.round(value)} s`;
-  if (value < 5400) return `${Math.round(value / 60)} min`;
-  return `${one.format(value / 3600)} h`;
+  const minutes = Math.round(value / 60), hours = Math.floor(minutes / 60);
+  return hours ? `${number.format(hours)} h ${minutes % 60} min` : `${minutes} min`;
 }
 /** @param {string} iso */
 export const time = (iso) => moment.format(new Date(iso));
@@ -53,7 +53,7 @@ export const words = {
     notGaussians: "This PLY contains no 3D Gaussians that can be previewed.",
     noSplats: "This GLB contains no 3D Gaussians.",
     newSpz: "This SPZ version can't be previewed. You can still upload it; the result will be shown.",
-    cut: "The file is incomplete.",
+    cut: "The file is incomplete.", shorter: (/** @type {number} */ n, /** @type {number} */ declared, /** @type {number} */ found) => `The file is incomplete: ${several(n, "Gaussian")} take ${count(declared)} bytes, but it has ${count(found)}.`,
     unreadable: "Couldn't read the scene.",
     notThere: "Couldn't load the scene.",
     otherColors: "These colors belong to a different scene.",
@@ -97,18 +97,20 @@ export const words = {
     drop: "Drop your scene here", dropTouch: "Tap to choose a scene", dropMore: "You can add cameras and a painting too.", dropNow: "Drop to add files",
     files: "Files", views: "Views", fromFiles: "Use my cameras", around: "Orbit the object", howMany: "Number of views", preset: "Preset", essentials: "Essentials", lookOptions: "Look", expertOptions: "Expert", expertHint: "Settings of the method. The preset's values suit most scenes.", weights: "Blend",
     nFiles: (/** @type {number} */ n) => several(n, "file"), more: "More options", find: "Find an option", regions: "Regions", addRegion: "Add a region", noOptions: "No matching option.", optionsAway: "Couldn't load the options; the preset's defaults apply.",
-    regionsHint: "Give parts of the scene their own painting, or freeze them.", region: (/** @type {number} */ n) => `Region ${n}`, regionName: "Name", regionSelect: "Select", freeze: "Freeze", ownStyle: "Same as the job",
+    regionsHint: "Give parts of the scene their own painting, or freeze them.", region: (/** @type {number} */ n) => `Region ${n}`, part: (/** @type {number} */ n) => `Part ${n}`, paintingOf: (/** @type {string[]} */ names) => `for ${names.join(", ")}`, regionName: "Name", regionSelect: "Select", regionStrength: "Strength", freeze: "Freeze", ownStyle: "Same as the job",
     presets: /** @type {Record<string, string>} */ ({ preview: "Quick look, minutes", standard: "Recommended", paper: "Published settings, hours" }),
     about: (/** @type {string} */ time) => `about ${time}`, cost: "Estimate time", start: "Start", starting: "Starting…", planning: "Analyzing views…", planned: (/** @type {number} */ step, /** @type {number} */ total) => `${count(step)} of ${several(total, "view")} analyzed`,
-    needScene: "Choose a scene.", needStyle: "Choose a painting.", needCameras: "Choose camera files, or orbit the object.",
-    resumable: (/** @type {string} */ name, /** @type {string} */ share) => `“${name}” was ${share} uploaded. Choose it again to finish.`, forget: "Discard",
+    needScene: "Choose a scene.", needStyle: "Choose a painting.", needOwnStyle: "Choose a painting for the rest of the scene.", needSelection: "Select a part of the scene in the 3D view, or remove the region.", needName: "Give the region a name.", needCameras: "Choose camera files, or orbit the object.",
+    resumable: (/** @type {string} */ name, /** @type {string} */ size, /** @type {string} */ share) => `“${name}” (${size}) was ${share} uploaded. Choose it again to finish.`,
+    resumed: (/** @type {string} */ name, /** @type {string} */ share) => `“${name}” is ${share} uploaded. Only the rest will be sent.`, forget: "Discard",
     blended: "Blend them", apart: "One job each", paintings: "Several paintings", startAll: (/** @type {number} */ n) => `Start ${n} jobs`, eachTakes: (/** @type {number} */ n) => `Each of the ${n} jobs takes about as long.`,
     createdSome: (/** @type {number} */ n, /** @type {number} */ all) => `${n} of ${all} jobs were created; Start creates the rest.`,
     expired: (/** @type {string[]} */ names) => `No longer on the service: ${names.slice(0, 3).join(", ")}${names.length > 3 ? "…" : ""}. Choose it again.`,
+    noHeic: (/** @type {string} */ name) => `${name}: this service doesn't read HEIC. Save it as JPEG, or have the operator run: pip install 'sgsst-service[heif]'`,
     stop: "Stop", created: (/** @type {string} */ name) => `Job “${name}” was created.`, on: "on", off: "off", byDefault: (/** @type {string} */ text) => `${text} (default)`,
   },
   select: {
-    name: "Selection", of: (/** @type {string} */ name) => (name ? `Select “${name}”` : "Select a region"), byHand: "Select in the 3D view", change: "Change the selection", forget: "Remove the selection",
+    name: "Selection", of: (/** @type {string} */ name) => (name ? `Select “${name}”` : "Select a region"), byHand: "Select in the 3D view", written: "Select by coordinates or a property", change: "Change the selection", forget: "Remove the selection",
     selected: (/** @type {number} */ n, /** @type {number} */ all) => `${count(n)} of ${several(all, "Gaussian")} selected`, made: (/** @type {number} */ n) => `${several(n, "Gaussian")} selected by hand`,
     notLoaded: "Choose a scene first, and wait until it has loaded.", weight: "Weight",
     tool: "Tool", tools: { move: "Move", brush: "Brush", lasso: "Lasso", box: "Box", sphere: "Sphere", similar: "Similar" }, mode: "Mode", modes: { add: "Add", subtract: "Subtract" },
@@ -127,7 +129,7 @@ export const words = {
   /** Titles, help, units and defaults of options for artists. Others are shown as the service describes them. */
   options: {
     titles: /** @type {Record<string, string>} */ ({
-      content_weight: "Strength", resolution: "Resolution", views: "Views to use", max_seconds: "Time limit",
+      content_weight: "Content weight", resolution: "Resolution", views: "Views to use", max_seconds: "Time limit",
       style_scale: "Stroke size", style_rotation: "Rotate the painting", preserve_colors: "Keep the scene's colors", background: "Background", style_background: "Behind transparent paintings",
       refine: "Finer strokes", sh_attenuation: "Soften reflections", stroke_depth: "Strokes by depth", unseen: "Parts that no view shows",
       up: "Up direction", elevation: "Height of the orbit", radius: "Distance of the orbit",
@@ -138,7 +140,7 @@ export const words = {
       views_per_step: "Views per step", rebalance: "Balance the workers", measure: "Quality check", backbone: "Feature network", compute_everything: "Compute everything", workers: "Workers",
     }),
     help: /** @type {Record<string, string>} */ ({
-      content_weight: "light, balanced or strong. Or a number: the higher, the closer to the original.",
+      content_weight: "The strength as a number: lower values give more style, higher ones keep more of the original.",
       resolution: "Longer side of the views in pixels. Larger is finer, and slower.", views: "Uses this many of the cameras, evenly spread. Fewer is faster.",
       max_seconds: "Stops after this time and keeps the result.", style_scale: "1 is the painting's own; 2 paints strokes twice as large.", style_rotation: "Turns the strokes, counterclockwise.",
       preserve_colors: "match: the painting takes on the scene's colors. luminance: only brightness changes.", background: "black, white, or R,G,B from 0 to 255, such as 40,40,48.",
@@ -156,7 +158,8 @@ export const words = {
   },
   plan: {
     title: "Estimate", decided: "How it will run", ran: "How it ran", seconds: "Estimated time", wholeJob: "for the whole job, once it starts", memory: "Memory", gpuMemory: "GPU memory", workers: "Workers", gaussians: "Gaussians", views: "Views",
-    unknown: "unknown", byService: "automatic", dropped: (/** @type {number} */ n) => `${count(n)} left out`, pixels: (/** @type {number} */ n) => `${hundredths.format(n / 1e6)} megapixels`,
+    items: /** @type {Record<string, string>} */ ({ "second forward": "Second pass of the network", "uncovered pixels": "Empty parts of the views", "unseen Gaussians": "Gaussians that no view shows" }),
+    unknown: "unknown", dropped: (/** @type {number} */ n) => `${count(n)} left out`, pixels: (/** @type {number} */ n) => `${hundredths.format(n / 1e6)} megapixels`,
     none: "Nothing was left out.",
   },
   job: {

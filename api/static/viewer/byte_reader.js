@@ -5,6 +5,9 @@ import { words } from "../words.js";
 /** Error of a file that cannot be shown; its message is shown to the user. */
 export class SceneError extends Error {}
 
+/** Error of a file that ends too early. */
+export class CutError extends SceneError {}
+
 export class ByteReader {
   /** @param {ReadableStream<Uint8Array>} stream */
   constructor(stream) {
@@ -43,7 +46,7 @@ export class ByteReader {
     for (let filled = 0; filled < count;) {
       if (!this.rest.length) {
         const { value, done } = await this.reader.read();
-        if (done) throw new SceneError(words.scene.cut);
+        if (done) throw new CutError(words.scene.cut);
         this.rest = value;
       }
       const part = this.rest.subarray(0, count - filled);

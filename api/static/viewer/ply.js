@@ -1,6 +1,6 @@
 // @ts-check
 /** Readers of PLY headers, and of Gaussians as the reference code of 3D Gaussian Splatting writes them. */
-import { SceneError } from "./byte_reader.js";
+import { CutError, SceneError } from "./byte_reader.js";
 import { BATCH, SCALE_LOW } from "./packing.js";
 import { isFlat, plyRendering } from "./render_tag.js";
 import { words } from "../words.js";
@@ -38,9 +38,19 @@ export async function readHeader(reader) {
       const comments = lines.filter((line) => line.startsWith("comment ")).map((line) => line.slice(8).trim());
       return { begin, elements: elementsOf(lines), comments };
     }
-    if (text.length < size) throw new SceneError(words.scene.cut);
+    if (text.length < size) throw new CutError(words.scene.cut);
     if (size >= LONGEST_HEADER) throw new SceneError(words.scene.notPly);
   }
+}
+
+/**
+ * @param {Header} header
+ * @param {number} size size of the file in bytes; 0 if unknown
+ * @throws {CutError} if the file is shorter than its header states
+ */
+export function checkLength({ begin, elements }, size) {
+  const declared = elements.reduce((sum, { count, stride }) => sum + count * stride, begin);
+  if (size && declared > size) throw new CutError(words.scene.shorter(elements.find(({ name }) => name === "vertex")?.count ?? 0, declared, size));
 }
 
 /**

@@ -6,7 +6,7 @@ import { ByteReader, SceneError } from "./byte_reader.js";
 import { glb } from "./glb.js";
 import { compressedPly, isSplat, splat, spz, spz4 } from "./packed.js";
 import { notShown } from "../scene_formats.js";
-import { plainPly, readHeader } from "./ply.js";
+import { checkLength, plainPly, readHeader } from "./ply.js";
 import { words } from "../words.js";
 
 /**
@@ -29,6 +29,7 @@ export async function openScene(reader, size) {
   const start = await reader.peek(4096), magic = String.fromCharCode(...start.subarray(0, 4));
   if (magic.startsWith("ply")) {
     const header = await readHeader(reader);
+    checkLength(header, size);
     return header.elements.some(({ name }) => name === "chunk") ? compressedPly(reader, header) : plainPly(reader, header);
   }
   if (start[0] === 0x1f && start[1] === 0x8b) return spz(reader.piped(/** @type {any} */ (new DecompressionStream("gzip"))));

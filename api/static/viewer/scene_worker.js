@@ -1,6 +1,6 @@
 // @ts-check
 /** Worker that reads a scene as it arrives, passes it on in batches, and sorts it for the viewer. */
-import { ByteReader, SceneError } from "./byte_reader.js";
+import { ByteReader, CutError, SceneError } from "./byte_reader.js";
 import { depthOrder } from "./depth_order.js";
 import { pack } from "./packing.js";
 import { openScene } from "./scene_file.js";
@@ -26,7 +26,7 @@ port.onmessage = async (/** @type {MessageEvent} */ { data }) => {
       await load(data.source, data.room);
     } catch (error) {
       const told = error instanceof SceneError ? error.message : words.scene.unreadable;
-      port.postMessage({ kind: "failed", message: told, detail: String(error) });
+      port.postMessage({ kind: "failed", message: told, cut: error instanceof CutError, detail: String(error) });
     }
   }
 };
@@ -56,7 +56,7 @@ async function opened(source) {
   if (source instanceof Blob) return [source.stream(), source.size];
   const answer = await fetch(source, { credentials: "same-origin" });
   if (!answer.ok || !answer.body) throw new SceneError(words.scene.notThere);
-  return [answer.body, Number(answer.headers.get("content-length") ?? 0)];
+  return [answer.body, answer.headers.has("content-encoding") ? 0 : Number(answer.headers.get("content-length") ?? 0)];
 }
 
 /**

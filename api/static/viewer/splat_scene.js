@@ -7,6 +7,8 @@ import { words } from "../words.js";
 /** @typedef {import("./depth_order.js").Pose} Pose */
 /** @typedef {{count: number, degree: number, size: number, rendering: import("./render_tag.js").Rendering}} Shown values of a file's header */
 
+/** @typedef {Error & {cut: boolean}} SceneFailure `cut`: whether the file ends too early */
+
 /** Maximum bytes of textures; lower on devices with little memory, such as phones. */
 const MEMORY = (/** @type {any} */ (navigator).deviceMemory ?? 8) >= 8 ? 1.5e9 : 4e8;
 
@@ -65,13 +67,13 @@ export class SplatScene {
       this.whole = true;
       this.middle = told.middle;
       this.tellReady?.();
-    } else this.fail(told.message);
+    } else this.fail(told.message, told.cut);
     this.changed();
   }
 
-  /** @param {string} message */
-  fail(message) {
-    const wrong = new Error(message);
+  /** @param {string} message @param {boolean} [cut] whether the file ends too early */
+  fail(message, cut = false) {
+    const wrong = Object.assign(new Error(message), { cut });
     this.tellWrong?.(wrong);
     this.tellBroken?.(wrong);
   }

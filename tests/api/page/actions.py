@@ -64,6 +64,12 @@ def set_options(watched: Watched, **values: Any) -> None:
             control.fill(str(value))
 
 
+def write_selection(region: Any, text: str) -> None:
+    """Select the Gaussians of a region by a text, such as "half-space=1,0,0,0"."""
+    region.locator("details").evaluate("(fold) => { fold.open = true; }")
+    region.get_by_label("Select").fill(text)
+
+
 _DROP = """(files) => {
   const carried = new DataTransfer();
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));

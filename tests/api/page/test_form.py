@@ -10,7 +10,7 @@ import httpx
 import pytest
 from PIL import Image
 
-from tests.api.page.actions import LONG, REFUSED, Visit, choose, drop, expand, set_options
+from tests.api.page.actions import LONG, REFUSED, Visit, choose, drop, expand, set_options, write_selection
 from tests.api.page.browser import FLAGS, Watched, chromium
 from tests.api.service import Service, wait_for
 
@@ -115,6 +115,27 @@ def test_dropped_files_that_are_not_used_are_named(visit: Visit, files: dict[str
     watched.check()
 
 
+def test_truncated_scene_is_refused_on_its_card(visit: Visit, files: dict[str, Path]) -> None:
+    watched = visit()
+    page = watched.page
+    whole = files["scene"].read_bytes()
+    files["scene"].write_bytes(whole[:-5000])
+    choose(watched, files)
+    slot = page.locator(".slot", has_text="Scene")
+    slot.get_by_text(f"616 Gaussians take {len(whole):,} bytes, but it has {len(whole) - 5000:,}.").wait_for()
+    page.get_by_text("3 cameras").or_(page.locator(".thumb", has_text="cameras.json")).first.wait_for()
+    sent: list[str] = []
+    page.on("request", lambda request: sent.append(request.url) if "/v1/" in request.url else None)
+    page.get_by_role("button", name="Start").click()
+    assert page.get_by_label("Scene", exact=True).evaluate("(input) => input === document.activeElement")
+    assert sent == []
+    files["scene"].write_bytes(whole)
+    choose(watched, {"scene": files["scene"]})
+    slot.get_by_text("616 Gaussians · SH degree 1").wait_for()
+    assert slot.locator(".wrong").is_hidden()
+    watched.check()
+
+
 def test_invalid_numbers_stop_the_start(visit: Visit, files: dict[str, Path]) -> None:
     watched = visit()
     page = watched.page
@@ -149,18 +170,26 @@ def test_refusals_of_the_service_stand_at_their_place(visit: Visit, files: dict[
     page.locator("[data-name=background]").get_by_text("'pink' is not a color. Give black, white").wait_for()
     set_options(watched, background="40,40,48")
     page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
-    for name, select in (("first", "half-space=1,0,0,0"), ("second", "cube=1")):
+    for number, select in ((1, "half-space=1,0,0,0"), (2, "cube=1")):
         page.get_by_role("button", name="Add a region").click()
-        region = page.get_by_role("group", name=f"Region {1 if name == 'first' else 2}")
-        region.get_by_label("Name").fill(name)
-        region.get_by_label("Select").fill(select)
+        region = page.get_by_role("group", name=f"Region {number}")
+        assert region.get_by_label("Name").input_value() == f"Part {number}"
+        write_selection(region, select)
         region.get_by_label("Freeze").check()
+    region.get_by_label("Name").fill("Grandma's face, 50% [x]: \u00fc")
     page.get_by_role("button", name="Estimate time").click()
     region.locator(".wrong", has_text="not a known selection").wait_for()
-    region.get_by_label("Name").fill("no name")
     region.get_by_label("Select").fill("half-space=-1,0,0,0")
+    region.get_by_label("Freeze").uncheck()
     page.get_by_role("button", name="Estimate time").click()
-    region.locator(".wrong:visible").wait_for()
+    page.get_by_role("region", name="Estimate").get_by_text("Region Grandma's face").wait_for(state="attached")
+    region.get_by_label("Select").fill("")
+    page.get_by_role("button", name="Estimate time").click()
+    region.locator(".wrong", has_text="Select a part of the scene in the 3D view").wait_for()
+    assert page.evaluate("() => document.activeElement.innerText") == "Select in the 3D view"
+    region.get_by_label("Name").fill(" ")
+    page.get_by_role("button", name="Estimate time").click()
+    region.locator(".wrong", has_text="Give the region a name.").wait_for()
     assert region.get_by_label("Name").get_attribute("aria-invalid") == "true"
     watched.check(REFUSED)
 
@@ -277,7 +306,7 @@ def test_estimate_warns_and_can_be_stopped(visit: Visit, files: dict[str, Path])
     page.locator("details.fold", has_text="Regions").evaluate("(fold) => { fold.open = true; }")
     page.get_by_role("button", name="Add a region").click()
     page.get_by_role("group", name="Region 1").get_by_label("Name").fill("empty")
-    page.get_by_role("group", name="Region 1").get_by_label("Select").fill("half-space=0,0,1,99")
+    write_selection(page.get_by_role("group", name="Region 1"), "half-space=0,0,1,99")
     page.get_by_role("group", name="Region 1").get_by_label("Freeze").check()
     held: list[Any] = []
     page.route("**/v1/jobs?dry_run=true", lambda route: held.append(route))

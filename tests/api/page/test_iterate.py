@@ -112,12 +112,53 @@ def test_changes_restore_regions_with_masks(
     watched.settled()
     row = page.get_by_role("group", name="Region 1")
     row.get_by_text("308 Gaussians selected by hand").wait_for()
-    for name, value in {"Name": "left", "Weight": "0.25", "Style": "night.png"}.items():
+    page.locator("[data-name=resolution]").wait_for()
+    page.reload()
+    page.get_by_role("button", name="Remove scene.ply").wait_for()
+    page.get_by_role("img", name="night.png").wait_for()
+    page.get_by_text("3 cameras shown in the scene").wait_for()
+    row.get_by_text("308 Gaussians selected by hand").wait_for()
+    for name, value in {"Name": "left", "Weight": "0.25", "Style": '"night.png"'}.items():
         assert row.get_by_label(name).input_value() == value
     again = started(watched, service)
     assert not sent
     assert again["parameters"]["regions"] == before["parameters"]["regions"]
     assert digests(again, "mask") == digests(before, "mask")
+    watched.check()
+
+
+def test_painting_of_a_region_is_not_one_of_the_job(
+    visit: Visit, service: Service, files: dict[str, Path], night: Path, tmp_path: Path
+) -> None:
+    """It is no part of the blend or of the default name, and another painting replaces only that of the job."""
+    region = {"name": "the left", "select": "half-space=1,0,0,0", "style": ["night.png:1.0"], "content_weight": "light"}
+    body = [(role, (path.name, path.read_bytes())) for role, path in [*files.items(), ("style", night)]]
+    values = STEPS | {"steps_sos": 2, "regions": [region]}
+    answer = httpx.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(values)}, timeout=60)
+    before = httpx.get(f"{service.url}/v1/jobs/{done(service, answer.json()['id'])}").json()
+    assert before["name"] == "scene · style"
+    watched = visit(f"/#/jobs/{before['id']}")
+    page = watched.page
+    page.get_by_role("button", name="Try another painting").click()
+    page.get_by_role("img", name="night.png").wait_for()
+    page.locator(".thumb", has_text="for the left").wait_for()
+    row = page.get_by_role("group", name="Region 1")
+    assert row.get_by_label("Strength").input_value() == "light"
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.locator(".slot", has_text="Style").get_by_text("Choose a painting for the rest of the scene.").wait_for()
+    page.get_by_label("Style", exact=True).first.set_input_files(files["style"])
+    assert page.get_by_text("Blend them").is_hidden()
+    assert page.locator("[data-name=name] input").get_attribute("placeholder") == "scene · style"
+    row.get_by_label("Style").select_option("Same as the job")
+    page.get_by_text("Blend them").wait_for()
+    assert page.get_by_label("night.png", exact=True).input_value() == "1"
+    row.get_by_label("Style").select_option("night.png")
+    page.get_by_text("Blend them").wait_for(state="hidden")
+    again = started(watched, service)
+    assert again["name"] == "scene · style"
+    assert [each["style"] for each in again["parameters"]["regions"]] == ["night.png"]
+    assert digests(again, "style") == [digests(before, "style")[1], digests(before, "style")[0]]
+    httpx.post(f"{service.url}/v1/jobs/{again['id']}/cancel").raise_for_status()
     watched.check()
 
 

@@ -23,7 +23,19 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
-from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, drop, expand, set_options, submit
+from tests.api.page.actions import (
+    LONG,
+    REFUSED,
+    STEPS,
+    Visit,
+    choose,
+    done,
+    drop,
+    expand,
+    set_options,
+    submit,
+    write_selection,
+)
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
 from tests.small_scenes import ball, wall, write_files
@@ -45,6 +57,9 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.get_by_role("button", name="Estimate time").click()
     cost = page.get_by_role("region", name="Estimate")
     cost.get_by_text("616", exact=True).wait_for()
+    assert cost.get_by_text("network layers").is_hidden(), "what a plan decides is folded away"
+    assert cost.get_by_text("automatic").count() == 0
+    cost.get_by_text("How it will run").click()
     cost.get_by_text("network layers").wait_for()
 
     page.get_by_role("button", name="Start").click()
@@ -111,12 +126,17 @@ def test_reload_while_uploading_sends_only_the_rest(visit: Visit, files: dict[st
     page.get_by_role("button", name="Pause").wait_for()
     page.unroute_all(behavior="ignoreErrors")
     page.reload()
+    page.get_by_text(f"“big.ply” ({big.stat().st_size / 1e6:.1f} MB) was").wait_for()
     page.get_by_text("Choose it again to finish").wait_for()
+    (tmp_path / "elsewhere").mkdir()
+    choose(watched, {"scene": large_scene(tmp_path / "elsewhere" / "big.ply", 20, 20)})
+    page.locator(".notice").wait_for(state="hidden")
 
     first, before = next((url, offset) for url, offset, _ in sent if offset > 0)
     sent.clear()
     set_options(watched, **LONG)
     choose(watched, files | {"scene": big})
+    page.get_by_text("Only the rest will be sent.").wait_for()
     page.get_by_role("button", name="Start").click()
     page.get_by_role("button", name="Cancel").wait_for()
     again = [offset for url, offset, _ in sent if url == first]
@@ -466,7 +486,7 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
     page.get_by_role("button", name="Add a region").click()
     region = page.get_by_role("group", name="Region 1")
     region.get_by_label("Name").fill("left")
-    region.get_by_label("Select").fill("half-space=1,0,0,0")
+    write_selection(region, "half-space=1,0,0,0")
     region.get_by_label("Freeze").check()
     page.get_by_role("button", name="Start").click()
     page.locator(".badge", has_text="Done").wait_for()

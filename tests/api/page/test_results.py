@@ -88,6 +88,11 @@ def test_result_comes_before_deletion_on_a_phone(visit: Visit, finished: str) ->
     assert tops[0] < 300, "the view is at the top of the page"
     fill_the_screen(watched)
     page.get_by_role("heading", name="How it ran").wait_for()
+    assert page.locator(".decisions").is_hidden()
+    page.locator("summary", has_text="Settings").click()
+    facts = page.locator(".fold .facts")
+    facts.get_by_text("255, 255, 255").wait_for()
+    assert not set("[{_") & set(facts.inner_text()), facts.inner_text()
     watched.check()
 
 
@@ -122,6 +127,23 @@ def test_no_remaining_time_is_shown_while_views_are_analyzed(visit: Visit, finis
     assert page.locator(".state .left").inner_text() == ""
     page.get_by_role("heading", name="How it will run").wait_for()
     page.unroute_all(behavior="ignoreErrors")
+    watched.check()
+
+
+def test_video_is_not_offered_where_its_extra_is_missing(visit: Visit, finished: str) -> None:
+    watched = visit("/#/jobs")
+    page = watched.page
+    script = "export const installed = { video: false, heif: false };"
+    page.route("**/installed.js", lambda route: route.fulfill(body=script, content_type="text/javascript"))
+    page.goto(f"{watched.url}/#/jobs/{finished}")
+    page.reload()
+    page.get_by_role("link", name="Download", exact=True).wait_for()
+    assert page.get_by_role("button", name="Make a video").count() == 0
+    page.get_by_role("link", name="New", exact=True).click()
+    heic = {"name": "a.heic", "mimeType": "image/heic", "buffer": b"any"}
+    page.get_by_label("Style", exact=True).set_input_files([heic])
+    page.locator(".slot", has_text="Style").get_by_text("pip install 'sgsst-service[heif]'").wait_for()
+    assert page.locator(".thumb").count() == 0
     watched.check()
 
 

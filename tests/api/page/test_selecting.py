@@ -311,7 +311,7 @@ def test_selected_region_stays_frozen(visit: Visit, service: Service, files: dic
     job_id = page.url.rsplit("/", 1)[1]
     job = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()
     (region,) = job["parameters"]["regions"]
-    assert (region["name"], region["select"], region["freeze"]) == ("near", "mask=near.bin", True)
+    assert (region["name"], region["select"], region["freeze"]) == ("near", "mask=region_1.bin", True)
     mask = httpx.get(f"{service.url}/v1/jobs/{job_id}/inputs/mask").content
     frozen = np.unpackbits(np.frombuffer(mask, np.uint8), bitorder="little").astype(bool)[:616]
     assert 10 < frozen.sum() == count < 600
