@@ -3,13 +3,13 @@
 import { h, icon, newId, put } from "./dom.js";
 import { installed } from "./installed.js";
 import { showWrong } from "./options.js";
-import { sceneSuffix } from "./scene_formats.js";
 import { StoredFile } from "./stored.js";
 import { size, words } from "./words.js";
 
 /** @typedef {import("./stored.js").Chosen} Chosen */
 
 const say = words.submit;
+const HEIC = /\.(heic|heif|hif)$/i;
 /** Number of files that a slot lists. */
 const SHOWN = 12;
 
@@ -140,45 +140,4 @@ export class Slot {
   end() {
     this.urls.forEach((url) => URL.revokeObjectURL(url));
   }
-}
-
-const HEIC = /\.(heic|heif|hif)$/i;
-const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp|heic|heif|hif)$/i, CAMERAS = /\.(json|bin|txt)$/i;
-
-/**
- * Sort dropped files into slots. Up to four images are styles; more are photos.
- *
- * @param {File[]} files
- * @returns {{scene: File[], style: File[], cameras: File[], photos: File[], unknown: File[]}}
- */
-export function sorted(files) {
-  const pictures = files.filter((file) => PICTURE.test(file.name)), many = pictures.length > 4;
-  const [scene, ...others] = files.filter((file) => sceneSuffix(file.name));
-  return {
-    scene: scene ? [scene] : [], cameras: files.filter((file) => CAMERAS.test(file.name)),
-    style: many ? [] : pictures, photos: many ? pictures : [],
-    unknown: [...others, ...files.filter(({ name }) => !PICTURE.test(name) && !CAMERAS.test(name) && !sceneSuffix(name))],
-  };
-}
-
-/** Return the files of a drop, including those in folders. @param {DataTransfer} data @returns {Promise<File[]>} */
-export async function droppedFiles(data) {
-  const entries = [...data.items].map((item) => item.webkitGetAsEntry?.()).filter((entry) => entry);
-  if (!entries.some((entry) => entry?.isDirectory)) return [...data.files];
-  /** @type {File[]} */
-  const found = [];
-  const walk = async (/** @type {any} */ entry) => {
-    if (found.length > 10000) return;
-    if (entry.isFile) found.push(await new Promise((done, wrong) => entry.file(done, wrong)));
-    else {
-      const reader = entry.createReader();
-      for (;;) {
-        const part = await new Promise((done, wrong) => reader.readEntries(done, wrong));
-        if (!part.length) break;
-        for (const each of part) await walk(each);
-      }
-    }
-  };
-  for (const entry of entries) await walk(entry);
-  return found;
 }

@@ -4,6 +4,7 @@ import { ask, eventsOf, get, Problem, randomKey } from "./api.js";
 import { readCameras, ringCameras } from "./cameras.js";
 import { announce, h, icon, newId, put } from "./dom.js";
 import { forgetDraft, keepDraft, keptDraft } from "./draft.js";
+import { listenToDrops, sorted } from "./drops.js";
 import { Gallery } from "./gallery.js";
 import { defaultName } from "./names.js";
 import { GROUPS, optionControl, plainly, showWrong } from "./options.js";
@@ -11,11 +12,12 @@ import { costCard } from "./plan.js";
 import { RegionList } from "./regions.js";
 import { accepted } from "./scene_formats.js";
 import { SelectPanel } from "./select_panel.js";
-import { droppedFiles, oneModel, Slot, sorted } from "./slots.js";
+import { SendingCard } from "./sending.js";
+import { oneModel, Slot } from "./slots.js";
 import { Stage } from "./stage.js";
 import { contentOf, StoredFile } from "./stored.js";
 import { addPictures } from "./strength.js";
-import { forgetUnfinished, sendAll, unfinished, Upload, uploadText } from "./uploads.js";
+import { forgetUnfinished, unfinished } from "./uploads.js";
 import { percent, seconds, size, words } from "./words.js";
 
 /** @typedef {import("./options.js").Control} Control */
@@ -46,8 +48,7 @@ export class SubmitView {
     /** @type {Map<string, Control>} */
     this.controls = new Map([["name", this.name]]);
     this.leaving = new AbortController();
-    /** @type {Map<File, Upload>} */
-    this.uploads = new Map();
+    this.sending = new SendingCard(() => this.stop());
     /** Inputs for the shares of the paintings in a blend, by the paintings' names. @type {Record<string, any>} */
     this.weights = {};
     /** Scene that the masks of the regions belong to. @type {Chosen | undefined} */
@@ -64,7 +65,7 @@ export class SubmitView {
     this.build();
     this.restoreFiles();
     this.loadOptions();
-    this.listenToDrops();
+    listenToDrops((files) => this.take(files), this.leaving.signal);
   }
 
   restoreFiles() {
@@ -126,7 +127,6 @@ export class SubmitView {
     this.problem = h("p.wrong.block", { hidden: true, role: "alert" });
     this.costButton = h("button.quiet", { type: "button", onclick: () => this.act(true) }, say.cost);
     this.startButton = h("button.primary", { type: "submit" }, say.start);
-    this.progress = h("div.sending", { hidden: true });
     this.result = h("div.result", { "aria-live": "polite" });
     this.notice = h("div.notice", { hidden: true });
     this.unused = h("p.wrong.block", { hidden: true, role: "alert" });
@@ -136,7 +136,7 @@ export class SubmitView {
       h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.viewsBody, this.found),
       h("section", h("h2", say.essentials), this.presets, this.main),
       h("section", h("h2", say.more), this.search, this.none, h("div", this.lookFold, this.regionFold, this.expertFold)),
-      h("div.actions", this.problem, this.progress, h("div.row", this.costButton, this.startButton)), this.result);
+      h("div.actions", this.problem, this.sending.element, h("div.row", this.costButton, this.startButton)), this.result);
     this.element = h("div.split", h("div.pinned", this.stage.element), this.form);
     this.showViews();
     this.showUnfinished();
@@ -289,24 +289,6 @@ export class SubmitView {
     }
     if (draft.orbiting && this.around) this.around.input.checked = true;
     this.showViews();
-  }
-
-  listenToDrops() {
-    const hint = h("div.dropping", { "aria-hidden": "true" }, say.dropNow);
-    const signal = this.leaving.signal;
-    let depth = 0;
-    document.addEventListener("dragenter", (event) => {
-      if (!event.dataTransfer?.types.includes("Files")) return;
-      if (!depth++) document.body.append(hint);
-    }, { signal });
-    document.addEventListener("dragleave", () => !--depth && hint.remove(), { signal });
-    document.addEventListener("dragover", (event) => event.preventDefault(), { signal });
-    document.addEventListener("drop", async (event) => {
-      event.preventDefault();
-      depth = 0;
-      hint.remove();
-      if (event.dataTransfer) this.take(await droppedFiles(event.dataTransfer));
-    }, { signal });
   }
 
   /** @param {File[]} files */
@@ -478,7 +460,7 @@ export class SubmitView {
   stop() {
     this.stopped = true;
     this.stopping?.abort();
-    for (const upload of this.sending ?? []) upload.stop();
+    this.sending.stop();
   }
 
   /** @param {boolean} dry whether to plan only */
@@ -490,7 +472,6 @@ export class SubmitView {
     if (this.reveal()) return;
     this.setBusy(true, dry);
     this.stopping = new AbortController();
-    this.planningText = "";
     try {
       const bodies = this.bodies(await this.send());
       if (dry) await this.plan(bodies[0]);
@@ -509,7 +490,7 @@ export class SubmitView {
     this.stopped = false;
     for (const button of [this.costButton, this.startButton]) button.disabled = busy;
     this.startButton.textContent = busy && !dry ? say.starting : this.jobs > 1 ? say.startAll(this.jobs) : say.start;
-    this.progress.hidden = !busy;
+    this.sending.element.hidden = !busy;
     if (busy) put(this.result);
   }
 
@@ -524,11 +505,7 @@ export class SubmitView {
   async send() {
     const { scene, style, cameras, photos } = this.slots, files = this.orbiting ? [] : [cameras.files, photos.files], masks = this.maskFiles();
     const all = /** @type {File[]} */ ([scene.files, style.files, ...files, masks].flat().filter((file) => !(file instanceof StoredFile)));
-    for (const file of all) if (!this.uploads.has(file)) this.uploads.set(file, new Upload(file, () => this.showSending(all)));
-    this.showSending(all);
-    this.sending = all.map((file) => /** @type {Upload} */ (this.uploads.get(file)));
-    for (const upload of this.sending) upload.over = false;
-    const ids = await sendAll(this.sending), idOf = new Map(all.map((file, i) => [/** @type {Chosen} */ (file), ids[i]]));
+    const ids = await this.sending.send(all), idOf = new Map(all.map((file, i) => [/** @type {Chosen} */ (file), ids[i]]));
     const named = (/** @type {Chosen[]} */ chosen) => chosen.map((file) => (file instanceof StoredFile ? `/${file.path}` : idOf.get(file)));
     return {
       scene: named(scene.files)[0], style: named(style.files), cameras: this.orbiting ? [] : named(cameras.files),
@@ -546,48 +523,19 @@ export class SubmitView {
     }]);
   }
 
-  /** @param {File[]} files */
-  showSending(files) {
-    const uploads = files.map((file) => this.uploads.get(file)).filter((upload) => upload !== undefined);
-    const total = files.reduce((sum, file) => sum + file.size, 0), sent = uploads.reduce((sum, upload) => sum + upload.sent, 0);
-    if (!this.sendingBar) {
-      this.sendingBar = h("progress", { max: 1, value: 0, "aria-label": words.uploads.title });
-      this.sendingText = h("span");
-      this.pauseButton = h("button.quiet.small", { type: "button", onclick: () => this.pause() }, words.uploads.pause);
-      this.stopButton = h("button.quiet.small", { type: "button", onclick: () => this.stop() }, say.stop);
-      this.sendingTitle = h("strong", words.uploads.title);
-      put(this.progress, h("div.row", this.sendingTitle, this.sendingText, this.pauseButton, this.stopButton), this.sendingBar);
-    }
-    const now = uploads.find((upload) => upload.state !== "done") ?? uploads[0], through = uploads.length === files.length && uploads.every((upload) => upload.state === "done");
-    this.sendingBar.value = sent / Math.max(total, 1);
-    this.sendingText.textContent = through ? this.planningText ?? "" : now ? `${now.file.name}: ${uploadText(now)}` : "";
-    this.pauseButton.hidden = this.sendingTitle.hidden = through;
-    this.stopButton.hidden = false;
-    this.pauseButton.textContent = now?.state === "paused" ? words.uploads.resume : words.uploads.pause;
-  }
-
-  pause() {
-    const paused = this.sending?.some((upload) => upload.state === "paused");
-    for (const upload of this.sending ?? []) {
-      if (paused) upload.resume();
-      else upload.pause();
-    }
-  }
-
   /** @param {any} body */
   async plan(body) {
-    this.tellPlanning(say.planning);
+    this.sending.tell(say.planning);
     const answer = await ask("POST", "v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: AbortSignal.any([this.leaving.signal, /** @type {AbortController} */ (this.stopping).signal]) });
     if (!answer.headers.get("content-type")?.includes("event-stream")) return void this.showPlan(body, await answer.json());
     for await (const { event, data } of eventsOf(answer)) {
-      if (event === "planning") this.tellPlanning(say.planned(data.step, data.total), data.fraction);
+      if (event === "planning") this.sending.tell(say.planned(data.step, data.total), data.fraction);
       else if (event === "problem") throw new Problem(data.status, data);
       else if (event === "plan") {
         this.showPlan(body, data);
         this.result.scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
       }
     }
-    this.planningText = "";
   }
 
   /** @param {any} body @param {any} view */
@@ -596,18 +544,10 @@ export class SubmitView {
     put(this.result, costCard(view), this.jobs > 1 ? h("p.help", say.eachTakes(this.jobs)) : null);
   }
 
-  /** @param {string} text @param {number} [share] */
-  tellPlanning(text, share) {
-    this.planningText = text;
-    this.sendingText.textContent = text;
-    if (share !== undefined) this.sendingBar.value = share;
-    else this.sendingBar.removeAttribute("value");
-  }
-
   /** @param {any[]} bodies */
   async create(bodies) {
-    this.tellPlanning(say.starting);
-    this.stopButton.hidden = true; // the service may already have accepted the job
+    this.sending.tell(say.starting);
+    this.sending.stopButton.hidden = true; // the service may already have accepted the job
     /** @type {any[]} */
     const jobs = [];
     for (const body of bodies) {
@@ -630,7 +570,7 @@ export class SubmitView {
   refuse(error) {
     const text = error instanceof Error ? error.message : String(error);
     if (error instanceof Problem) {
-      if (error.code === "unknown-upload") this.uploads.clear();
+      if (error.code === "unknown-upload") this.sending.uploads.clear();
       if (error.code === "unknown-input") this.askAgain(error.input);
       const told = error.errors.length ? error.errors : [{ at: "", message: text }];
       const placed = [...told].reverse().map(({ at, message }) => this.mark(error.input, at, plainly(message)));
@@ -680,7 +620,7 @@ export class SubmitView {
     this.leaving.abort();
     this.timing?.abort();
     this.selecting.end();
-    for (const upload of this.uploads.values()) upload.stop();
+    this.sending.end();
     for (const slot of Object.values(this.slots)) slot.end();
     this.stage.end();
     this.opened?.end();

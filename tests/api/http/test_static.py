@@ -15,6 +15,7 @@ import pytest
 from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
 from service.store.states import ACTIONS, TITLES, UNFINISHED
 from sgsst_core.files.formats import FORMATS
+from sgsst_core.option_parsers import STRENGTHS
 from tests.api.service import Service
 
 BUNDLE = "vendor/swagger-ui/swagger-ui-bundle.js"
@@ -60,7 +61,7 @@ def test_files_are_cached_by_digest(client: httpx.Client, files: StaticFiles) ->
     for name in files.files:
         path = f"/static/{files.digest}/{name}"
         plain = client.get(path, headers={"Accept-Encoding": "identity"})
-        if name not in ("scene_formats.js", "statuses.js"):  # filled in by the server
+        if name not in ("installed.js", "scene_formats.js", "statuses.js", "strength.js"):  # filled in by the server
             assert plain.content == Path(FOLDER, name).read_bytes()
         assert "max-age=31536000" in plain.headers["cache-control"]
         assert "immutable" in plain.headers["cache-control"]
@@ -74,6 +75,11 @@ def test_page_knows_the_registered_scene_formats(client: httpx.Client, files: St
     match = re.search(r"sceneFormats = .*\((\[.*\])\);", module)
     assert match
     assert [entry["suffix"] for entry in json.loads(match[1])] == [format.suffix for format in FORMATS]
+
+
+def test_page_knows_what_is_installed(client: httpx.Client, files: StaticFiles) -> None:
+    assert '{"video": true, "heif": true}' in client.get(f"/static/{files.digest}/installed.js").text
+    assert json.dumps(STRENGTHS) in client.get(f"/static/{files.digest}/strength.js").text
 
 
 def test_page_knows_the_states_of_jobs(client: httpx.Client, files: StaticFiles) -> None:
