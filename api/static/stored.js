@@ -48,7 +48,7 @@ export async function allInputs(job) {
   if (!job.input_counts.photos && !job.input_counts.mask) return storedInputs(job);
   const inputs = [];
   for (let cursor = "0"; cursor !== null; ) {
-    const page = await get(`/v1/jobs/${job.id}/inputs?cursor=${cursor}`);
+    const page = await get(`v1/jobs/${job.id}/inputs?cursor=${cursor}`);
     inputs.push(...page.inputs);
     cursor = page.next_cursor;
   }
