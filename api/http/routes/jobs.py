@@ -432,7 +432,7 @@ async def change_job(request: Request, job_id: JobId, context: ContextDep, calle
 def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Response:
     check_id(job_id)
     job, _ = context.store.jobs.detail(job_id, caller.owner)
-    regions = JobParameters(**job.parameters).region_requests
+    regions = JobParameters(**job.row.parameters).region_requests
     context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs.named, regions))
     return _job_response(context, caller, job_id)
 
