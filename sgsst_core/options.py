@@ -6,6 +6,7 @@ pydantic cannot express are added by `Annotated[..., Option(...)]`.
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -52,6 +53,12 @@ def renamed_hint(name: str) -> str:
         return f"it was removed: {REMOVED[plain]}"
     new = RENAMED.get(plain, "")
     return f"it is called {'--' + new.replace('_', '-') if flag else new} now" if new else ""
+
+
+def unknown_text(name: str, known: Iterable[str]) -> str:
+    """Return the message for an unknown option or parameter, with the most similar known one."""
+    similar = difflib.get_close_matches(name, known, 1)
+    return "is not a parameter." + (f" Did you mean {similar[0]!r}?" if similar else "")
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from sgsst_core.option_parsers import (
     parse_strength,
     parse_weights,
 )
-from sgsst_core.options import Declared, Option, merged, reason, renamed_hint
+from sgsst_core.options import Declared, Option, declared, merged, reason, renamed_hint, unknown_text
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
@@ -355,6 +355,8 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
 def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     """Return the settings of a preset with the given values replaced; None keeps the preset's value.
 
+    Settings have the names of the command line and the REST API.
+
     With fewer steps than the preset's, the learning rate falls only as far as the preset's falls in as many steps:
     falling to the preset's end, it would stop the colors before they are near the style's.
 
@@ -368,7 +370,8 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     """
     if preset not in _PRESETS:
         raise SettingsError(f"There is no preset {preset!r}. Choose one of {', '.join(_PRESETS)}.")
-    chosen = {name: value for name, value in values.items() if value is not None}
+    shown = declared(Settings)
+    chosen = {shown[name].field if name in shown else name: each for name, each in values.items() if each is not None}
     if "learning_rate" in chosen:  # an explicit learning rate is constant, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])
     whole = _PRESETS[preset]
@@ -390,6 +393,8 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
     except ValidationError as error:
         first = merged(error.errors())[0]
         name = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden" and not renamed_hint(name):
+            raise SettingsError(f"Setting {name} {unknown_text(name, declared(model))}") from error
         raise SettingsError(f"Setting {name} = {first['input']!r}: {renamed_hint(name) or reason(first)}.") from error
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import errno
 import logging
 from http import HTTPStatus
@@ -19,7 +18,7 @@ from api.http.addresses import address, path_of
 from service.errors import ServiceError
 from service.parameters import JobParameters
 from sgsst_core.errors import InvalidInputError
-from sgsst_core.options import merged, reason, renamed_hint
+from sgsst_core.options import merged, reason, renamed_hint, unknown_text
 from worker.region_requests import RegionOptions
 
 MEDIA_TYPE = "application/problem+json"
@@ -141,11 +140,8 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
 
 
 def _unknown(at: str) -> str:
-    """Return the message for an unknown parameter, with the most similar known one."""
-    name = at.rpartition(".")[2]
-    known = {*JobParameters.model_fields, *RegionOptions.model_fields}
-    similar = difflib.get_close_matches(name, known, 1)
-    return "is not a parameter." + (f" Did you mean {similar[0]!r}?" if similar else "")
+    """Return the message for an unknown parameter of a job or region."""
+    return unknown_text(at.rpartition(".")[2], {*JobParameters.model_fields, *RegionOptions.model_fields})
 
 
 async def _http_error(request: Request, error: Exception) -> JSONResponse:

@@ -86,3 +86,9 @@ def test_unknown_preset_error_lists_the_presets() -> None:
 def test_settings_are_immutable() -> None:
     with pytest.raises(ValueError, match="frozen"):
         make_settings().seed = 3  # type: ignore[misc]
+
+
+def test_settings_have_the_names_of_the_command_line() -> None:
+    assert make_settings("preview", resolution=160).max_resolution == 160
+    with pytest.raises(SettingsError, match=r"Setting resolutoin is not a parameter. Did you mean 'resolution'\?"):
+        make_settings("preview", resolutoin=160)
