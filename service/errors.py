@@ -485,6 +485,20 @@ class StoreError(ServiceError, InfrastructureError):
     retry_after = 10
 
 
+class DeadlineError(ServiceError):
+    """Request that made no progress for too long, because something that it needs hangs."""
+
+    code, status = "deadline-exceeded", 503
+    retry_after = 10
+    example = (30.0,)
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__(
+            f"The service got no answer for {seconds:g} s from its database, its store of files or its disk. "
+            "Try again later."
+        )
+
+
 class DamagedWeightsError(ServiceError, InfrastructureError):
     """Damaged feature network weights on this machine: no job is accepted until they are reinstalled."""
 

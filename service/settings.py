@@ -58,6 +58,7 @@ class ServiceSettings(BaseSettings):
             with the size of the files (`service.inspection.inspector`).
         dry_run_seconds: Base limit of CPU time for a dry run; it grows with Gaussians and views.
         receive_seconds: Time without new bytes after which a request body is abandoned, or without reading a response.
+        answer_seconds: Time without progress after which a request is answered with 503, or its response ended.
         session_days: Lifetime of a browser session that was started with a key.
         upload_hours: Time after which an unfinished upload, or a finished one that no job uses, expires.
         retention_days: Time after which the results of a finished job expire; the job's record is deleted after another
@@ -112,6 +113,7 @@ class ServiceSettings(BaseSettings):
     inspection_bytes: int = Field(8 * GB, gt=0)
     dry_run_seconds: float = Field(600, gt=0)
     receive_seconds: float = Field(60, gt=0)
+    answer_seconds: float = Field(30, gt=0)
 
     session_days: float = Field(7, gt=0)
     upload_hours: float = Field(24, gt=0)

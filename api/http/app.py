@@ -14,6 +14,7 @@ from fastapi import FastAPI
 from starlette.types import ASGIApp
 
 from api.http.context import Context
+from api.http.deadline import Deadlines
 from api.http.documentation import complete
 from api.http.event_hub import Hub
 from api.http.fetching import Fetcher
@@ -32,6 +33,7 @@ from api.http.threads import OwnerThreads
 from service.errors import DamagedWeightsError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
+from service.files.threads import FileThreads
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
 from service.inspection.video_maker import VideoMaker
@@ -39,8 +41,10 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from service.weights import check_weights
 
-#: Number of threads for requests that read the database or the disk.
+#: Number of threads for requests that read the database.
 _THREADS = 40
+#: Time limit of a piece of work on files, relative to the deadline of its request: the error then names what hangs.
+_FILES_FRACTION = 0.9
 #: Seconds that a request waits for a locked database, and for each response of the database server.
 _ANSWER_SECONDS = 8.0
 
@@ -58,20 +62,21 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         store = open_store(settings, patience=settings.start_seconds, answer_seconds=_ANSWER_SECONDS)
         results = Artifacts(settings.artifacts_url)
         blobs = open_blobs(settings, store.inputs, results)
-        threads = OwnerThreads()
+        threads = FileThreads(_FILES_FRACTION * settings.answer_seconds)
         context = Context(
             settings=settings,
             store=store,
             blobs=blobs,
             artifacts=results,
-            inspector=Inspector(settings, store, blobs),
-            derived=DerivedFiles(settings, store, blobs, results),
-            videos=VideoMaker(settings, store, blobs, results),
+            inspector=Inspector(settings, store, blobs, threads),
+            derived=DerivedFiles(settings, store, blobs, results, threads),
+            videos=VideoMaker(settings, store, blobs, results, threads),
             hub=Hub(store),
             sign_ins=SignIns(),
             rates=Rates(),
-            receipts=Receipts(store.inputs, blobs),
+            receipts=Receipts(store.inputs, blobs, threads),
             threads=threads,
+            readers=OwnerThreads(),
             fetcher=Fetcher(settings, blobs, threads),
             metrics=Metrics(store, settings.folder),
             readiness=Readiness(
@@ -85,7 +90,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         )
         app.state.context = context
         anyio.to_thread.current_default_thread_limiter().total_tokens = _THREADS
-        # Most of these threads wait for the disk; the default executor has few of them on machines with few processors.
+        # Most of these threads wait; the default executor has few of them on machines with few processors.
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS))
         context.hub.start()
         context.receipts.start()
@@ -98,6 +103,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         await context.derived.close()
         await context.videos.close()
         context.readiness.close()
+        threads.close()
         store.close()
 
     app = _App(
@@ -113,6 +119,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         app.include_router(module.router)
     add_static(app)
     add_handlers(app)
+    app.add_middleware(Deadlines, seconds=settings.answer_seconds)
 
     plain = app.openapi
 

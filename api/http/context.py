@@ -31,6 +31,7 @@ from api.http.threads import OwnerThreads
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
+from service.files.threads import FileThreads
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
 from service.inspection.video_maker import VideoMaker
@@ -94,7 +95,8 @@ class Context:
     sign_ins: SignIns
     rates: Rates
     receipts: Receipts
-    threads: OwnerThreads
+    threads: FileThreads
+    readers: OwnerThreads
     fetcher: Fetcher
 
 

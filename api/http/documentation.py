@@ -26,6 +26,7 @@ from service.errors import (
     ChangedMeanwhileError,
     DatabaseBusyError,
     DatabaseUnavailableError,
+    DeadlineError,
     RateLimitError,
     RefusedInputError,
     ServiceError,
@@ -98,6 +99,7 @@ _ANYWHERE = (
     DatabaseUnavailableError,
     DatabaseBusyError,
     ChangedMeanwhileError,
+    DeadlineError,
 )
 _WITH_KEY = (RateLimitError, NoKeyError, ForeignSiteError, CrossOriginError)
 

@@ -11,6 +11,7 @@ import logging
 from collections.abc import AsyncIterator, Iterable, Iterator
 from contextlib import AsyncExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import PurePosixPath
 
 import httpx
@@ -18,10 +19,10 @@ import httpx
 from api.http.multipart import check_file
 from api.http.receipts import Receipt
 from api.http.request_memory import memory
-from api.http.threads import OwnerLimit, OwnerThreads
 from service.errors import BusyError, FetchError, InvalidUrlError, TooLargeError, UrlsOffError
 from service.files.blobs import Blobs, Receiver
 from service.files.staging import staged_name
+from service.files.threads import FileThreads, OwnerLimit
 from service.outgoing import origin, parse_origins, parse_url, send
 from service.settings import ServiceSettings
 
@@ -70,10 +71,10 @@ class _Input:
 
 
 class Fetcher:
-    """Fetcher of inputs by URL."""
+    """Fetcher of inputs by URL; `threads` write the files."""
 
-    def __init__(self, settings: ServiceSettings, blobs: Blobs, threads: OwnerThreads) -> None:
-        self._settings, self._blobs, self._threads = settings, blobs, threads
+    def __init__(self, settings: ServiceSettings, blobs: Blobs, threads: FileThreads) -> None:
+        self._settings, self._blobs, self.threads = settings, blobs, threads
         self._allowed = parse_origins(settings.url_hosts)
         self._limit = OwnerLimit(_REQUESTS_PER_OWNER)
 
@@ -130,15 +131,16 @@ class Fetcher:
         """Fetch one file, and return its SHA-256."""
         async with AsyncExitStack() as stack:
             chunks = await self._open(source, state, stack)
-            file = self._blobs.receive(self._settings.max_upload_bytes)
+            run = partial(self.threads.run, state.receipt.owner)
+            file = await run(self._blobs.receive, self._settings.max_upload_bytes)
             try:
                 while chunk := await self._next(source, state, chunks):
                     state.left -= len(chunk)
                     self._check_size(0, state)
-                    await self._threads.run(state.receipt.owner, _write, chunk, file, state.receipt)
-                sha256 = await self._threads.run(state.receipt.owner, self._keep, source, file, state.receipt)
+                    await run(_write, chunk, file, state.receipt)
+                sha256 = await run(self._keep, source, file, state.receipt, size=file.size)
             except BaseException:
-                file.discard()
+                await self.threads.clean_up(run(file.discard))
                 raise
             _log.info("input fetched: host=%s bytes=%d", parse_url(source.url).host, file.size)
             return sha256

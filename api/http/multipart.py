@@ -20,7 +20,6 @@ from starlette.requests import ClientDisconnect
 
 from api.http.receipts import Receipt
 from api.http.request_memory import memory
-from api.http.threads import OwnerThreads
 from service.errors import (
     RefusedInputError,
     ServiceError,
@@ -30,6 +29,7 @@ from service.errors import (
 )
 from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, staged_name
+from service.files.threads import FileThreads
 from service.settings import ServiceSettings
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats import read_scene_header
@@ -191,7 +191,7 @@ def declared_bytes(request: Request, limit: int, advice: str = "Use uploads.") -
 
 
 async def receive(
-    request: Request, blobs: Blobs, settings: ServiceSettings, receipt: Receipt, threads: OwnerThreads
+    request: Request, blobs: Blobs, settings: ServiceSettings, receipt: Receipt, threads: FileThreads
 ) -> Received:
     """Read a multipart request to its end, and store its files as blobs, which the receipt protects from deletion.
 
@@ -211,10 +211,10 @@ async def receive(
     blocks = body_blocks(request, settings)
     try:
         async for block in blocks:
-            await threads.run(receipt.owner, form.feed, block)
+            await threads.run(receipt.owner, form.feed, block, size=form.unsaved)
         form.finish()
     except BaseException as error:
-        form.discard()
+        await threads.clean_up(threads.run(receipt.owner, form.discard))
         if isinstance(error, ServiceError) and not isinstance(error, TooSlowError | TooLargeError):
             await _drain(blocks)
         raise
@@ -288,6 +288,11 @@ class _Form:
         """
         if not self._done:
             raise BadRequestError("The multipart body ends before its last boundary: it was cut off.")
+
+    @property
+    def unsaved(self) -> int:
+        """Bytes of the current file, which become a blob at its end."""
+        return 0 if self._file is None else self._file.size
 
     def discard(self) -> None:
         """Delete the received bytes of a file that is not complete."""

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
+from functools import partial
 from types import TracebackType
 from typing import Self
 
-from service.errors import DatabaseUnavailableError
+from service.errors import DatabaseUnavailableError, StoreError
 from service.files.blobs import Blobs
+from service.files.threads import FileThreads
 from service.store.inputs import GRACE_SECONDS, Inputs
 from service.store.quotas import Quotas
 
@@ -24,8 +27,8 @@ _log = logging.getLogger(__name__)
 class Receipts:
     """Receipts of this process. A background task renews each one until its request has ended."""
 
-    def __init__(self, inputs: Inputs, blobs: Blobs) -> None:
-        self.inputs, self.blobs = inputs, blobs
+    def __init__(self, inputs: Inputs, blobs: Blobs, threads: FileThreads) -> None:
+        self.inputs, self._blobs, self._threads = inputs, blobs, threads
         self.active: set[str] = set()
         self._renewing: asyncio.Task[None] | None = None
 
@@ -41,6 +44,23 @@ class Receipts:
     def of(self, owner: str, quotas: Quotas) -> Receipt:
         """Return a receipt for an owner's request, with no charge yet."""
         return Receipt(self, owner, quotas)
+
+    async def end(self, owner: str, receipt: str) -> None:
+        """Release the charge of a receipt, and delete the request's files unless other jobs or uploads use them."""
+        self.active.discard(receipt)
+        await self._threads.clean_up(self._end(owner, receipt))
+
+    async def _end(self, owner: str, receipt: str) -> None:
+        unused = await asyncio.to_thread(self.inputs.end_receipt, receipt)
+        if unused:
+            await self.remove(owner, partial(self._blobs.remove, unused))
+
+    async def remove(self, owner: str, files: Callable[[], None]) -> None:
+        """Remove files that no database row refers to any longer; housekeeping removes those that remain."""
+        try:
+            await self._threads.clean_up(self._threads.run(owner, files))
+        except (StoreError, OSError) as error:
+            _log.warning("unused files not deleted yet: %s", error.__cause__ or error)
 
     async def _renew(self) -> None:
         while True:
@@ -99,18 +119,12 @@ class Receipt:
             self._receipts.active.discard(self.id)
             self.id = None
 
-    def end(self) -> None:
-        """Release the charge, and delete the request's files unless other jobs or uploads use them."""
-        receipt = self.id
-        if receipt is not None:
-            self.hand_over()
-            self._receipts.blobs.remove(self._receipts.inputs.end_receipt(receipt))
-
     async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self.id is not None:
-            await asyncio.to_thread(self.end)
+        receipt, self.id = self.id, None
+        if receipt is not None:
+            await self._receipts.end(self.owner, receipt)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import hashlib
+import threading
+from functools import partial
 
 from fastapi import Request
 
 from api.http.context import Context
 from api.http.multipart import BadRequestError, body_blocks
-from service.errors import ServiceError, TooLargeError
+from service.errors import ServiceError, StoreError, TooLargeError
 from service.store.tables import UploadRow
 
 #: Digest algorithms of `Upload-Checksum`.
@@ -41,25 +42,32 @@ async def append_body(request: Request, context: Context, row: UploadRow, checks
     Args:
         checksum: Algorithm and expected digest of the body; None for no check.
     """
-    writer = await asyncio.to_thread(_Writer, context, row, checksum)
+    run = partial(context.threads.run, row.owner)
+    writer = await run(_Writer, context, row, checksum)
     try:
         try:
             async for block in body_blocks(request, context.settings):
-                await context.threads.run(row.owner, writer.write, block)
+                await run(writer.write, block, size=_SAVE_BYTES)
+        except StoreError:
+            raise
         except ServiceError:
             if checksum is None:
-                await context.threads.run(row.owner, writer.save)  # no checksum can contradict them
+                await run(writer.save, size=_SAVE_BYTES)  # no checksum can contradict them
             raise
-        return await context.threads.run(row.owner, writer.finish)
+        return await run(writer.finish, size=row.length if writer.complete else _SAVE_BYTES)
     finally:
-        writer.close()
+        await context.threads.clean_up(run(writer.close))
 
 
 class _Writer:
-    """Writer that checks received bytes and saves them at intervals."""
+    """Writer that checks received bytes and saves them at intervals.
+
+    A thread that hangs and was given up blocks the others, so that no file is closed while it is written to.
+    """
 
     def __init__(self, context: Context, row: UploadRow, checksum: tuple[str, bytes] | None) -> None:
         self._context, self._row, self._checksum = context, row, checksum
+        self._lock = threading.RLock()
         self._seconds = context.settings.upload_hours * 3600
         self._part = context.blobs.append(row, self._seconds)
         self._digest = hashlib.new(checksum[0]) if checksum else None
@@ -68,18 +76,25 @@ class _Writer:
     def write(self, block: bytes) -> None:
         if self._offset + len(block) > self._row.length:
             raise LongerThanDeclaredError(self._row.length)
-        self._context.blobs.ensure_space(len(block))
-        self._part.write(block)
-        self._offset += len(block)
-        if self._digest is not None:
-            self._digest.update(block)
-        elif self._offset - self._saved >= _SAVE_BYTES:
-            self.save()
+        with self._lock:
+            self._context.blobs.ensure_space(len(block))
+            self._part.write(block)
+            self._offset += len(block)
+            if self._digest is not None:
+                self._digest.update(block)
+            elif self._offset - self._saved >= _SAVE_BYTES:
+                self.save()
+
+    @property
+    def complete(self) -> bool:
+        """Whether all bytes of the upload have been written."""
+        return self._offset == self._row.length
 
     def save(self) -> float:
         """Make the received bytes durable, then update the database. Return the upload's new expiry time."""
-        self._saved = self._offset
-        return self._part.save()
+        with self._lock:
+            self._saved = self._offset
+            return self._part.save()
 
     def finish(self) -> float:
         """Verify and save the bytes of the request. Store the file as a blob if the upload is complete."""
@@ -88,12 +103,13 @@ class _Writer:
             raise ChecksumError
         expires = self.save()
         self.close()
-        if self._offset == self._row.length:
+        if self.complete:
             self._context.blobs.finish_upload(self._row, self._seconds)
         return expires
 
     def close(self) -> None:
-        self._part.close()
+        with self._lock:
+            self._part.close()
 
 
 def parse_checksum(header: str) -> tuple[str, bytes]:

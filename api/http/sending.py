@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import re
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Annotated, Any
 from urllib.parse import quote
 
-import anyio
-import anyio.to_thread
 from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
@@ -22,10 +18,8 @@ from api.http.request_memory import memory
 from api.http.threads import OwnerThreads
 from service.errors import NotFoundError, ServiceError
 from service.examples import SHA256
+from service.files.threads import FileThreads
 
-#: Size in bytes above which a file counts as large, and limiter of concurrent checks of large files. It keeps checks of
-#: small files and other requests from waiting for them.
-_LARGE_BYTES, _LARGE_CHECKS = 64 << 20, anyio.CapacityLimiter(2)
 #: Maximum size in bytes of two chunks. Sending 64 kB at a time takes several times as much CPU time per byte.
 _MOST_BYTES = 1 << 20
 #: Maximum number of characters of a suggested file name.
@@ -106,6 +100,7 @@ class SentFile:
     """File to send.
 
     Attributes:
+        owner: Owner of the file, whose turn it is sent in.
         sha256, size: SHA-256 and size in bytes of the content.
         name: Suggested name for saving the file.
         kind: Media type.
@@ -115,6 +110,7 @@ class SentFile:
         read: Function that yields the bytes from one offset up to another, in chunks of at most a given size.
     """
 
+    owner: str
     sha256: str
     size: int
     name: str
@@ -230,7 +226,7 @@ def names_etag(header: str | None, tag: str, *, strong: bool = False) -> bool:
     return text == "*" or any(tag == named and not (strong and weak) for weak, named in _ETAG.findall(text))
 
 
-async def send_file(request: Request, file: SentFile, conditions: Conditions) -> Response:
+async def send_file(request: Request, threads: FileThreads, file: SentFile, conditions: Conditions) -> Response:
     """Return the response with a file or a range of it.
 
     Raises:
@@ -254,16 +250,23 @@ async def send_file(request: Request, file: SentFile, conditions: Conditions) ->
     status = 206 if span else 200
     if request.method == "HEAD":
         return Response(status_code=status, headers=response_headers, media_type=file.kind)
-    await anyio.to_thread.run_sync(file.check, limiter=_LARGE_CHECKS if file.size > _LARGE_BYTES else None)
+    await threads.run(file.owner, file.check, size=file.size)
     body = file.read(start, stop, memory.share(_MOST_BYTES) // 2)  # one chunk is read while another is sent
-    first = await asyncio.to_thread(_first, body)  # an error at this point can still be sent as a response
-    return StreamingResponse(chain(first, body), status, response_headers, file.kind)
+    first = await threads.run(file.owner, _next, body)  # an error at this point can still be sent as a response
+    return StreamingResponse(_chunks(threads, file.owner, first, body), status, response_headers, file.kind)
 
 
-def _first(body: Iterator[bytes]) -> list[bytes]:
-    """Return a list with the first block of a body; empty if the body is empty."""
+async def _chunks(threads: FileThreads, owner: str, chunk: bytes | None, body: Iterator[bytes]) -> AsyncIterator[bytes]:
+    """Yield a chunk and the ones that follow it."""
+    while chunk is not None:
+        yield chunk
+        chunk = await threads.run(owner, _next, body)
+
+
+def _next(body: Iterator[bytes]) -> bytes | None:
+    """Return the next chunk of a body; None at its end."""
     try:
-        return [piece for piece in (next(body, None),) if piece is not None]
+        return next(body, None)
     except FileNotFoundError as error:
         raise JustRemovedError from error
 

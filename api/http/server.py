@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import resource
 import socket
@@ -52,6 +53,8 @@ def main() -> None:
         server.run(listeners)
     if not server.started:
         sys.exit("The API could not be started.")
+    logging.shutdown()
+    os._exit(0)  # threads that wait for a hanging file store would be waited for
 
 
 def _affordable_connections() -> int:

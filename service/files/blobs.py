@@ -13,6 +13,7 @@ import os
 import secrets
 import shutil
 import tempfile
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -60,6 +61,7 @@ class Receiver:
         self.size = 0
         self._limit = limit
         self._ensure_space = ensure_space
+        self._lock = threading.Lock()  # a thread that hangs and was given up still writes to the file
         with disk_errors():
             self._file = path.open("xb", buffering=0)
 
@@ -74,8 +76,9 @@ class Receiver:
         self.size += len(data)
         if self.size > self._limit:
             raise TooLargeError(f"A file has more than {self._limit:,} bytes.", self._limit)
-        self._ensure_space(len(data))
-        write_all(self._file, data)
+        with self._lock:
+            self._ensure_space(len(data))
+            write_all(self._file, data)
 
     def close(self) -> None:
         """Make the bytes durable and close the file."""
@@ -84,8 +87,9 @@ class Receiver:
 
     def discard(self) -> None:
         """Delete the received bytes."""
-        self._file.close()
-        self.path.unlink(missing_ok=True)
+        with self._lock:
+            self._file.close()
+            self.path.unlink(missing_ok=True)
 
 
 class PartWriter(Protocol):

@@ -11,21 +11,22 @@ import hashlib
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from service.errors import DamagedFileError, LostFileError, StoreError
 
-#: Limits for S3: timeouts for connecting and for responses in seconds, and numbers of attempts by the S3 client and by
-#: fsspec. The S3 client retries 503 (SlowDown) with exponential backoff. In total, an unreachable store raises an error
-#: after half a minute.
-_CONNECT_SECONDS, _ANSWER_SECONDS = 3.0, 30.0
-_CLIENT_TRIES, _TRIES = 3, 3
+#: Limits of each request to S3: timeouts for connecting and for responses in seconds, and number of tries, with
+#: exponential backoff. The S3 client alone retries; retries of fsspec around it would multiply both. A store that
+#: accepts connections and never responds raises an error after three quarters of a minute.
+_CONNECT_SECONDS, _ANSWER_SECONDS, _TRIES = 3.0, 10.0, 4
 #: Chunk size in bytes and number of concurrent chunks for transfers of large S3 objects; the defaults would use half a
 #: gigabyte of memory.
 _PIECE_BYTES, _PIECES = 16 << 20, 3
@@ -38,6 +39,8 @@ CHUNK = 1 << 17
 _CHECKED_SECONDS, _MAX_CHECKED = 3600.0, 10_000
 
 _log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 #: File system metadata that change with an object's content: size, times, and inode or ETag.
 Stamp = tuple[Any, ...]
@@ -57,7 +60,7 @@ class ObjectStore:
         self._s3 = "s3" in self._protocols()
         self._checked: OrderedDict[str, tuple[Stamp, str, float]] = OrderedDict()
         if self._s3:
-            self._files.retries = _TRIES
+            self._files.retries = 1
 
     def _protocols(self) -> tuple[str, ...]:
         protocol = self._files.protocol
@@ -85,12 +88,15 @@ class ObjectStore:
         """Copy an S3 object in chunks, so that only an interrupted chunk has to be fetched again."""
         size = self._files.size(path)
         starts = range(0, size, _PIECE_BYTES)
-        with target.open("wb") as file:
+
+        def piece(start: int) -> bytes:
+            end = min(start + _PIECE_BYTES, size)
+            data: bytes = _uninterrupted(partial(self._files.cat_file, path, start=start, end=end))
+            return data
+
+        with target.open("wb") as file, ThreadPoolExecutor(_PIECES) as pool:
             for first in range(0, len(starts), _PIECES):
-                some = list(starts[first : first + _PIECES])
-                ends = [min(start + _PIECE_BYTES, size) for start in some]
-                for data in self._files.cat_ranges([path] * len(some), some, ends, on_error="raise"):
-                    file.write(data)
+                file.writelines(pool.map(piece, starts[first : first + _PIECES]))
 
     def read(self, name: str, start: int, stop: int, chunk: int = CHUNK) -> Iterator[bytes]:
         """Yield the bytes from `start` up to `stop` in chunks of at most `chunk` bytes.
@@ -105,7 +111,7 @@ class ObjectStore:
             file.seek(start)
             left = stop - start
             while left > 0:
-                data = file.read(min(chunk, left))
+                data = _uninterrupted(partial(file.read, min(chunk, left)))
                 if not data:
                     raise TruncatedError(f"{name}: is shorter than its row says")
                 left -= len(data)
@@ -146,7 +152,7 @@ class ObjectStore:
         """
         with self._translated(name), self._files.open(self._path(name), "rb") as file:
             digest = hashlib.sha256()
-            while data := file.read(CHUNK):
+            while data := _uninterrupted(partial(file.read, CHUNK)):
                 digest.update(data)
             return digest.hexdigest()
 
@@ -297,6 +303,20 @@ class ObjectStore:
             raise StoreError from _cause(name, error)
 
 
+def _uninterrupted(read: Callable[[], T]) -> T:
+    """Repeat a read whose response was cut off. The S3 client has retried requests without a response."""
+    for left in reversed(range(_TRIES)):
+        started = time.monotonic()
+        try:
+            return read()
+        except FileNotFoundError:
+            raise
+        except Exception:
+            if not left or time.monotonic() - started > _ANSWER_SECONDS:
+                raise
+    raise AssertionError
+
+
 def _cause(name: str, error: Exception) -> Exception:
     """Add the object's name to an error, for the operator's log."""
     error.add_note(f"store of files: {name}")
@@ -307,7 +327,7 @@ def _options(url: str) -> dict[str, Any]:
     """Return fsspec options for the protocol of a URL."""
     if not url.startswith(("s3://", "s3a://")):
         return {}
-    retries = {"mode": "standard", "total_max_attempts": _CLIENT_TRIES}
+    retries = {"mode": "standard", "total_max_attempts": _TRIES}
     config = {"connect_timeout": _CONNECT_SECONDS, "read_timeout": _ANSWER_SECONDS, "retries": retries}
     return {"config_kwargs": config, "skip_instance_cache": True}
 

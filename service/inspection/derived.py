@@ -9,18 +9,20 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
-import tempfile
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from service.deadlines import suspended
 from service.errors import LostFileError, NoArtifactError, NotFoundError, TooManyBlendsError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
+from service.files.threads import FileThreads
 from service.inspection.inspector import LEFTOVER_SECONDS, MEMORY_PER_BYTE, InspectionProcess, findings_of
 from service.inspection.lanes import Lanes
 from service.parameters import stored_parameters
@@ -70,8 +72,11 @@ class DerivedFiles:
     Concurrent requests for the same file share one task.
     """
 
-    def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts) -> None:
+    def __init__(
+        self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts, threads: FileThreads
+    ) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
+        self._threads = threads
         self._lanes = Lanes([InspectionProcess()])
         self._tasks: dict[tuple[str, str], asyncio.Task[None]] = {}
         self._folder = settings.folder / "packing"
@@ -114,7 +119,8 @@ class DerivedFiles:
                 self._tasks[job.id, name] = task
                 task.add_done_callback(lambda done: self._tasks.pop((job.id, name), None))
             try:
-                await asyncio.shield(task)
+                with suspended():  # each part of the task has its own limit
+                    await asyncio.shield(task)
             except LostFileError:
                 await asyncio.to_thread(self._result, job.id)  # fails if the job was deleted meanwhile
                 raise
@@ -134,14 +140,16 @@ class DerivedFiles:
     async def _compress(self, job: JobRow, name: str, quotas: Quotas) -> None:
         """Compress the result, store the files, and make them visible."""
         async with self._turn(job) as (process, folder, result):
-            self._blobs.ensure_space(3 * result.size)
-            staged = await asyncio.to_thread(self._stage, folder, job, [result])
+            await self._threads.run(job.owner, self._blobs.ensure_space, 3 * result.size)
+            size = result.size + await input_bytes(self._store, job)
+            staged = await self._threads.run(job.owner, self._stage, folder, job, [result], size=size)
             limits = {"name": name, "bytes": result.size + _HEADER_BYTES}  # a compressed scene is smaller
             request = self._request("compress", folder, job, replace(staged, scene=Path(RESULT)), limits, result.size)
+            loss = json.dumps(findings_of(await process.ask(request)), indent=1) + "\n"
             loss_file = folder / "loss.json"
-            loss_file.write_text(json.dumps(findings_of(await process.ask(request)), indent=1) + "\n")
+            await self._threads.run(job.owner, loss_file.write_text, loss)
             files = {f"{name}.json": loss_file, name: folder / name}
-            await asyncio.to_thread(self._publish, job, result, files, quotas)
+            await self._threads.run(job.owner, self._publish, job, result, files, quotas, size=result.size)
 
     # --- blends ---------------------------------------------------------------------------------------------------
 
@@ -152,13 +160,16 @@ class DerivedFiles:
             others = [await asyncio.to_thread(self._result, job_id) for job_id in blend.others]
             scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
             size = (scene["size"] if scene else 0) + sum(row.size for row in (result, *others))
-            self._blobs.ensure_space(size + _BLEND_SIZE * result.size)
-            staged = await asyncio.to_thread(self._stage, folder, job, [result, *others])
+            run = partial(self._threads.run, job.owner)
+            await run(self._blobs.ensure_space, size + _BLEND_SIZE * result.size)
+            size_of_all = await input_bytes(self._store, job) + size
+            staged = await run(self._stage, folder, job, [result, *others], size=size_of_all)
             parts = {RESULT: blend.weight, **{_staged_name(job, row): blend.others[row.job_id] for row in others}}
             file = f"blend{blend.format.suffix}"
             limits = {"name": file, "parts": parts, "bytes": _BLEND_SIZE * result.size + _HEADER_BYTES}
             findings_of(await process.ask(self._request("blend", folder, job, staged, limits, size)))
-            await asyncio.to_thread(self._publish, job, result, {blend.name: folder / file}, quotas)
+            files = {blend.name: folder / file}
+            await run(self._publish, job, result, files, quotas, size=_BLEND_SIZE * result.size)
 
     def _check_count(self, job: JobRow) -> None:
         if sum(row.name.startswith(_BLENDS) for row in self._store.jobs.artifacts(job.id)) >= MOST_BLENDS:
@@ -171,8 +182,8 @@ class DerivedFiles:
         """Wait for the owner's turn, and provide the process, an empty folder, and the job's result."""
         async with self._lanes.turn(job.owner) as process:
             result = await asyncio.to_thread(self._result, job.id)  # the job may have been deleted meanwhile
-            with tempfile.TemporaryDirectory(dir=self._folder) as folder:
-                yield process, Path(folder), result
+            async with self._threads.folder(job.owner, self._folder) as folder:
+                yield process, folder, result
 
     def _stage(self, folder: Path, job: JobRow, results: list[ArtifactRow]) -> Staged:
         """Stage the job's inputs, with results beside them."""
@@ -224,6 +235,11 @@ def remove_leftovers(folder: Path) -> None:
     for leftover in folder.iterdir():
         if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
             shutil.rmtree(leftover, ignore_errors=True)
+
+
+async def input_bytes(store: Store, job: JobRow) -> int:
+    """Return the bytes of a job's inputs."""
+    return sum(entry["size"] for entry in await asyncio.to_thread(store.jobs.inputs, job.id))
 
 
 def _staged_name(job: JobRow, result: ArtifactRow) -> str:

@@ -10,17 +10,17 @@ import logging
 import os
 import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 import psutil
 
+from service.deadlines import suspended
 from service.errors import BusyError, InspectionLimitError, RefusedInputError
 from service.files.blobs import Blobs
 from service.files.staging import stage
+from service.files.threads import FileThreads
 from service.inspection.lanes import Lanes
 from service.inspection.sandbox import missing
 from service.parameters import JobParameters
@@ -161,9 +161,9 @@ class InspectionProcess:
 class Inspector:
     """Validator and planner of complete jobs; its findings are cached by files and parameters."""
 
-    def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs) -> None:
+    def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, threads: FileThreads) -> None:
         self._settings = settings
-        self._store, self._blobs = store, blobs
+        self._store, self._blobs, self._threads = store, blobs, threads
         # two lanes: if one owner's files occupy a lane for the full time limit, the other lane serves all other owners
         self._validating = Lanes([InspectionProcess(), InspectionProcess()])
         self._warming: asyncio.Task[None] | None = None
@@ -223,8 +223,9 @@ class Inspector:
             return recalled
         if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
             self._warming = asyncio.create_task(self._validating.slots[1].warm())
-        async with self._lanes(work, inputs).turn(owner) as process:
-            answer = await self._ask_process(process, work, owner, inputs, rows, parameters, show)
+        with suspended():  # the process has its own limits
+            async with self._lanes(work, inputs).turn(owner) as process:
+                answer = await self._ask_process(process, work, owner, inputs, rows, parameters, show)
         transient = answer.get("error", {}).get("code") in (InspectionLimitError.code, WeightsError.code)
         if not transient:  # a later check may succeed
             key = self._key(work, owner, inputs, parameters)
@@ -248,12 +249,12 @@ class Inspector:
         show: Show,
     ) -> dict[str, Any]:
         seconds = await asyncio.to_thread(self._seconds, work, owner, inputs, parameters)
-        with tempfile.TemporaryDirectory(dir=self._folder) as folder:
-            paths = await asyncio.to_thread(self._blobs.fetch, rows, Path(folder))
-            staged = await asyncio.to_thread(stage, Path(folder), inputs, paths)
+        async with self._threads.folder(owner, self._folder) as folder:
+            paths = await self._threads.run(owner, self._blobs.fetch, rows, folder, size=_size(inputs))
+            staged = await self._threads.run(owner, stage, folder, inputs, paths)
             request = {
                 "work": work,
-                "folder": folder,
+                "folder": str(folder),
                 "staged": staged.as_json(),
                 "parameters": parameters.model_dump(mode="json"),
                 "limits": self._limits,

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import tempfile
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from service.deadlines import suspended
 from service.errors import BusyError, NoArtifactError, NotFoundError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
-from service.inspection.derived import remove_leftovers
+from service.files.threads import FileThreads
+from service.inspection.derived import input_bytes, remove_leftovers
 from service.inspection.inspector import (
     MEMORY_PER_BYTE,
     InspectionProcess,
@@ -70,8 +72,11 @@ class VideoMaker:
     A video is rendered to its end even if nobody waits for it any longer, unless the service ends.
     """
 
-    def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts) -> None:
+    def __init__(
+        self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts, threads: FileThreads
+    ) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
+        self._threads = threads
         self._lanes = Lanes([InspectionProcess(threads_of_a_job(settings))])
         self._making: dict[str, _Making] = {}
         self._folder = settings.folder / "videos"
@@ -105,7 +110,8 @@ class VideoMaker:
         assert making.task is not None
         making.watchers.append(show)
         try:
-            await asyncio.shield(making.task)
+            with suspended():  # each part of the task has its own limit
+                await asyncio.shield(making.task)
         finally:
             making.watchers.remove(show)
         row = await asyncio.to_thread(self._store.jobs.artifact, job.id, VIDEO)
@@ -127,27 +133,28 @@ class VideoMaker:
         side = options.resolution or DEFAULT_SIDE
         pixels = side * side * options.frames * (2 if options.compare else 1)
         most_bytes = round(_BYTES_PER_PIXEL * pixels) + (1 << 20)
-        self._blobs.ensure_space(2 * result.size + round(_USUAL_BYTES * most_bytes))
+        run = partial(self._threads.run, job.owner)
+        await run(self._blobs.ensure_space, 2 * result.size + round(_USUAL_BYTES * most_bytes))
         seconds = _SECONDS_PER_PIXEL * pixels + _SECONDS_PER_BYTE * result.size * options.frames
-        async with self._lanes.turn(job.owner) as process:
-            with tempfile.TemporaryDirectory(dir=self._folder) as folder:
-                staged = await asyncio.to_thread(self._stage, Path(folder), job, result)
-                request = {
-                    "work": "video",
-                    "folder": folder,
-                    "staged": replace(staged, scene=Path(RESULT)).as_json(),
-                    "parameters": stored_parameters(job.parameters).model_dump(mode="json"),
-                    "limits": {
-                        "name": VIDEO,
-                        "options": options.model_dump(mode="json"),
-                        "unstylized": str(staged.scene),
-                        "bytes": most_bytes,
-                    },
-                    "seconds": self._settings.inspection_seconds + seconds,
-                    "bytes": self._settings.inspection_bytes + 2 * MEMORY_PER_BYTE * result.size + _ENCODER_BYTES,
-                }
-                findings_of(await process.ask(request, making.show))
-                await asyncio.to_thread(self._publish, Path(folder), job, result, quotas)
+        async with self._lanes.turn(job.owner) as process, self._threads.folder(job.owner, self._folder) as folder:
+            size = result.size + await input_bytes(self._store, job)
+            staged = await run(self._stage, folder, job, result, size=size)
+            request = {
+                "work": "video",
+                "folder": str(folder),
+                "staged": replace(staged, scene=Path(RESULT)).as_json(),
+                "parameters": stored_parameters(job.parameters).model_dump(mode="json"),
+                "limits": {
+                    "name": VIDEO,
+                    "options": options.model_dump(mode="json"),
+                    "unstylized": str(staged.scene),
+                    "bytes": most_bytes,
+                },
+                "seconds": self._settings.inspection_seconds + seconds,
+                "bytes": self._settings.inspection_bytes + 2 * MEMORY_PER_BYTE * result.size + _ENCODER_BYTES,
+            }
+            findings_of(await process.ask(request, making.show))
+            await run(self._publish, folder, job, result, quotas, size=most_bytes)
 
     def _stage(self, folder: Path, job: JobRow, result: ArtifactRow) -> Staged:
         """Stage the job's inputs, with the result beside them."""

@@ -84,7 +84,7 @@ async def list_artifacts(
         following = page[most - 1].name if len(page) > most else None
         return [artifact_view(row) for row in page[:most] if not row.name.startswith(".")], following
 
-    return await send_list("artifacts", read, cursor, limit, context.threads, caller.owner)
+    return await send_list("artifacts", read, cursor, limit, context.readers, caller.owner)
 
 
 #: Media types of results (`service.files.artifacts`), and how the content of each starts.
@@ -153,6 +153,7 @@ async def get_artifact(
     row = await _find_artifact(context, caller, job, name, format_)
     kind = media_type(row.name)
     file = SentFile(
+        owner=job.owner,
         sha256=row.sha256,
         size=row.size,
         name=_file_name(job.name, row.name),
@@ -162,7 +163,7 @@ async def get_artifact(
         check=partial(check_artifact, context, row),
         read=partial(context.artifacts.read, row.location),
     )
-    return await send_file(request, file, conditions)
+    return await send_file(request, context.threads, file, conditions)
 
 
 async def _find_artifact(

@@ -102,7 +102,7 @@ async def list_inputs(
         page = context.store.jobs.input_page(job_id, position, most + 1)
         return input_views(job_id, page[:most]), str(position + most) if len(page) > most else None
 
-    return await send_list("inputs", read, str(cursor), limit, context.threads, caller.owner)
+    return await send_list("inputs", read, str(cursor), limit, context.readers, caller.owner)
 
 
 @router.head("/{job_id}/inputs/{role}", operation_id="head_input", response_class=Response, responses=_ANSWERS)
@@ -125,6 +125,7 @@ async def get_input(
     """Download a file that a job was created from, whole or in ranges, until the job expires."""
     entry, row = await asyncio.to_thread(_find_input, context, caller, job_id, role)
     file = SentFile(
+        owner=caller.owner,
         sha256=row.sha256,
         size=row.size,
         name=entry["name"],
@@ -134,7 +135,7 @@ async def get_input(
         check=partial(check_input, context, row),
         read=partial(context.blobs.read, row),
     )
-    return await send_file(request, file, conditions)
+    return await send_file(request, context.threads, file, conditions)
 
 
 def check_input(context: Context, row: BlobRow) -> None:

@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
@@ -50,6 +51,7 @@ from api.http.schemas import (
 )
 from api.http.sending import IfNoneMatch, names_etag, send_list
 from api.http.submission import BODY, REFUSALS, JobFromUploads
+from service.deadlines import suspended
 from service.errors import (
     CancelError,
     DamagedWeightsError,
@@ -146,8 +148,11 @@ async def create_job(
         fetched: dict[str, str] = {}
         if urls := context.fetcher.urls(parts[0].uploads):
             await context.threads.run(caller.owner, _find_inputs, context, caller, parts, fetched)
-            fetched = await context.fetcher.fetch(urls, receipt)
-        job_request = await context.threads.run(caller.owner, _find_files, context, caller, parts, fetched)
+            with suspended():  # fetching has its own deadline
+                fetched = await context.fetcher.fetch(urls, receipt)
+        found = await context.threads.run(caller.owner, _find_inputs, context, caller, parts, fetched)
+        size = sum(row.size for row in found[1].values())
+        job_request = await context.threads.run(caller.owner, _check_files, context, caller, parts, *found, size=size)
         if not job_request.checked:
             await context.inspector.inspect(
                 "validate", caller.owner, job_request.inputs, job_request.rows, job_request.parameters
@@ -204,9 +209,10 @@ def _find_inputs(
     return inputs, rows
 
 
-def _find_files(context: Context, caller: Caller, parts: Parts, fetched: Mapping[str, str]) -> _JobRequest:
-    """Find the files of a job, and run all checks that need no inspection process."""
-    inputs, rows = _find_inputs(context, caller, parts, fetched)
+def _check_files(
+    context: Context, caller: Caller, parts: Parts, inputs: list[dict[str, Any]], rows: dict[str, BlobRow]
+) -> _JobRequest:
+    """Run all checks of a job's files that need no inspection process."""
     _, parameters, webhook = parts
     checked = context.inspector.recall("validate", caller.owner, inputs, parameters) is not None
     if not checked:
@@ -376,7 +382,7 @@ async def list_jobs(
         following = page[most - 1].row.id if len(page) > most else None  # one more shows if more follow
         return [job_view(job) for job in page[:most]], following
 
-    return await send_list("jobs", read, cursor, limit, context.threads, caller.owner, at_once=16)
+    return await send_list("jobs", read, cursor, limit, context.readers, caller.owner, at_once=16)
 
 
 @router.get(
@@ -528,10 +534,14 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
     },
     operation_id="delete_job",
 )
-def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
+async def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
     """Delete a job that has ended, with its results."""
-    find(context, caller, job_id)
-    unused = context.store.jobs.delete(job_id, caller.owner)
+    check_id(job_id)
+    unused = await asyncio.to_thread(context.store.jobs.delete, job_id, caller.owner)
+    await context.receipts.remove(caller.owner, partial(_remove_files, context, job_id, unused))
+
+
+def _remove_files(context: Context, job_id: str, unused: Sequence[str]) -> None:
     context.artifacts.remove_job(job_id)
     context.blobs.remove(unused)
 

@@ -225,7 +225,8 @@ async def get_shared_file(
     conditions: ConditionsDep,
 ) -> Response:
     """Download a file of a shared result, whole or in ranges. Only what the viewer shows can be read."""
-    response = await send_file(request, await asyncio.to_thread(_find_file, context, shared, name), conditions)
+    file = await asyncio.to_thread(_find_file, context, shared, name)
+    response = await send_file(request, context.threads, file, conditions)
     response.headers["Referrer-Policy"] = _SECRET["Referrer-Policy"]
     return response
 
@@ -251,4 +252,4 @@ def _find_file(context: Context, shared: Shared, name: str) -> SentFile:
         check, read = partial(check_artifact, context, row), partial(context.artifacts.read, row.location)
         sha256, size = row.sha256, row.size
     values: dict[str, Any] = {"kind": "application/octet-stream", "inline": False, "policy": _POLICY}
-    return SentFile(sha256=sha256, size=size, name=name, check=check, read=read, **values)
+    return SentFile(owner=shared.job.owner, sha256=sha256, size=size, name=name, check=check, read=read, **values)

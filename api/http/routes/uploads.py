@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from email.utils import format_datetime
+from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -180,7 +182,7 @@ def describe_uploads(context: ContextDep) -> Response:
         ),
     },
 )
-def create_upload(
+async def create_upload(
     context: ContextDep,
     caller: CallerDep,
     length: LengthHeader,
@@ -201,14 +203,21 @@ def create_upload(
         raise FileTooLargeError(length, limit)
     if not length:
         raise EmptyFileError
-    context.blobs.ensure_space(length)
     name = staged_name("upload", uploaded_name(metadata))
     seconds = context.settings.upload_hours * 3600
-    row = context.store.inputs.create_upload(
-        caller.owner, length, name, metadata, seconds, idempotency_key, caller.quotas
+    await context.threads.run(caller.owner, context.blobs.ensure_space, length)
+    row = await asyncio.to_thread(
+        context.store.inputs.create_upload,
+        caller.owner,
+        length,
+        name,
+        metadata,
+        seconds,
+        idempotency_key,
+        caller.quotas,
     )
     if row.sha256 is None:  # a repeated request may refer to an upload that is already complete
-        context.blobs.start_upload(row.id)
+        await context.threads.run(caller.owner, context.blobs.start_upload, row.id)
     response_headers = {
         **_HEADERS,
         "Location": address(f"/v1/uploads/{row.id}"),
@@ -323,7 +332,8 @@ async def append_upload(
     check_offset(row, offset)
     expires = row.expires_at
     if row.sha256 is None and row.offset == row.length:  # the service died before it recorded the upload as complete
-        await asyncio.to_thread(context.blobs.finish_upload, row, context.settings.upload_hours * 3600)
+        finish, seconds = context.blobs.finish_upload, context.settings.upload_hours * 3600
+        await context.threads.run(caller.owner, finish, row, seconds, size=row.length)
     elif row.sha256 is None:
         expires = await append_body(request, context, row, expected)
     else:
@@ -346,13 +356,17 @@ async def append_upload(
     },
     operation_id="delete_upload",
 )
-def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
+async def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """Cancel an upload, or delete a finished one. Jobs that use it keep their file."""
-    _find_upload(context, caller.owner, upload_id)
-    unused = context.store.inputs.delete_upload(upload_id, caller.owner)
+    await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
+    unused = await asyncio.to_thread(context.store.inputs.delete_upload, upload_id, caller.owner)
+    await context.receipts.remove(caller.owner, partial(_remove_files, context, upload_id, unused))
+    return Response(status_code=204, headers=_HEADERS)
+
+
+def _remove_files(context: Context, upload_id: str, unused: Sequence[str]) -> None:
     context.blobs.discard_upload(upload_id)
     context.blobs.remove(unused)
-    return Response(status_code=204, headers=_HEADERS)
 
 
 def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:

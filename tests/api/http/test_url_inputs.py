@@ -24,12 +24,12 @@ from api.client import Client
 from api.client.answers import RequestError
 from api.http.fetching import Fetcher, file_name
 from api.http.receipts import Receipts
-from api.http.threads import OwnerThreads
 from service import outgoing
 from service.errors import BusyError, FetchError, InvalidUrlError, QuotaError, ServiceError, TooLargeError, UrlsOffError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.stored_blobs import open_blobs
+from service.files.threads import FileThreads
 from service.outgoing import parse_origins
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -161,7 +161,7 @@ def fetch(stored: Stored, *urls: str, requests: int = 1, bytes_quota: int | None
     quotas = Quotas(stored_bytes=bytes_quota)
 
     async def request(fetcher: Fetcher) -> list[str]:
-        async with Receipts(stored.store.inputs, stored.blobs).of("me", quotas) as receipt:
+        async with Receipts(stored.store.inputs, stored.blobs, fetcher.threads).of("me", quotas) as receipt:
             checked = fetcher.urls([(index, "style", url) for index, url in enumerate(urls)])
             digests = await fetcher.fetch(checked, receipt)
             for sha256 in digests.values():
@@ -170,7 +170,7 @@ def fetch(stored: Stored, *urls: str, requests: int = 1, bytes_quota: int | None
             return [digests[url] for url in urls]
 
     async def all_requests() -> list[list[str]]:
-        fetcher = Fetcher(settings, stored.blobs, OwnerThreads())
+        fetcher = Fetcher(settings, stored.blobs, FileThreads(PATIENCE))
         return await asyncio.gather(*(request(fetcher) for _ in range(requests)))
 
     try:

@@ -16,7 +16,8 @@ import pytest
 from tests.http_servers import serve
 
 #: "slow-down": 503, S3's response to too many requests. "not-implemented": 501. "reset": the connection is closed
-#: before the response. "cut-off": it is closed in the middle of the response. "silence": there is no response at all.
+#: before the response. "cut-off": it is closed in the middle of the response. "silence": there is no response until
+#: `heal`.
 Fault = Literal["slow-down", "not-implemented", "reset", "cut-off", "silence"]
 
 _SLOW_DOWN = (
@@ -60,6 +61,7 @@ class FaultyS3:
         self.asked: list[tuple[str, str]] = []
         self._faults: list[tuple[Fault, Callable[[str, str], bool]]] = []
         self._lock = threading.Lock()
+        self._healed = threading.Event()
         faulty = self
         client = httpx.Client(base_url=behind, timeout=60)
 
@@ -84,14 +86,17 @@ class FaultyS3:
         """Inject a fault into the next `times` requests for which `which(method, path)` is true."""
         with self._lock:
             self._faults = [(fault, which)] * times
+            self._healed = threading.Event()
 
     def heal(self) -> None:
         """Forward all requests from now on."""
         with self._lock:
             self._faults = []
+            self._healed.set()
 
     def close(self) -> None:
         """Close the proxy."""
+        self.heal()
         self._server.shutdown()
         self._server.server_close()
 
@@ -111,7 +116,7 @@ class FaultyS3:
         elif fault == "reset":
             self._reset(handler)
         elif fault == "silence":
-            threading.Event().wait(20)
+            self._healed.wait()
             handler.close_connection = True
         else:
             headers = {name: value for name, value in handler.headers.items() if name.lower() != "connection"}

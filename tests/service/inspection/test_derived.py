@@ -14,6 +14,7 @@ from service.errors import QuotaError, TooManyBlendsError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.files.staging import RESULT
+from service.files.threads import FileThreads
 from service.inspection.derived import MOST_BLENDS, Blend, DerivedFiles
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -23,6 +24,7 @@ from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import JobRow
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.ply import PLY
+from tests.api.service import PATIENCE
 from tests.small_scenes import wall, write_files
 
 
@@ -52,7 +54,7 @@ class Stored:
         return self.store.jobs.get(job.id, owner)
 
     def derived(self) -> DerivedFiles:
-        return DerivedFiles(self.settings, self.store, self.blobs, self.artifacts)
+        return DerivedFiles(self.settings, self.store, self.blobs, self.artifacts, FileThreads(PATIENCE))
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from PIL import Image
 
 from service.errors import RefusedInputError
 from service.files.blobs import BlobFolder
+from service.files.threads import FileThreads
 from service.inspection.inspector import InspectionProcess, Inspector, Show
 from service.inspection.process import WORK, _check_frames_have_sizes, _memory_besides_reading
 from service.parameters import JobParameters
@@ -22,6 +23,7 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from sgsst_core.errors import CameraError
 from sgsst_core.files.scene_file import write_scene
+from tests.api.service import PATIENCE
 from tests.small_scenes import wall, write_files
 
 
@@ -38,7 +40,7 @@ def inspecting(folder: Path, **limits: Any) -> Iterator[Inspect]:
     (folder / "data").mkdir(exist_ok=True)
     store = open_store(settings)
     blobs = BlobFolder(settings.folder, store.inputs, 0)
-    inspector = Inspector(settings, store, blobs)
+    inspector = Inspector(settings, store, blobs, FileThreads(PATIENCE))
 
     def inspect(files: dict[str, Path], show: Show = lambda now: None, owner: str = "local") -> dict[str, Any]:
         digests = {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}

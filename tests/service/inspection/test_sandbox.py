@@ -20,11 +20,13 @@ import pytest
 import sgsst_core
 from service.errors import RefusedInputError
 from service.files.blobs import BlobFolder
+from service.files.threads import FileThreads
 from service.inspection import inspector, sandbox
 from service.inspection.inspector import Inspector
 from service.inspection.process import MAX_REPORTS
 from service.settings import ServiceSettings
 from service.store import open_store
+from tests.api.service import PATIENCE
 from tests.service.inspection import attack
 from tests.service.inspection.test_limits import Inspect, inspecting
 from tests.small_scenes import wall, write_files
@@ -214,11 +216,11 @@ def test_missing_kernel_features_are_logged(
     store = open_store(settings)
     blobs = BlobFolder(settings.folder, store.inputs, 0)
     try:
-        Inspector(settings, store, blobs)
+        Inspector(settings, store, blobs, FileThreads(PATIENCE))
         assert not caplog.records
         monkeypatch.setattr(sandbox, "_landlock_version", lambda: 0)
         monkeypatch.setattr(sandbox, "_has_seccomp", lambda: False)
-        Inspector(settings, store, blobs)
+        Inspector(settings, store, blobs, FileThreads(PATIENCE))
     finally:
         store.close()
     first, second = (record.getMessage() for record in caplog.records)
