@@ -14,6 +14,7 @@ from prometheus_client.registry import Collector
 
 from service.store import Store
 from service.store.database import BUCKETS
+from service.store.retries import Cause
 from service.store.states import AttemptOutcome, JobStatus
 
 
@@ -33,7 +34,11 @@ _COUNTERS = {
     "sgsst_attempts_ended": _Counter(
         "Attempts that have ended, by outcome.", "outcome", tuple(map(str, AttemptOutcome))
     ),
-    "sgsst_outages": _Counter("Attempts that failed because of a machine, the network or the file store."),
+    "sgsst_outages": _Counter(
+        "Attempts that ended without the job's doing, by cause.",
+        "cause",
+        tuple(cause for cause in Cause if cause not in (Cause.JOB, Cause.DISPATCHER)),
+    ),
     "sgsst_lease_expirations": _Counter("Leases that expired because their dispatcher did not renew them."),
 }
 _HISTOGRAMS = {

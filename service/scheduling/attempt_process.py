@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Any
 
 from service.files.staging import Staged
 from service.parameters import JobParameters
-from service.scheduling.endings import OUTAGE, Message, is_outage
+from service.scheduling.endings import OUTAGE, Message, cause_of_error, outage
 from service.scheduling.store_workplace import StoreWorkplace
 from service.store.leases import Published
+from service.store.retries import Cause
 from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ class AttemptProcess:
             result = self._run_on_ranks() if self._task.workers > 1 or self._task.cluster else self._run_alone()
         except Exception as error:
             send(failure(error))
-            if is_outage(error):
+            if cause_of_error(error) != Cause.JOB:
                 log(OUTAGE["message"])  # the details are for the operator only
             else:
                 traceback.print_exc()
@@ -248,9 +249,10 @@ def failure(error: Exception) -> Message:
     """Return the message for an error; the error is permanent if a retry would fail in the same way."""
     from sgsst_core.errors import DivergedError, InvalidInputError, SgsstError, is_out_of_memory
 
-    if is_outage(error):
+    cause = cause_of_error(error)
+    if cause != Cause.JOB:
         detail = "".join(traceback.format_exception(error))
-        return {"kind": "failed", "error": OUTAGE, "permanent": False, "detail": detail}
+        return {"kind": "failed", "error": outage(cause), "permanent": False, "detail": detail}
     code = error.code if isinstance(error, SgsstError) else "out-of-memory" if is_out_of_memory(error) else "internal"
     message = (
         str(error) if isinstance(error, SgsstError) or is_out_of_memory(error) else f"{type(error).__name__}: {error}"

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import errno
+import re
 import signal
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal, TypedDict
 
+from service.errors import DatabaseUnavailableError, NoSpaceError, StoreError
+from service.store.retries import Cause
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
 
@@ -45,24 +48,40 @@ class StopRequest(StrEnum):
     ABANDON = "abandon"
 
 
-#: Error shown to the job's user if a machine, a network or the file store has failed.
+#: Error of an attempt that has failed because of a machine, a network or the file store, without the `cause`.
 OUTAGE = {
     "code": InfrastructureError.code,
     "message": "A machine of the service, its network or its store of files has failed. The job is tried again.",
 }
-#: Error numbers of machine faults: a full, broken or read-only disk, or an unreachable file system.
-_MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.ENOTCONN, errno.ENODEV)
+#: Causes by type of error; the first match counts. Jobs write to folders of the service, so output errors are the
+#: disk's, and only an operator can install missing weights.
+_CAUSES: tuple[tuple[type[BaseException], Cause], ...] = (
+    (NoSpaceError, Cause.DISK),
+    (StoreError, Cause.STORE),
+    (DatabaseUnavailableError, Cause.DATABASE),
+    (OutputError, Cause.DISK),
+    (InfrastructureError, Cause.MACHINE),
+    (WeightsError, Cause.MACHINE),
+)
+#: Error numbers of a full, broken or read-only disk, and of a file system that cannot be reached.
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.ENOTCONN, errno.ENODEV)
+#: Text of a full disk in the errors of libraries that drop the number, such as safetensors and NumPy.
+_FULL = re.compile(r"No space left on device|Disk quota exceeded|requested and \d+ written")
 
 
-def is_outage(error: BaseException) -> bool:
-    """Return whether an error is the fault of a machine, a network or a store rather than of the job.
+def cause_of_error(error: BaseException) -> Cause:
+    """Return what an error that ended an attempt is the fault of."""
+    known = next((cause for kind, cause in _CAUSES if isinstance(error, kind)), None)
+    if known is not None:
+        return known
+    if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
+        return Cause.DISK
+    return Cause.DISK if _FULL.search(str(error)) else Cause.JOB
 
-    Output errors count, because jobs write to folders of the service. Missing network weights count too, because only
-    an operator can install them.
-    """
-    if isinstance(error, OSError):
-        return error.errno in _MACHINE_ERRORS
-    return isinstance(error, InfrastructureError | OutputError | WeightsError)
+
+def outage(cause: Cause) -> dict[str, Any]:
+    """Return the recorded error of an attempt that ended for another cause than the job."""
+    return {**OUTAGE, "cause": cause}
 
 
 @dataclass(frozen=True)
@@ -115,7 +134,9 @@ def attempt_ending(
     crash = _crash_error(exit_code, log_tail)
     if cluster and exit_code > 0:
         return Ending(
-            AttemptOutcome.FAILED, OUTAGE, detail="\n".join(text for text in (crash["message"], log_tail) if text)
+            AttemptOutcome.FAILED,
+            outage(Cause.MACHINE),
+            detail="\n".join(text for text in (crash["message"], log_tail) if text),
         )
     return Ending(AttemptOutcome.FAILED, crash)
 

@@ -15,7 +15,7 @@ from service.errors import LeaseLostError, ServiceError
 from service.files.artifacts import Artifacts
 from service.parameters import stored_parameters
 from service.scheduling.child_process import ChildProcess
-from service.scheduling.endings import OUTAGE, Ending, Message, StopRequest, attempt_ending, is_outage
+from service.scheduling.endings import Ending, Message, StopRequest, attempt_ending, cause_of_error, outage
 from service.scheduling.packing import Grant
 from service.scheduling.progress import ProgressWriter
 from service.scheduling.publishing import Publisher
@@ -24,6 +24,7 @@ from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.leases import Lease, Published
+from service.store.retries import Cause, cause_of
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import SettingsError
 
@@ -109,8 +110,9 @@ class RunningAttempt:
                 if isinstance(error, ServiceError)
                 else {"code": "internal", "message": f"{type(error).__name__}: {error}"}
             )
+            cause = cause_of_error(error)
             with contextlib.suppress(Exception):
-                self._fail(OUTAGE if is_outage(error) else reported, permanent=False)
+                self._fail(reported if cause == Cause.JOB else outage(cause), permanent=False)
         finally:
             self._kill()
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -217,6 +219,6 @@ class RunningAttempt:
     def _fail(self, error: dict[str, Any], *, permanent: bool) -> None:
         retried = self._store.leases.fail(self.lease, error, permanent=permanent)
         outcome = "job will be retried" if retried else "job failed"
-        _log.warning("%s: %s", outcome, error["message"], extra=self.lease.log_fields)
+        _log.warning("%s: cause=%s: %s", outcome, cause_of(error), error["message"], extra=self.lease.log_fields)
         if not retried:
             self._publisher.sweep()

@@ -21,9 +21,18 @@ from service.store.database import Database, count, observe, upsert
 from service.store.history import add_point
 from service.store.queue import LOST, WAITING, next_job, next_jobs, reserve, reserved_by
 from service.store.quotas import count_gpu_seconds
-from service.store.retries import FailureCount, RetryPolicy, Verdict
+from service.store.retries import DISPATCHER_LOST, MAX_LOSSES, Cause, FailureCount, RetryPolicy, Verdict, cause_of
 from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
-from service.store.tables import ArtifactRow, AttemptRow, EventRow, JobRow, ReservationRow, TurnRow
+from service.store.tables import (
+    ArtifactRow,
+    AttemptRow,
+    DispatcherRow,
+    EventRow,
+    JobRow,
+    ProgressPointRow,
+    ReservationRow,
+    TurnRow,
+)
 from sgsst_core.errors import InfrastructureError
 
 #: Expiry of a lease whose dispatcher is known to be dead.
@@ -32,8 +41,8 @@ EXPIRED = 0.0
 MAX_PROGRESS_EVENTS = 200
 #: Prefix of files that only clients of an unfinished job need. They are removed once it has succeeded.
 LIVE = "live/"
-#: Maximum number of past attempts counted for the retry delay: by then the delay is at its maximum.
-_MAX_OUTAGES = 20
+#: Maximum number of past attempts that the retry policy looks at: by then the delay is at its maximum.
+_MAX_CAUSES = 2 * MAX_LOSSES
 #: Maximum number of candidates for backfilling, each from a different owner.
 _MAX_BACKFILL_CANDIDATES = 16
 
@@ -124,7 +133,7 @@ class Leases:
                 if lost and not is_lost(job):
                     skipped.append(job.id)
                     continue
-                if lost and self._close_lost(session, job, now):
+                if lost and self._close_lost(session, job, dispatcher, now):
                     continue
                 if fits(job):
                     return self._lease(session, job, dispatcher, now)
@@ -292,7 +301,7 @@ class Leases:
 
         Args:
             lease: Lease of the job.
-            error: `code` and `message`.
+            error: `code` and `message`, and the `cause` of an outage (`retries.Cause`).
             permanent: Whether another attempt would fail in the same way.
 
         Returns:
@@ -329,9 +338,12 @@ class Leases:
             _close_attempt(session, job, AttemptOutcome.CANCELED, None, now)
             end(session, job, Transition.STOP, now, self._retention)
 
-    def _close_lost(self, session: Session, job: JobRow, now: float) -> bool:
-        """Close the attempt of a lost dispatcher; return whether this has ended the job."""
-        error = {"code": "dispatcher-lost", "message": "The process that ran the job was not heard of again."}
+    def _close_lost(self, session: Session, job: JobRow, dispatcher: str, now: float) -> bool:
+        """Close an attempt whose lease `dispatcher` has found expired; return whether this has ended the job."""
+        error = {"code": DISPATCHER_LOST, "message": "The process that ran the job was not heard of again."}
+        if job.lease_owner == dispatcher or self._lives(session, job):
+            message = "The process that ran the job could not reach the database in time. The job is tried again."
+            error = {"code": InfrastructureError.code, "message": message, "cause": Cause.DATABASE}
         verdict = self._close(session, job, AttemptOutcome.LOST, error, now)
         count(session, "sgsst_lease_expirations_total")
         if verdict.transition == Transition.REQUEUE:
@@ -340,6 +352,12 @@ class Leases:
             job.error = error | {"message": f"{error['message']} This was attempt {job.attempt}."}
         end(session, job, verdict.transition, now, self._retention)
         return True
+
+    def _lives(self, session: Session, job: JobRow) -> bool:
+        """Return whether the dispatcher of an expired lease has reported after it failed to renew the lease."""
+        owner = session.get(DispatcherRow, job.lease_owner) if job.lease_owner else None
+        expired_at = job.lease_expires_at or EXPIRED
+        return owner is not None and expired_at > EXPIRED and owner.seen_at > expired_at - self._seconds / 2
 
     def _close(
         self,
@@ -354,11 +372,10 @@ class Leases:
         """Close an attempt and count it if it failed; return the verdict on the job."""
         _close_attempt(session, job, outcome, error, now)
         before, status = FailureCount(job.failures, job.failed_step), JobStatus(job.status)
-        if error is not None and error["code"] == InfrastructureError.code:
-            count(session, "sgsst_outages_total")
-            verdict = self._policy.after_outage(status, before, _outages(session, job))
-        else:
-            verdict = self._policy.after_attempt(outcome, status, before, job.saved_step, permanent=permanent)
+        causes = _causes(session, job) or [cause_of(error)]
+        if causes[0] not in (Cause.JOB, Cause.DISPATCHER):
+            count(session, "sgsst_outages_total", f'cause="{causes[0]}"')
+        verdict = self._policy.after_attempt(outcome, status, before, job.saved_step, causes, permanent=permanent)
         job.failures, job.failed_step = verdict.count.failures, verdict.count.failed_step
         return verdict
 
@@ -417,15 +434,16 @@ def _publish(session: Session, job: JobRow, files: Sequence[Published], now: flo
     return unused
 
 
-def _outages(session: Session, job: JobRow) -> int:
-    """Return the number of most recent consecutive attempts that ended by an outage."""
-    query = select(AttemptRow.error).where(AttemptRow.job_id == job.id).order_by(AttemptRow.number.desc())
-    count = 0
-    for error in session.scalars(query.limit(_MAX_OUTAGES)):
-        if not error or error["code"] != InfrastructureError.code:
-            break
-        count += 1
-    return count
+def _causes(session: Session, job: JobRow) -> list[Cause]:
+    """Return the causes of the ends of the latest attempts, newest first, back to the last one that made a step."""
+    attempts = select(AttemptRow.number, AttemptRow.error).where(AttemptRow.job_id == job.id)
+    progressed = session.scalar(
+        select(func.max(ProgressPointRow.attempt)).where(
+            ProgressPointRow.job_id == job.id, ProgressPointRow.attempt < job.attempt
+        )
+    )
+    newer = attempts.where(AttemptRow.number > (progressed or 0)).order_by(AttemptRow.number.desc())
+    return [cause_of(error) for _, error in session.execute(newer.limit(_MAX_CAUSES)).all()]
 
 
 def _count_gpus(session: Session, job: JobRow, attempt: AttemptRow, now: float) -> None:

@@ -1,13 +1,49 @@
-"""Retry policy for jobs whose attempt ended without a result, as pure functions for `service.store.leases`."""
+"""Retry policy for jobs whose attempt ended without a result, as pure functions for `service.store.leases`.
+
+Only the job's own failures count against it. An attempt that a machine, the network, the database, the disk or the file
+store has ended is repeated until it succeeds.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
 
 from service.store.states import AttemptOutcome, JobStatus, Transition
+from sgsst_core.errors import InfrastructureError
 
 #: Maximum delay between attempts in seconds; the delay doubles up to this limit.
 MAX_RETRY_SECONDS = 300.0
+#: Number of attempts in a row without a step that were lost with their dispatcher, after which a job fails. The
+#: dispatcher may have died of the job itself: some container runtimes end all processes of a container that has run out
+#: of memory.
+MAX_LOSSES = 10
+#: Code of the error of an attempt that was lost with its dispatcher.
+DISPATCHER_LOST = "dispatcher-lost"
+
+
+class Cause(StrEnum):
+    """Cause of an attempt's end without a result."""
+
+    #: The job itself: its files or settings, an error of the method, or a crash of its process.
+    JOB = "job"
+    STORE = "store"
+    DISK = "disk"
+    DATABASE = "database"
+    #: A machine or the network between machines.
+    MACHINE = "machine"
+    #: The dispatcher's process has ended, or its machine.
+    DISPATCHER = "dispatcher"
+
+
+def cause_of(error: Mapping[str, Any] | None) -> Cause:
+    """Return the cause of an attempt's end from its recorded error."""
+    code = (error or {}).get("code")
+    if code == DISPATCHER_LOST:
+        return Cause.DISPATCHER
+    return Cause((error or {}).get("cause", Cause.MACHINE)) if code == InfrastructureError.code else Cause.JOB
 
 
 @dataclass(frozen=True)
@@ -69,6 +105,7 @@ class RetryPolicy:
         status: JobStatus,
         count: FailureCount,
         saved_step: int | None,
+        causes: Sequence[Cause] = (Cause.JOB,),
         *,
         permanent: bool = False,
     ) -> Verdict:
@@ -76,6 +113,7 @@ class RetryPolicy:
 
         Args:
             outcome: Outcome of the attempt.
+            causes: Cause of the attempt's end, then those of earlier attempts back to the last one that made a step.
             status: Status of the job while the attempt ran.
             count: Count of failures before this attempt.
             saved_step: Last saved step of the job; None for no step.
@@ -85,25 +123,16 @@ class RetryPolicy:
             return Verdict(Transition.STOP, count)
         if outcome == AttemptOutcome.RELEASED:
             return Verdict(Transition.REQUEUE, count)
-        count = count.with_failure(saved_step)
-        if permanent or count.failures >= self.max_attempts:
+        if causes[0] == Cause.JOB:
+            count = count.with_failure(saved_step)
+            failed, repeated = permanent or count.failures >= self.max_attempts, count.failures
+        else:
+            failed = list(causes[:MAX_LOSSES]) == [Cause.DISPATCHER] * MAX_LOSSES
+            repeated = next((number for number, cause in enumerate(causes) if cause == Cause.JOB), len(causes))
+        if failed:
             return Verdict(Transition.FAIL, count)
         # a lost attempt has already cost the duration of a lease
-        return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else self._wait(count.failures))
-
-    def after_outage(self, status: JobStatus, count: FailureCount, outages: int) -> Verdict:
-        """Decide when a job is retried after a machine, the network or the file store failed.
-
-        This does not count as a failure of the job. It is retried with growing delays until it succeeds or is canceled.
-
-        Args:
-            status: Status of the job while the attempt ran.
-            count: Count of failures before this attempt; it does not change.
-            outages: Number of consecutive attempts that ended in an outage, including this one.
-        """
-        if status == JobStatus.CANCELING:
-            return Verdict(Transition.STOP, count)
-        return Verdict(Transition.REQUEUE, count, self._wait(outages))
+        return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else self._wait(repeated))
 
     def _wait(self, times: int) -> float:
         return min(self.retry_seconds * 2.0 ** max(times - 1, 0), MAX_RETRY_SECONDS)

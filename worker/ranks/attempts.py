@@ -11,9 +11,9 @@ import secrets
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from sgsst_core.errors import RanksFailedError
+from sgsst_core.errors import ClusterAwayError, RanksFailedError
 from worker.options import RunOptions
 from worker.ranks.cluster import Cluster
 from worker.ranks.failure_policy import FailedAttempt, Failure, GiveUp, RaiseError, decide, first_line
@@ -174,7 +174,7 @@ class _Attempts:
             if isinstance(decision, RaiseError):
                 raise decision.error
             if isinstance(decision, GiveUp):
-                raise RanksFailedError(decision.sentence) from failure.error
+                raise (ClusterAwayError if decision.outage else RanksFailedError)(decision.sentence) from failure.error
             self._listener.happened(decision.sentence)
             if self._listener.stop():
                 return self._ended(None)
@@ -209,7 +209,9 @@ class _Attempts:
             start_ranks(self._group, self._workers, self._scene_bytes(), self._options.actor, self._task)
             return self._watch()
         except (ray.exceptions.RayError, ConnectionError) as error:
-            raise AttemptFailedError(Failure("loss", f"Ray failed: {first_line(error)}", error)) from error
+            own = isinstance(error, ray.exceptions.RayTaskError | ray.exceptions.OutOfMemoryError)
+            kind: Literal["loss", "machine"] = "loss" if own else "machine"
+            raise AttemptFailedError(Failure(kind, f"Ray failed: {first_line(error)}", error)) from error
         finally:
             self._lost_at = time.monotonic()
             end_ranks(self._group, self._cluster, self._options.workplace)

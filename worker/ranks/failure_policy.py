@@ -22,13 +22,13 @@ class Failure:
     """Cause of a failed attempt.
 
     Attributes:
-        kind: "job" for an error of the job itself; "loss" for ranks that died, stopped responding or failed for another
-            reason.
+        kind: "job" for an error of the job itself; "machine" for ranks that were lost with their machine, the network
+            or Ray; "loss" for ranks that died or failed for another reason.
         reason: Short description without a full stop.
         error: Error that a rank raised; None if it died before it raised.
     """
 
-    kind: Literal["job", "loss"]
+    kind: Literal["job", "loss", "machine"]
     reason: str
     error: Exception | None = None
 
@@ -64,9 +64,13 @@ class RaiseError:
 
 @dataclass(frozen=True)
 class GiveUp:
-    """Decision to end the job because another attempt is unlikely to help; `sentence` states the reason."""
+    """Decision to end the job because another attempt is unlikely to help; `sentence` states the reason.
+
+    The job is not to blame (`outage`) if a machine, the network or Ray has failed.
+    """
 
     sentence: str
+    outage: bool = False
 
 
 Decision = TryAgain | RaiseError | GiveUp
@@ -97,12 +101,14 @@ def decide(attempts: Sequence[FailedAttempt]) -> Decision:
     if failure.error is not None and not last.progressed and _came_again(attempts):
         if isinstance(failure.error, SgsstError | MemoryError | RuntimeError):
             return RaiseError(failure.error)
-        return GiveUp(f"{failure.reason}; the same happened twice at step {last.last_step}.")
+        sentence = f"{failure.reason}; the same happened twice at step {last.last_step}."
+        return GiveUp(sentence, failure.kind == "machine")
     in_vain = _in_vain(attempts)
     if in_vain >= MOST_ATTEMPTS:
         farthest = max(attempt.last_step for attempt in attempts)
         return GiveUp(
-            f"{in_vain} attempts in a row came no further than step {farthest}. The last one: {failure.reason}."
+            f"{in_vain} attempts in a row came no further than step {farthest}. The last one: {failure.reason}.",
+            failure.kind == "machine",
         )
     return TryAgain(f"{failure.reason}, after step {last.last_step}.")
 

@@ -162,6 +162,8 @@ def _place(rank: RankHandle) -> RankPlace:
 POLL_SECONDS = 0.25
 #: Seconds to wait for a response that Ray reports as ready.
 _FETCH_SECONDS = 60.0
+#: Reason of a rank's death with its machine.
+_MACHINE_GONE = "its machine is gone"
 #: Seconds to wait for the root cause after a rank has lost its connection to another rank.
 _GRACE = 3.0
 
@@ -199,7 +201,8 @@ def _take_answer(group: RankGroup, rank: RankHandle, poll: Any) -> None:
     except ray.exceptions.ActorUnavailableError:  # may be temporary: the timeout decides
         return
     except ray.exceptions.ActorDiedError as error:
-        raise _lost(f"{group.name_of(rank)} was lost: {_reason_of_death(error)}") from error
+        reason = _reason_of_death(error)
+        raise _lost(f"{group.name_of(rank)} was lost: {reason}", machine=reason == _MACHINE_GONE) from error
     except ray.exceptions.RayActorError as error:
         raise _lost(f"{group.name_of(rank)} was lost: {first_line(error)}") from error
 
@@ -245,7 +248,7 @@ def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle)
 def _look_for_reasons(group: RankGroup, cluster: Cluster) -> None:
     """Raise an error if Ray has ended, or if a rank has failed for a reason other than the loss of another rank."""
     if not cluster.alive():
-        raise _lost("Ray's own processes on this machine were lost")
+        raise _lost("Ray's own processes on this machine were lost", machine=True)
     for rank in group.handles:
         outcome = rank.outcome
         if outcome is None or outcome.kind != "failed" or outcome.echo:
@@ -258,11 +261,12 @@ def _look_for_reasons(group: RankGroup, cluster: Cluster) -> None:
 
 
 def _silent(group: RankGroup, rank: RankHandle) -> AttemptFailedError:
-    return _lost(f"{group.name_of(rank)} was lost: it has not answered for {rank.silence:.0f} s")
+    remote = rank.place is not None and rank.place.process.home != home()
+    return _lost(f"{group.name_of(rank)} was lost: it has not answered for {rank.silence:.0f} s", machine=remote)
 
 
-def _lost(reason: str, error: Exception | None = None) -> AttemptFailedError:
-    return AttemptFailedError(Failure("loss", reason, error))
+def _lost(reason: str, error: Exception | None = None, *, machine: bool = False) -> AttemptFailedError:
+    return AttemptFailedError(Failure("machine" if machine else "loss", reason, error))
 
 
 def _reason_of_death(error: Exception) -> str:
@@ -273,7 +277,7 @@ def _reason_of_death(error: Exception) -> str:
     if "SIGKILL" in text or "Worker unexpectedly exits" in text or "connection error code" in text:
         return "its process was killed"
     if "node" in text.lower() and ("died" in text or "dead" in text):
-        return "its machine is gone"
+        return _MACHINE_GONE
     return first_line(error)
 
 

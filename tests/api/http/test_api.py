@@ -1026,7 +1026,7 @@ def test_metrics_count_attempts_by_outcome(tmp_path: Path, files: dict[str, byte
         }
         # The first waited briefly, the other three (one of them twice) a thousand seconds.
         assert (waits[900.0], waits[1800.0], waits[float("inf")]) == (1, 4, 4)
-        assert samples["sgsst_job_seconds_count"] == samples["sgsst_outages_total"] == "0.0"
+        assert samples["sgsst_job_seconds_count"] == samples['sgsst_outages_total{cause="disk"}'] == "0.0"
         assert samples["sgsst_iterations_per_second"] == "5.0"
         assert not re.search(r"job_[0-9a-f]{11}", text), "metrics name no job"
         store.close()

@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
 import httpx
@@ -31,9 +31,12 @@ from tests.small_scenes import wall, write_files
 #: Concurrent downloads of one key: more than the API has threads for.
 MANY = 60
 
+#: Settings of a service whose files can hang, and functions that make them hang and respond again.
+Hanging = tuple[dict[str, str], Callable[[], None], Callable[[], None]]
+
 
 @contextmanager
-def hanging_store(folder: Path) -> Iterator[tuple[dict[str, str], Callable[[], None], Callable[[], None]]]:
+def hanging_store(folder: Path) -> Iterator[Hanging]:
     """Provide settings with a store that can hang, and functions that make it hang and answer again."""
     with s3_server() as url:
         s3 = FaultyS3(url)
@@ -44,7 +47,7 @@ def hanging_store(folder: Path) -> Iterator[tuple[dict[str, str], Callable[[], N
 
 
 @contextmanager
-def hanging_folder(folder: Path) -> Iterator[tuple[dict[str, str], Callable[[], None], Callable[[], None]]]:
+def hanging_folder(folder: Path) -> Iterator[Hanging]:
     """Do the same with a pipe in place of the scene: opening it takes until somebody else writes to it."""
     moved: list[tuple[Path, Path]] = []
 
@@ -58,17 +61,16 @@ def hanging_folder(folder: Path) -> Iterator[tuple[dict[str, str], Callable[[], 
             path, away = moved.pop()
             pipe = path.rename(path.with_suffix(".pipe"))
             away.rename(path)
-            while True:  # until no reader waits any longer
-                try:
-                    os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
-                except OSError:
-                    break
+            writers.callback(os.close, os.open(pipe, os.O_RDWR))  # no opening waits any longer
 
-    yield {}, hang, heal
+    with ExitStack() as writers:
+        yield {}, hang, heal
 
 
 @pytest.mark.parametrize("kind", [pytest.param(hanging_store, marks=pytest.mark.slow), hanging_folder])
-def test_hanging_files_delay_only_requests_that_need_them(tmp_path: Path, kind: Callable[..., ExitStack]) -> None:
+def test_hanging_files_delay_only_requests_that_need_them(
+    tmp_path: Path, kind: Callable[..., AbstractContextManager[Hanging]]
+) -> None:
     """The deadline is longer than the patience of the other key's client."""
     data = tmp_path / "data"
     ply, cameras, style = write_files(tmp_path, wall())

@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from service.errors import NoSpaceError, StoreError
+from service.errors import DatabaseBusyError, NoSpaceError, StoreError
 from service.scheduling.attempt_process import failure
-from service.scheduling.endings import OUTAGE, Ending, Message, StopRequest, attempt_ending, is_outage
+from service.scheduling.endings import Ending, Message, StopRequest, attempt_ending, cause_of_error, outage
+from service.store.retries import Cause, cause_of
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import (
     ClusterAwayError,
@@ -58,7 +59,7 @@ def test_requested_stop_is_not_a_failure(requested: StopRequest, outcome: str, l
 def test_process_ended_by_ray_is_an_outage() -> None:
     """When the cluster's head dies, Ray terminates connected processes with exit code 1 and without a message."""
     outcome = ending(None, None, 1, "raylet has died", cluster=True)
-    assert (outcome.outcome, outcome.error, outcome.permanent) == (AttemptOutcome.FAILED, OUTAGE, False)
+    assert (outcome.outcome, outcome.error, outcome.permanent) == (AttemptOutcome.FAILED, outage(Cause.MACHINE), False)
     assert outcome.detail == "The process that ran the job ended with code 1.\nraylet has died"
     for other in (ending(None, None, 1), ending(None, None, -signal.SIGKILL, cluster=True)):
         assert other.error is not None
@@ -92,25 +93,30 @@ def test_process_without_a_final_message_has_crashed(last: Message | None, code:
 
 
 @pytest.mark.parametrize(
-    ("error", "outage"),
+    ("error", "cause"),
     [
-        (StoreError("The store of files does not answer."), True),
-        (NoSpaceError("The disk is full."), True),
-        (OutputError("out/stylized.ply: cannot be written: No space left on device."), True),
-        (WeightsError("no VGG weights in /root/.cache/sgsst"), True),
-        (InfrastructureError("The folder is not on this machine."), True),
-        (OSError(errno.ENOSPC, "No space left on device"), True),
-        (OSError(errno.EINVAL, "Invalid argument"), False),
-        (ImageError("style.png: is not an image"), False),
-        (ClusterAwayError("The Ray cluster at head:6379 cannot be joined."), True),
-        (RanksFailedError("3 attempts in a row came no further than step 0."), False),
+        (StoreError("The store of files does not answer."), Cause.STORE),
+        (DatabaseBusyError(), Cause.DATABASE),
+        (NoSpaceError("The disk is full."), Cause.DISK),
+        (OutputError("out/stylized.ply: cannot be written: No space left on device."), Cause.DISK),
+        (OSError(errno.ENOSPC, "No space left on device"), Cause.DISK),
+        (OSError("24576 requested and 4096 written"), Cause.DISK),
+        (RuntimeError("Error while serializing: I/O error: No space left on device (os error 28)"), Cause.DISK),
+        (WeightsError("no VGG weights in /root/.cache/sgsst"), Cause.MACHINE),
+        (InfrastructureError("The folder is not on this machine."), Cause.MACHINE),
+        (ClusterAwayError("The Ray cluster at head:6379 cannot be joined."), Cause.MACHINE),
+        (OSError(errno.EINVAL, "Invalid argument"), Cause.JOB),
+        (ImageError("style.png: is not an image"), Cause.JOB),
+        (MemoryError("out of memory"), Cause.JOB),
+        (RanksFailedError("3 attempts in a row came no further than step 0."), Cause.JOB),
     ],
 )
-def test_machine_failures_are_reported_as_outages(error: Exception, outage: bool) -> None:
-    assert is_outage(error) == outage
-    message = failure(error)
-    assert (message["error"] == OUTAGE) == outage
-    assert (str(error) in message.get("detail", "")) == outage, "for the operator"
+def test_cause_of_each_error(error: Exception, cause: Cause) -> None:
+    assert cause_of_error(error) == cause
+    message, its_own = failure(error), cause == Cause.JOB
+    assert (message["error"] == outage(cause)) == (not its_own)
+    assert cause_of(message["error"]) == cause
+    assert (str(error) in message.get("detail", "")) == (not its_own), "for the operator"
     outcome = ending(None, message)
     assert (outcome.outcome, outcome.detail) == (AttemptOutcome.FAILED, message.get("detail"))
-    assert not (outage and outcome.permanent)
+    assert its_own or not outcome.permanent

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.store.retries import MAX_RETRY_SECONDS, FailureCount, RetryPolicy, Verdict
+from service.store.retries import MAX_LOSSES, MAX_RETRY_SECONDS, Cause, FailureCount, RetryPolicy, Verdict, cause_of
 from service.store.states import TRANSITIONS, AttemptOutcome, JobStatus, Transition
 
 POLICY = RetryPolicy(max_attempts=3, retry_seconds=5.0)
@@ -56,19 +56,61 @@ def test_progress_resets_the_retry_delay() -> None:
     assert decision == Verdict(Transition.REQUEUE, FailureCount(0, 20), POLICY.retry_seconds)
 
 
-def test_lost_attempt_is_retried_without_delay() -> None:
-    decision = POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.RUNNING, FailureCount(1, None), None)
-    assert decision == Verdict(Transition.REQUEUE, FailureCount(2, None), 0.0)
+#: Causes that never count against a job.
+OTHERS = [cause for cause in Cause if cause != Cause.JOB]
 
 
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (None, Cause.JOB),
+        ({"code": "crashed"}, Cause.JOB),
+        ({"code": "out-of-memory"}, Cause.JOB),
+        ({"code": "invalid-scene"}, Cause.JOB),
+        ({"code": "workers-failed"}, Cause.JOB),
+        ({"code": "infrastructure"}, Cause.MACHINE),
+        ({"code": "infrastructure", "cause": "disk"}, Cause.DISK),
+        ({"code": "infrastructure", "cause": "store"}, Cause.STORE),
+        ({"code": "infrastructure", "cause": "database"}, Cause.DATABASE),
+        ({"code": "dispatcher-lost"}, Cause.DISPATCHER),
+    ],
+)
+def test_cause_of_recorded_error(error: dict[str, str] | None, cause: Cause) -> None:
+    assert cause_of(error) == cause
+
+
+@pytest.mark.parametrize("cause", OTHERS)
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST])
-def test_attempts_without_progress_are_limited(outcome: AttemptOutcome) -> None:
-    count, delays = FRESH, []
+def test_only_own_failures_count(cause: Cause, outcome: AttemptOutcome) -> None:
+    count, waits = FailureCount(POLICY.max_attempts - 1, 10), []
+    for repeated in range(1, MAX_LOSSES):
+        verdict = POLICY.after_attempt(outcome, JobStatus.RUNNING, count, 10, [cause] * repeated + [Cause.JOB])
+        assert (verdict.transition, verdict.count) == (Transition.REQUEUE, count)
+        waits.append(verdict.wait)
+    lost = outcome == AttemptOutcome.LOST
+    assert waits[:3] == [0.0 if lost else POLICY.retry_seconds * factor for factor in (1, 2, 4)]
+    assert waits[-1] == (0.0 if lost else MAX_RETRY_SECONDS)
+    assert POLICY.after_attempt(outcome, JobStatus.CANCELING, count, 10, [cause]).transition == Transition.STOP
+
+
+@pytest.mark.parametrize("cause", OTHERS)
+def test_job_that_may_end_its_dispatchers_fails_at_last(cause: Cause) -> None:
+    """An outage never fails a job, however often it occurs."""
+    verdict = POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.STARTING, FRESH, None, [cause] * MAX_LOSSES)
+    assert verdict.transition == (Transition.FAIL if cause == Cause.DISPATCHER else Transition.REQUEUE)
+    mixed = [Cause.DISPATCHER, Cause.DATABASE] * MAX_LOSSES
+    assert POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.STARTING, FRESH, None, mixed).transition == (
+        Transition.REQUEUE
+    )
+
+
+def test_own_failures_without_progress_are_limited() -> None:
+    count, decisions = FRESH, []
     for _ in range(POLICY.max_attempts):
-        verdict = POLICY.after_attempt(outcome, JobStatus.STARTING, count, None)
-        delays.append(verdict.transition)
+        verdict = POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.STARTING, count, None)
+        decisions.append(verdict.transition)
         count = verdict.count
-    assert delays == [Transition.REQUEUE, Transition.REQUEUE, Transition.FAIL]
+    assert decisions == [Transition.REQUEUE, Transition.REQUEUE, Transition.FAIL]
 
 
 def test_permanent_failure_is_not_retried() -> None:
@@ -84,15 +126,3 @@ def test_every_verdict_is_an_allowed_transition(status: JobStatus, outcome: Atte
         count = FailureCount(failures, None)
         verdict = POLICY.after_attempt(outcome, status, count, None, permanent=permanent)
         assert status in TRANSITIONS[verdict.transition]
-
-
-def test_outage_does_not_count_as_a_failure() -> None:
-    count = FailureCount(2, 10)
-    waits = []
-    for outages in range(1, 12):
-        verdict = POLICY.after_outage(JobStatus.RUNNING, count, outages)
-        assert (verdict.transition, verdict.count) == (Transition.REQUEUE, count)
-        waits.append(verdict.wait)
-    assert waits[:3] == [POLICY.retry_seconds * factor for factor in (1, 2, 4)]
-    assert waits[-1] == MAX_RETRY_SECONDS
-    assert POLICY.after_outage(JobStatus.CANCELING, count, 1).transition == Transition.STOP
