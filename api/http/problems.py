@@ -15,7 +15,8 @@ from starlette.routing import Match
 from starlette.types import Scope
 
 from api.http.addresses import address, path_of
-from service.errors import ServiceError
+from service.errors import NoSpaceError, ServiceError
+from service.files.cache import is_full
 from service.parameters import JobParameters
 from sgsst_core.errors import InvalidInputError
 from sgsst_core.options import merged, reason, renamed_hint, unknown_text
@@ -172,6 +173,8 @@ def routed_methods(scope: Scope) -> list[str]:
 
 async def _system_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, OSError)
+    if is_full(error):
+        return from_service(NoSpaceError())
     if error.errno not in (errno.EMFILE, errno.ENFILE):
         raise error
     detail = "The service has reached its limit of open files. Try again later."

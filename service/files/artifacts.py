@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.errors import DamagedFileError, LostFileError
+from service.files.blobs import disk_errors
 from service.files.cache import file_digest
 from service.files.objects import CHUNK, ObjectStore
 from service.store.leases import Published
@@ -43,6 +44,7 @@ class Artifacts:
         if self.local:
             self.objects.make_folder()
 
+    @disk_errors()
     def put(self, job_id: str, epoch: int, name: str, source: Path, *, final: bool = False) -> Published:
         """Store a result file.
 
@@ -78,6 +80,7 @@ class Artifacts:
         """
         self.objects.check_once(location, sha256)
 
+    @disk_errors()
     def fetch(self, location: str, target: Path, sha256: str) -> None:
         """Copy a result to a local file, atomically.
 

@@ -26,6 +26,7 @@ from service.errors import LockedError, LostUploadError, NoSpaceError, NotFoundE
 from service.files.objects import CHUNK, ObjectStore
 from service.store.inputs import Inputs, check_offset
 from service.store.tables import BlobRow, UploadRow
+from sgsst_core.errors import OutputError
 
 #: Age in seconds at which files without a database row are removed; younger files may not have their row yet.
 _ORPHAN_SECONDS = 3600.0
@@ -46,11 +47,12 @@ def disk_errors() -> Iterator[None]:
     """
     try:
         yield
-    except OSError as error:
-        if error.errno in (errno.ENOENT, errno.EMFILE, errno.ENFILE):
+    except (OSError, OutputError) as error:
+        cause = error.__cause__ if isinstance(error, OutputError) else error
+        if not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EMFILE, errno.ENFILE):
             raise
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        raise (NoSpaceError if full else StoreError)(f"The service cannot write the file: {error.strerror}.") from error
+        full = cause.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        raise (NoSpaceError if full else StoreError)(f"The service cannot write the file: {cause.strerror}.") from error
 
 
 class Receiver:
@@ -82,8 +84,9 @@ class Receiver:
 
     def close(self) -> None:
         """Make the bytes durable and close the file."""
-        os.fsync(self._file.fileno())
-        self._file.close()
+        with disk_errors():
+            os.fsync(self._file.fileno())
+            self._file.close()
 
     def discard(self) -> None:
         """Delete the received bytes."""
@@ -396,7 +399,8 @@ class _FileWriter:
         self._offset += len(data)
 
     def save(self) -> float:
-        os.fsync(self._file.fileno())
+        with disk_errors():
+            os.fsync(self._file.fileno())
         size = self._offset - self._saved
         expires = self._inputs.advance_upload(self._upload.id, self._saved, size, self._seconds)
         self._saved = self._offset

@@ -28,6 +28,7 @@ from service.inspection.lanes import Lanes
 from service.parameters import stored_parameters
 from service.settings import ServiceSettings
 from service.store import Store
+from service.store.leases import Published
 from service.store.quotas import Quotas
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import result_name
@@ -209,25 +210,51 @@ class DerivedFiles:
         }
 
     def _publish(self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas) -> None:
-        """Store files and make them visible.
-
-        Raises:
-            QuotaError: If they exceed the owner's quota of stored bytes; they are removed.
-        """
-        # later than the epoch of the last lease, so that the files are not swept as leftovers of an attempt
-        epoch = job.lease_epoch + 1
-        put = [self._artifacts.put(job.id, epoch, name, path, final=True) for name, path in files.items()]
-        unused = [file.location for file in put]
-        try:
-            unused = self._store.jobs.add_derived(result, put, job.owner, quotas)
-        finally:
-            for location in unused:
-                self._artifacts.remove(location)
+        publish_derived(self._store, self._artifacts, job, result, files, quotas)
 
     async def close(self) -> None:
         """Stop the process, which also aborts any work in progress."""
         for process in self._lanes.slots:
             await process.close()
+
+
+def publish_derived(
+    store: Store,
+    artifacts: Artifacts,
+    job: JobRow,
+    result: ArtifactRow,
+    files: dict[str, Path],
+    quotas: Quotas,
+    *,
+    replace: bool = False,
+) -> None:
+    """Charge the owner of a job for files derived from its result, store them, and make them visible.
+
+    The charge is a receipt until the files have rows. It ends if they cannot be stored, and expires if this process
+    dies.
+
+    Args:
+        files: Files by name.
+        replace: Whether files replace those of the same names.
+
+    Raises:
+        QuotaError: If they exceed the owner's quota of stored bytes; nothing is stored.
+    """
+    known = {row.name: row.size for row in store.jobs.artifacts(job.id)} if replace else {}
+    size = sum(path.stat().st_size - known.get(name, 0) for name, path in files.items())
+    receipt = store.inputs.open_receipt(job.owner, max(0, size), quotas)
+    put: list[Published] = []
+    unused: list[str] | None = None
+    try:
+        for name, path in files.items():
+            # later than the epoch of the last lease, so that the file is not swept as a leftover of an attempt
+            put.append(artifacts.put(job.id, job.lease_epoch + 1, name, path, final=True))
+        unused = store.jobs.add_derived(result, put, job.owner, quotas, replace=replace, receipt=receipt)
+    finally:
+        if unused is None:
+            store.inputs.end_receipt(receipt)
+        for location in [file.location for file in put] if unused is None else unused:
+            artifacts.remove(location)
 
 
 def remove_leftovers(folder: Path) -> None:

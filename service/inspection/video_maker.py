@@ -19,7 +19,7 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
 from service.files.threads import FileThreads
-from service.inspection.derived import input_bytes, remove_leftovers
+from service.inspection.derived import input_bytes, publish_derived, remove_leftovers
 from service.inspection.inspector import (
     MEMORY_PER_BYTE,
     InspectionProcess,
@@ -165,14 +165,8 @@ class VideoMaker:
         return staged
 
     def _publish(self, folder: Path, job: JobRow, result: ArtifactRow, quotas: Quotas) -> None:
-        # later than the epoch of the last lease, so that the file is not swept as a leftover of an attempt
-        file = self._artifacts.put(job.id, job.lease_epoch + 1, VIDEO, folder / VIDEO, final=True)
-        unused = [file.location]
-        try:
-            unused = self._store.jobs.add_derived(result, [file], job.owner, quotas, replace=True)
-        finally:
-            for location in unused:
-                self._artifacts.remove(location)
+        files = {VIDEO: folder / VIDEO}
+        publish_derived(self._store, self._artifacts, job, result, files, quotas, replace=True)
 
     async def close(self) -> None:
         """Stop the process, which also aborts the video in progress."""

@@ -161,6 +161,8 @@ def main() -> None:
     signal.signal(signal.SIGTERM, handle)
     signal.signal(signal.SIGINT, handle)
     dispatcher.run()
+    logging.shutdown()
+    os._exit(0)  # threads that wait for a hanging file store would be waited for
 
 
 if __name__ == "__main__":

@@ -13,8 +13,9 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from service.errors import StoreError
+from service.errors import NoSpaceError, ServiceError, StoreError
 from service.files.artifacts import Artifacts
+from service.files.blobs import disk_errors
 from service.files.staging import CHECKPOINT, RESULT
 from service.store import Store
 from service.store.leases import LIVE, Lease, Published
@@ -70,7 +71,7 @@ class Outbox:
         files = {RESULT: self._out / RESULT} | {name: self._out / file for name, file in _RESULTS.items()}
         return {name: path for name, path in files.items() if path.is_file()}
 
-    def put(self, files: Mapping[str, Path]) -> tuple[list[Published], StoreError | None]:
+    def put(self, files: Mapping[str, Path]) -> tuple[list[Published], ServiceError | None]:
         """Upload new and changed files; return them, and the error that stopped the upload (None for no error)."""
         done = []
         for name, path in files.items():
@@ -81,7 +82,7 @@ class Outbox:
                     continue
                 try:
                     done.append(self._put_file(name, path))
-                except StoreError as error:
+                except (StoreError, NoSpaceError) as error:
                     return done, error
                 self._uploaded[name] = stamp
         return done, None
@@ -134,7 +135,15 @@ class Publisher:
         """
         if time.monotonic() - self._refused_at < _RETRY_SECONDS and not whole_log:
             return
-        put, refused = self._outbox.put(self._outbox.unfinished() | self._grown_log(now=whole_log))
+        refused: ServiceError | None
+        put: list[Published]
+        try:
+            with disk_errors():
+                files = self._outbox.unfinished() | self._grown_log(now=whole_log)
+        except (StoreError, NoSpaceError) as error:  # there is no space for a copy of the log
+            put, refused = [], error
+        else:
+            put, refused = self._outbox.put(files)
         self.publish(put)
         if refused is not None:
             self._refused_at = time.monotonic()
@@ -179,7 +188,7 @@ class Publisher:
             given_up: Callback that returns whether to stop waiting; it is called while the file store is unreachable.
 
         Raises:
-            StoreError: If the store was unreachable for too long.
+            StoreError, NoSpaceError: If the store was unreachable or full for too long.
         """
         self.publish(put_patiently(self._outbox, given_up))
         self._store.leases.succeed(self._lease, list(self._results.values()), result)
@@ -203,7 +212,7 @@ def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Publishe
     """Upload a job's results; retry failed uploads, because the results would be lost otherwise.
 
     Raises:
-        StoreError: If the file store was unreachable for too long, or `given_up` returned true.
+        StoreError, NoSpaceError: If the file store was unreachable or full for too long, or `given_up` returned true.
     """
     started = time.monotonic()
     done: list[Published] = []
@@ -218,7 +227,7 @@ def put_patiently(outbox: Outbox, given_up: Callable[[], bool]) -> list[Publishe
         time.sleep(_RETRY_SECONDS)
 
 
-def _reason(error: StoreError) -> str:
+def _reason(error: ServiceError) -> str:
     """Return an error with its cause, for the operator."""
     cause = error.__cause__
     return f"{error} ({type(cause).__name__}: {cause})" if cause is not None else str(error)

@@ -7,18 +7,23 @@ import logging
 import queue
 import shutil
 import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from service.errors import LeaseLostError, ServiceError
+from service.deadlines import LEAST_RATE
+from service.errors import LeaseLostError, ServiceError, StoreError
 from service.files.artifacts import Artifacts
 from service.parameters import stored_parameters
 from service.scheduling.child_process import ChildProcess
 from service.scheduling.endings import Ending, Message, StopRequest, attempt_ending, cause_of_error, outage
 from service.scheduling.packing import Grant
 from service.scheduling.progress import ProgressWriter
-from service.scheduling.publishing import Publisher
+from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
 from service.scheduling.scheduler import Holding
 from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
@@ -32,6 +37,11 @@ from sgsst_core.errors import SettingsError
 _CANCEL_SECONDS = 8.0
 #: Time to wait for a message before other tasks are done, in seconds.
 _MESSAGE_SECONDS = 0.2
+#: Time limit of each piece of work on files at the start and the end of an attempt, in seconds; the time for the bytes
+#: of large files comes on top. It is longer than the S3 client's own.
+_FILE_SECONDS = 60.0
+
+Result = TypeVar("Result")
 
 _log = logging.getLogger(__name__)
 
@@ -58,6 +68,9 @@ class RunningAttempt:
         self._finish_requested = False
         self._publisher = Publisher(lease, folder, store, artifacts, settings.preview_seconds)
         self._progress = ProgressWriter(lease, store)
+        # Work on files has a thread of its own, because it may hang: the attempt then ends without it.
+        self._files = ThreadPoolExecutor(1, f"{lease.job_id}-files")
+        self._pending: deque[Future[None]] = deque()
         self._thread = threading.Thread(target=self._run, name=lease.job_id, daemon=True)
 
     @property
@@ -115,7 +128,33 @@ class RunningAttempt:
                 self._fail(reported if cause == Cause.JOB else outage(cause), permanent=False)
         finally:
             self._kill()
-            shutil.rmtree(self._folder, ignore_errors=True)
+            removed = self._files.submit(shutil.rmtree, self._folder, ignore_errors=True)
+            wait([removed], _CANCEL_SECONDS)  # if the folder hangs, it is removed afterwards
+            self._files.shutdown(wait=False)
+
+    def _within(self, work: Callable[[], Result], seconds: float = _FILE_SECONDS, size: int = 0) -> Result:
+        """Return the result of work on files, after all earlier work.
+
+        Raises:
+            StoreError: If the file store or the folder hangs.
+        """
+        future = self._files.submit(work)
+        try:
+            return future.result(seconds + size / LEAST_RATE)
+        except TimeoutError as error:
+            if future.done():
+                raise
+            future.cancel()
+            raise StoreError from error
+
+    def _publish_later(self, publish: Callable[[], None]) -> None:
+        """Publish files without waiting for the file store."""
+        self._pending.append(self._files.submit(publish))
+
+    def _check_published(self) -> None:
+        """Raise the error of publishing that has failed."""
+        while self._pending and self._pending[0].done():
+            self._pending.popleft().result()
 
     def _attempt(self) -> None:
         try:
@@ -124,7 +163,8 @@ class RunningAttempt:
             self._fail({"code": error.code, "message": str(error)}, permanent=True)
             return
         self._count_gpus()
-        self._stager.prepare(self._folder, self.lease, self.grant, parameters)
+        prepare = partial(self._stager.prepare, self._folder, self.lease, self.grant, parameters)
+        self._within(prepare, size=sum(entry["size"] for entry in self.lease.job.inputs))
         self._process = ChildProcess(self._folder, self.grant, cluster=self._stager.cluster)
         _log.info("attempt started", extra=self.lease.log_fields)
         last = self._watch(self._process)
@@ -132,13 +172,14 @@ class RunningAttempt:
             return
         exit_code = self._process.wait()
         self._progress.write(now=True)
-        self._publisher.publish_unfinished(whole_log=True)
+        self._within(partial(self._publisher.publish_unfinished, whole_log=True), PATIENCE_SECONDS)
+        self._check_published()
         ending = attempt_ending(
             self._stop_request,
             last,
             exit_code,
-            self._publisher.log_tail(),
-            has_result=self._publisher.has_result(),
+            self._within(self._publisher.log_tail),
+            has_result=self._within(self._publisher.has_result),
             cluster=self._stager.cluster,
         )
         self._conclude(ending, {} if last is None else last.get("result", {}))
@@ -146,11 +187,12 @@ class RunningAttempt:
     def _conclude(self, ending: Ending, result: dict[str, Any]) -> None:
         """Record the end of an attempt in the store."""
         if ending.outcome == AttemptOutcome.SUCCEEDED:
-            self._publisher.succeed(result, lambda: self._stop_request == StopRequest.ABANDON)
-            self._publisher.sweep()
+            succeed = partial(self._publisher.succeed, result, lambda: self._stop_request == StopRequest.ABANDON)
+            self._within(succeed, 2 * PATIENCE_SECONDS)
+            self._sweep()
         elif ending.outcome == AttemptOutcome.CANCELED:
             self._store.leases.stop(self.lease)
-            self._publisher.sweep()
+            self._sweep()
         elif ending.outcome == AttemptOutcome.RELEASED:
             self._store.leases.release(self.lease)
         else:
@@ -178,7 +220,9 @@ class RunningAttempt:
                 process.kill()
                 return None
             self._progress.write()
-            self._publisher.publish_unfinished()
+            self._check_published()
+            if not self._pending:
+                self._publish_later(self._publisher.publish_unfinished)
             if self._finish_requested:
                 process.finish()
             if self._stop_request is not None:
@@ -192,7 +236,7 @@ class RunningAttempt:
         if message["kind"] == "left-out":
             self._release_gpus(message["gpus"])
         if message["kind"] == "stored":
-            self._publisher.publish([Published(**message["file"])])
+            self._publish_later(partial(self._publisher.publish, [Published(**message["file"])]))
         if message["kind"] == "prepared":
             self._store.leases.start(self.lease)
         self._progress.update(message)
@@ -221,4 +265,9 @@ class RunningAttempt:
         outcome = "job will be retried" if retried else "job failed"
         _log.warning("%s: cause=%s: %s", outcome, cause_of(error), error["message"], extra=self.lease.log_fields)
         if not retried:
-            self._publisher.sweep()
+            self._sweep()
+
+    def _sweep(self) -> None:
+        """Remove leftovers of the ended job; housekeeping removes those that remain."""
+        with contextlib.suppress(StoreError):
+            self._within(self._publisher.sweep)

@@ -21,7 +21,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from service.errors import DamagedFileError, LostFileError, StoreError
+from service.errors import DamagedFileError, LostFileError, ServiceError, StoreError
 from service.file_permissions import keep_private
 from service.files.artifacts import Artifacts
 from service.files.cache import file_digest
@@ -220,7 +220,7 @@ class _Uploader:
                 _log.warning("upload failed, retrying: %s", refused.__cause__ or refused)
                 self._stop.wait(_RETRY_SECONDS)
 
-    def _upload(self) -> StoreError | None:
+    def _upload(self) -> ServiceError | None:
         put, refused = self._outbox.put(self._outbox.unfinished())
         self._report(put)
         return refused

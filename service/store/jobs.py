@@ -328,6 +328,7 @@ class Jobs:
         quotas: Quotas = NO_QUOTAS,
         *,
         replace: bool = False,
+        receipt: str | None = None,
     ) -> list[str]:
         """Publish files derived from `source`, unless `source` has been removed or replaced.
 
@@ -337,6 +338,7 @@ class Jobs:
             owner: Owner of the job.
             quotas: Quotas of the owner.
             replace: Whether files replace those of the same names, instead of being left out.
+            receipt: Receipt that the owner was charged by before the files were stored; the files take it over.
 
         Returns:
             Locations of files without a row: replaced ones, and those that were left out or whose `source` is gone.
@@ -360,6 +362,8 @@ class Jobs:
                     session.flush()
                 values = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
                 session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **values))
+            if receipt is not None:
+                close_receipt(session, receipt)
             session.flush()
             check_bytes(session, owner, quotas)
         return unused

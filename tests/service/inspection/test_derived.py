@@ -109,6 +109,7 @@ def test_parallel_blends_cannot_pass_their_limit(stored: Stored, tmp_path: Path)
 def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Path) -> None:
     job = stored.finished("one", tmp_path)
     before = {row.name for row in stored.store.jobs.artifacts(job.id)}
+    objects, used = set(stored.artifacts.objects.below("")), stored.store.usage.of("one").stored_bytes
 
     async def compress(quotas: Quotas) -> None:
         derived = stored.derived()
@@ -118,7 +119,11 @@ def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Pat
             await derived.close()
 
     with pytest.raises(QuotaError):
-        asyncio.run(compress(Quotas(stored_bytes=1)))
+        asyncio.run(compress(Quotas(stored_bytes=used)))
+    assert set(stored.artifacts.objects.below("")) == objects
+    assert stored.store.usage.of("one").stored_bytes == used
     assert {row.name for row in stored.store.jobs.artifacts(job.id)} == before
     asyncio.run(compress(NO_QUOTAS))
     assert {row.name for row in stored.store.jobs.artifacts(job.id)} == before | {"stylized.spz", "stylized.spz.json"}
+    derived = sum(row.size for row in stored.store.jobs.artifacts(job.id) if row.name not in before)
+    assert stored.store.usage.of("one").stored_bytes == used + derived

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
@@ -70,6 +71,31 @@ def test_running_dispatcher_is_registered(settings: ServiceSettings, store: Stor
         dispatchers = wait_for(store.operations.dispatchers, "the dispatcher to be known")
         assert [(row.name, row.slots, row.free) for row in dispatchers] == [(dispatcher.name, 2, 2)]
     assert store.operations.dispatchers() == []
+
+
+def test_attempt_whose_files_hang_ends_by_the_store(
+    settings: ServiceSettings, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The input is a pipe, which cannot be opened before somebody writes to it."""
+    monkeypatch.setattr("service.scheduling.running._FILE_SECONDS", 0.3)
+    monkeypatch.setattr("service.scheduling.running._CANCEL_SECONDS", 0.1)
+    pipe = settings.folder / "blobs" / "aa" / "blob"
+    pipe.parent.mkdir(parents=True)
+    os.mkfifo(pipe)
+    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+    job, _ = store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
+
+    def error() -> dict[str, str] | None:
+        attempts = store.jobs.detail(job.id, None)[2]
+        return attempts[0].error if attempts else None
+
+    with at_work(settings, store):
+        recorded = wait_for(error, "the attempt to end")
+        writer = os.open(pipe, os.O_RDWR)  # the thread that hangs continues
+    os.close(writer)
+    assert (recorded["code"], recorded["cause"]) == ("infrastructure", "store")
+    ended = store.jobs.get(job.id, None)
+    assert (ended.status, ended.failures) == ("queued", 0)
 
 
 def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Store, folder: Path) -> RunningAttempt:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from service.errors import NoSpaceError
 from service.files.artifacts import Artifacts
-from service.scheduling.publishing import Publisher
+from service.scheduling.publishing import Outbox, Publisher
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
@@ -57,6 +59,22 @@ def publisher(lease: Lease, folder: Path, store: Store, settings: ServiceSetting
 def announced(store: Store, lease: Lease) -> list[str]:
     """Return the names of the files that were announced to watchers, in order."""
     return [event.data["name"] for event in store.jobs.events(lease.job_id, 0) if event.kind == "artifact"]
+
+
+def test_full_disk_delays_publishing(folder: Path, settings: ServiceSettings) -> None:
+    """The limit on the size of files stands for a disk without space."""
+    outbox = Outbox("job_1", 1, folder / "out", Artifacts(settings.artifacts_url))
+    (folder / "out" / "stylized.views.jpg").write_bytes(bytes(1 << 20))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, hard))
+    try:
+        put, refused = outbox.put(outbox.unfinished())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (put, type(refused)) == ([], NoSpaceError)
+    assert stored_names(settings) == []
+    put, refused = outbox.put(outbox.unfinished())
+    assert ([file.name for file in put], refused) == (["views.jpg"], None)
 
 
 def content(store: Store, settings: ServiceSettings, lease: Lease, name: str) -> bytes:

@@ -116,6 +116,21 @@ def test_blends_count_toward_stored_bytes(store: Store) -> None:
     assert store.usage.of("local").stored_bytes == 11
 
 
+def test_derived_files_are_charged_before_they_are_stored(store: Store) -> None:
+    job_id, quotas = submit(store, NO_QUOTAS), Quotas(stored_bytes=11)
+    store.leases.succeed(lease(store), [Published("stylized.ply", "x/1", 4, SHA)], {})
+    result, blend = store.jobs.artifact(job_id, "stylized.ply"), Published("blends/a.ply", "x/2", 4, SHA)
+    assert result is not None
+    receipt = store.inputs.open_receipt("local", blend.size, quotas)
+    assert store.usage.of("local").stored_bytes == 11
+    with pytest.raises(QuotaError):
+        store.inputs.open_receipt("local", blend.size, quotas)
+    assert store.jobs.add_derived(result, [blend], "local", quotas, receipt=receipt) == []
+    assert store.usage.of("local").stored_bytes == 11
+    store.inputs.end_receipt(receipt)
+    assert store.usage.of("local").stored_bytes == 11
+
+
 def test_upload_used_as_an_input_counts_once(store: Store) -> None:
     row = store.inputs.create_upload("local", 3, "scene.ply", "", 1000)
     store.inputs.finish_upload(row.id, SHA, 1000)
