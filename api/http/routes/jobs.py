@@ -150,9 +150,11 @@ async def create_job(
             await context.threads.run(caller.owner, _find_inputs, context, caller, parts, fetched)
             with suspended():  # fetching has its own deadline
                 fetched = await context.fetcher.fetch(urls, receipt)
-        found = await context.threads.run(caller.owner, _find_inputs, context, caller, parts, fetched)
-        size = sum(row.size for row in found[1].values())
-        job_request = await context.threads.run(caller.owner, _check_files, context, caller, parts, *found, size=size)
+        resolved = await context.threads.run(caller.owner, _find_inputs, context, caller, parts, fetched)
+        size = sum(row.size for row in resolved[1].values())
+        job_request = await context.threads.run(
+            caller.owner, _check_files, context, caller, parts, *resolved, size=size
+        )
         if not job_request.checked:
             await context.inspector.inspect(
                 "validate", caller.owner, job_request.inputs, job_request.rows, job_request.parameters
