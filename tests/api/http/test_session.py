@@ -402,4 +402,4 @@ def test_cookie_authorizes_streams_and_files(browser: httpx.Client, store: Store
     with browser.stream("GET", f"/v1/jobs/{job_id}/events") as answer:
         assert answer.status_code == 200
         assert any("queued" in line for line in answer.iter_lines())
-    assert browser.get(f"/v1/jobs/{job_id}/artifacts").json() == {"artifacts": []}
+    assert browser.get(f"/v1/jobs/{job_id}/artifacts").json() == {"artifacts": [], "next_cursor": None}
