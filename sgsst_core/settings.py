@@ -240,7 +240,11 @@ class Settings(BaseModel):
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed for the order of views and for random training backgrounds.")
     max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
-        None, gt=0, allow_inf_nan=False, description="Stop after S seconds of steps and write the result."
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="Stop after S seconds of steps and write the result. Not counted: reading, the survey of the "
+        "views, and measurements of speed and quality.",
     )
     memory_limit: Annotated[
         int | None,
