@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,7 +23,7 @@ from sgsst_core.quality.measure import Measurements
 from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, sent_json
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation
+from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
 from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.options import RunOptions
@@ -102,7 +103,8 @@ def execute(
     """
     stylizer = job.stylizer
     first = stylizer.job.collectives.rank == 0
-    measure = Measurements(stylizer)
+    reported = _ReportedSteps(progress)
+    measure = Measurements(stylizer, reported.show_views if first else show_nothing)
     if job.resumed:
         stylizer.load_state(job.resumed.state)
     if first:
@@ -113,7 +115,7 @@ def execute(
     checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), saved, warn)
     callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds)
     if first:
-        callbacks.progress, callbacks.stop, callbacks.finish = progress, stop, finish
+        callbacks.progress, callbacks.stop, callbacks.finish = reported, stop, finish
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
         callbacks.preview_seconds = 0.0  # `Previews` itself limits how often a preview is written
         if preview and not _has_rows_of_file(job):
@@ -164,6 +166,26 @@ def _write_views(job: Job, warn: Warn) -> None:
         write_views(path, job.scene_file.scene, cameras, background=settings.background, near=settings.near)
     except OutputError as error:
         warn(f"The images of the views could not be written: {error}")
+
+
+class _ReportedSteps:
+    """Progress callback for `loop.Callbacks.progress`, which also reports the views of quality checks after a step."""
+
+    def __init__(self, report: Callable[[Progress], None]) -> None:
+        self._report = report
+        self._latest: Progress | None = None
+        self._at = 0.0
+
+    def __call__(self, now: Progress) -> None:
+        """Report a step."""
+        self._latest, self._at = now, time.monotonic()
+        self._report(now)
+
+    def show_views(self, done: int, total: int) -> None:
+        """Report the views of a quality check; ignored before the first step."""
+        if self._latest is not None:
+            left = max(self._latest.seconds_left - (time.monotonic() - self._at), 0.0)
+            self._report(replace(self._latest, stage="measuring", seconds_left=left, views=(done, total)))
 
 
 class _CheckpointWriter:

@@ -74,7 +74,7 @@ def prepare(
         collectives: Collectives of all ranks.
         resume: Choice of the checkpoint to resume from; None follows the request.
         warn: Callback for checkpoints that cannot be used.
-        show_planning: Callback for the progress of the survey of the views. It is not called if the checkpoint's plan
+        show_planning: Callback for the progress of planning. It is not called if the checkpoint's plan
             is used.
         preview: Writer of previews, used on rank 0 of a new job; None to write none.
 

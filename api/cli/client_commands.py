@@ -16,7 +16,15 @@ from rich.progress import BarColumn, ProgressColumn, TextColumn
 from rich.table import Table
 
 from api.cli.arguments import JobInputs, JsonOption
-from api.cli.console import INTERRUPTED, JOB_FAILED, PlainConsole, error_console, loss_text, out_console
+from api.cli.console import (
+    EARLY_ENDS,
+    INTERRUPTED,
+    JOB_FAILED,
+    PlainConsole,
+    error_console,
+    loss_text,
+    out_console,
+)
 from api.cli.options import with_arguments, with_options
 from api.cli.progress_bars import transfer_bar
 from api.client.inputs import different_names, path_or_url
@@ -31,7 +39,7 @@ from sgsst_core.files.formats import (
     result_name,
 )
 from sgsst_core.number_format import duration
-from sgsst_core.stylizing.progress_bar import clock, live_bar
+from sgsst_core.stylizing.progress_bar import live_bar, set_total, time_left
 from worker.outputs import check_folder, check_is_not_input, result_format
 from worker.region_requests import RegionOptions, RegionRequest, region_requests
 from worker.styles import parse_styles, split_weight
@@ -347,12 +355,15 @@ def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
         task = bar.add_task("checking", total=None, text="")
 
         def sent(done: int, total: int) -> None:
-            bar.update(task, description="sending", completed=done, total=total or None, text=f"{done / 1e6:.0f} MB")
+            set_total(bar, None if done == total else total)
+            bar.update(task, description="sending", completed=done, text=f"{done / 1e6:.0f} MB")
             if done == total:
-                bar.update(task, description="checking", total=None, text="")
+                bar.update(task, description="checking", text="")
 
         def planned(done: int, total: int) -> None:
-            bar.update(task, description="planning", completed=done, total=total, text=f"view {done} of {total}")
+            text = f"view {done} of {total}" if total else "measuring the speed"
+            set_total(bar, total or None)
+            bar.update(task, description="planning", completed=done, text=text)
 
         yield sent, planned
 
@@ -397,6 +408,11 @@ def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
     if job.status != "succeeded":
         error_console.print(_job_text(job))
         raise typer.Exit(JOB_FAILED)
+    result = job.data["result"]
+    if result["steps"] < result.get("total", 0):
+        error_console.print(
+            f"Steps: {_step_count_text(result)}; loss {loss_text(result['loss_before'], result['loss_after'])}"
+        )
     with transfer_bar(error_console, out.name) as progress:
         client.download(job.id, out, progress=progress, format=_format_of(out))
     if not as_json:
@@ -424,13 +440,17 @@ def _format_of(out: Path) -> ExtraName | None:
 def _step_text(progress: Any) -> str:
     if not progress.get("total"):
         return str(progress["stage"])
-    unit = "view" if progress["stage"] == "planning" else "step"
-    text = f"{progress['stage']}: {unit} {progress['step']} of {progress['total']}"
+    unit, done, total = "step", progress["step"], progress["total"]
+    if progress.get("views_to_check"):
+        unit, done, total = "view", progress["views_checked"], progress["views_to_check"]
+    elif progress["stage"] in ("planning", "refining"):
+        unit = "view"
+    text = f"{progress['stage']}: {unit} {done} of {total}"
     loss = progress.get("mean_loss") or progress.get("loss")
     if loss is not None:
         text += f", loss {loss:.3g}"
-    if progress.get("eta_s") is not None:
-        text += f", {clock(progress['eta_s'])} left"
+    if left := time_left(progress.get("eta_s")):
+        text += f", {left}"
     return text
 
 
@@ -448,7 +468,7 @@ def _short_status(job: Job) -> str:
     """Return the status of a job with its position in the queue or its progress, in at most 13 characters."""
     if job.status == "queued" and job.data.get("queue_position"):
         return f"queued, #{job.data['queue_position']}"
-    if job.progress and not job.finished and job.progress["total"]:
+    if job.progress and job.status in ("running", "finishing") and job.progress["total"]:
         return f"{job.status} {job.progress['fraction']:.0%}"
     return job.status
 
@@ -459,10 +479,19 @@ def _job_text(job: Job) -> str:
         lines.append(f"{'progress:':<12}{_progress_text(job)}")
     result = job.data.get("result")
     if result:
+        lines.append(f"{'steps:':<12}{_step_count_text(result)}")
         lines.append(f"{'loss:':<12}{loss_text(result['loss_before'], result['loss_after'])}")
     if job.error:
         lines.append(f"{'error:':<12}{job.error['message']}")
     return "\n".join(lines)
+
+
+def _step_count_text(result: Any) -> str:
+    """Return the number of steps of a finished job, and why it made no more."""
+    steps, total = result["steps"], result.get("total")  # results of earlier versions have no total
+    if total is None or steps >= total:
+        return str(steps)
+    return f"{steps} of {total}: {EARLY_ENDS.get(result['stopped'], result['stopped'])}"
 
 
 def _plan_text(plan: Any) -> str:

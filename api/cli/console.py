@@ -15,6 +15,13 @@ BAD_INPUT, FAILURE = 2, 1
 #: Exit codes of client commands: no such job or file, a job whose status does not allow the request, and a job that
 #: did not succeed.
 NOT_FOUND, CONFLICT, JOB_FAILED = 3, 4, 5
+#: Reasons why a job stopped before its last step.
+EARLY_ENDS = {
+    "max-seconds": "it reached --max-seconds (submit it again with more seconds to make more steps)",
+    "on-request": "it was asked to finish (submit it again to make all steps)",
+    "target-loss": "the loss has reached --target-loss",
+    "converged": "the loss no longer falls (use --no-early-stop to run all steps)",
+}
 #: Exit code after Ctrl-C, as in shells.
 INTERRUPTED = 130
 

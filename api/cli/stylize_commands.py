@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from api.cli.arguments import JobInputs
-from api.cli.console import FAILURE, error_console, loss_text, out_console, print_field, spinner
+from api.cli.console import EARLY_ENDS, FAILURE, error_console, loss_text, out_console, print_field, spinner
 from api.cli.interrupt import stop_on_signal
 from api.cli.options import with_arguments, with_options
 from api.cli.weights_commands import fetch
@@ -29,12 +29,6 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command i
 #: Resolution and number of steps of the demo, and seconds after which it stops on a slow machine. The whole demo takes
 #: less than five minutes.
 DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 180
-
-#: Reasons to stop before the last step that need no action.
-_EARLY_ENDS = {
-    "target-loss": "the loss has reached --target-loss",
-    "converged": "the loss no longer falls (use --no-early-stop to run all steps)",
-}
 
 
 @with_options(StylizeOptions)
@@ -202,13 +196,13 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
         paths += [("report as JSON", outputs.report)]
     for heading, path in paths:
         print_field(heading, path)
-    if result.stopped in _EARLY_ENDS:
-        out_console.print(f"Stopped at step {result.step} of {result.total}: {_EARLY_ENDS[result.stopped]}.")
     if result.stopped == "max-seconds":
         out_console.print(
             f"Reached --max-seconds at step {result.step} of {result.total}. The checkpoint is kept. To continue, "
             f"raise --max-seconds, which counts from the first step:\n{command}"
         )
+    elif result.stopped in EARLY_ENDS:
+        out_console.print(f"Stopped at step {result.step} of {result.total}: {EARLY_ENDS[result.stopped]}.")
     if result.report_error is not None:
         error_console.print(
             f"The stylized scene is complete, but its report could not be written: {result.report_error}"

@@ -20,7 +20,7 @@ from service.errors import ServiceError
 _EVENTS = "text/event-stream"
 #: Status in the log if the client has closed the connection, as in nginx. It is never sent.
 _CLIENT_CLOSED = 499
-_PROGRESS = {"step": 5, "total": 24, "fraction": 0.208, "eta_s": 31.5}
+_PROGRESS = {"stage": "planning", "step": 5, "total": 24, "fraction": 0.208, "eta_s": 31.5}
 
 _log = logging.getLogger(__name__)
 
@@ -42,8 +42,9 @@ def _documented(model: type[BaseModel], description: str, progress: str, result:
 #: Documentation of the responses for the OpenAPI document.
 DRY_RUN = _documented(
     PlanView,
-    "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: `planning`, the number of "
-    "surveyed views; finally `plan`, or a `problem` that occurred after the response started.",
+    "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: `planning`, the stage "
+    "(`planning`, `refining` or `probing`) and its number of completed views (`total` is 0 if it has none); finally "
+    "`plan`, or a `problem` that occurred after the response started.",
     "planning",
     "plan",
 )

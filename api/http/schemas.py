@@ -94,10 +94,11 @@ class ProgressView(BaseModel):
     )
 
     stage: str = Field(
-        description="`reading`, `planning` (surveying the views), `starting`, `coarse` (coarsest scale), `sos` (all "
-        "scales), `measuring` (views between the cameras) or `video` (frames of the video)."
+        description="`reading`, `planning` (surveying the views), `refining` (choosing Gaussians to split), `probing` "
+        "(measuring the speed of this machine), `starting`, `coarse` (coarsest scale), `sos` (all scales), `measuring` "
+        "(checking the quality of some views) or `video` (frames of the video)."
     )
-    step: int = Field(description="Completed steps; surveyed views while `planning`; frames while `video`.")
+    step: int = Field(description="Completed steps; views while `planning` or `refining`; frames while `video`.")
     total: int = Field(description="Maximum number of steps or views; 0 while unknown.")
     fraction: float = Field(description="Completed fraction of the steps or views, 0 to 1.")
     eta_s: float | None = Field(
@@ -109,6 +110,8 @@ class ProgressView(BaseModel):
     )
     mean_loss: float | None = Field(None, description="Loss of the last round of views, comparable over time.")
     mean_scales: list[float | None] | None = Field(None, description="The same for each scale.")
+    views_checked: int | None = Field(None, description="While `measuring`: completed views of this check of quality.")
+    views_to_check: int | None = Field(None, description="While `measuring`: all views of this check of quality.")
     seconds: float | None = Field(description="Seconds of all steps so far.")
     attempt: int
     updated_at: Time
@@ -233,7 +236,9 @@ class JobView(BaseModel):
     queue_position: int | None = Field(description="1 is next; null if the job is not queued.")
     preview: str | None = Field(description="Artifact with the newest preview image; null if there is none yet.")
     progress: ProgressView | None
-    result: dict[str, Any] | None = Field(description="Steps, reason to stop, and loss before and after.")
+    result: dict[str, Any] | None = Field(
+        description="Why the job stopped (`stopped`), its `steps` of `total`, and its loss before and after."
+    )
     error: ErrorView | None
     parameters: dict[str, Any] = Field(
         description="As `JobParameters`, with defaults for omitted fields; fields of an earlier version are shown as "

@@ -5,7 +5,7 @@ import { h, put } from "./dom.js";
 import { badge } from "./job.js";
 import { labels } from "./names.js";
 import { ResultStage } from "./result_stage.js";
-import { UNFINISHED } from "./statuses.js";
+import { stepFraction, UNFINISHED } from "./statuses.js";
 import { percent, words } from "./words.js";
 
 const say = words.compare;
@@ -68,8 +68,8 @@ export class CompareView {
 
 /** Return the image of a job with its label and status. @param {any} job @param {string} name */
 function tile(job, name) {
-  const running = UNFINISHED.has(job.status) && job.progress?.total;
+  const painted = stepFraction(job);
   const image = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: words.job.sheetOf(name), decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
   return h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", image), h("strong", { title: name }, name)),
-    h("div.row", badge(job.status), running ? h("small", percent(job.progress.fraction)) : null));
+    h("div.row", badge(job.status), painted === undefined ? null : h("small", percent(painted))));
 }

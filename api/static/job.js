@@ -21,6 +21,18 @@ const AGAIN = 3000;
 /** Milliseconds between requests for changes that were made elsewhere, such as in another tab. */
 const ELSEWHERE = 5000;
 
+/** Stages before the steps. */
+const PLANNING = new Set(["planning", "refining", "probing"]);
+
+/** Describe how a job ended; empty if it made all steps and its loss fell. @param {any} result */
+function outcomeOf(result) {
+  const { stopped, steps, total, loss_before: before, loss_after: after } = result ?? {}, risen = after > before;
+  const early = steps < total ? say.early[stopped] : undefined;
+  if (!early) return risen ? say.risen : "";
+  const made = [say.steps(steps, total), before > 0 && say.lossLeft(after / before)].filter(Boolean).join(", ");
+  return `${early}: ${made}. ${say.onward[stopped] ?? (risen ? say.risen : "")}`.trim();
+}
+
 /** @param {string} status */
 export const badge = (status) => h(`span.badge.${status}`, titles[status] ?? status);
 
@@ -38,6 +50,7 @@ export class JobView {
     this.renaming = h("span.renaming");
     this.badge = h("span");
     this.meta = h("p.meta");
+    this.outcome = h("ul.warnings", { hidden: true });
     this.actions = h("div.row.actions-inline");
     this.stateText = h("span");
     this.leftText = h("span.left");
@@ -58,7 +71,7 @@ export class JobView {
     this.deletion = h("p.deletion");
     this.facts = h("section.card");
     this.curve = h("section.card", h("h2", say.loss), this.chart.element);
-    this.body = h("div.job", h("header.head", h("div", h("div.row", this.heading, this.renaming, this.badge), this.meta), this.actions),
+    this.body = h("div.job", h("header.head", h("div", h("div.row", this.heading, this.renaming, this.badge), this.meta, this.outcome), this.actions),
       this.connection, this.error, h("div.split.watch", h("div.pinned.tall", this.show, this.state), h("div.panel", this.download, this.film, this.sharing, this.curve, this.plan, this.files, this.facts, this.deletion)));
     this.element = h("div", h("p.quiet.pending", words.page.loading));
     this.begin();
@@ -191,6 +204,9 @@ export class JobView {
     this.planTitle.textContent = UNFINISHED.has(job.status) ? words.plan.decided : words.plan.ran;
     const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
     this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
+    const outcome = job.status === "succeeded" ? outcomeOf(job.result) : "";
+    this.outcome.hidden = !outcome;
+    put(this.outcome, h("li", outcome));
     this.error.hidden = !job.error;
     if (job.error) put(this.error, h("strong", say.failed), h("p", job.error.message));
     this.showActions();
@@ -238,11 +254,12 @@ export class JobView {
       this.bar.removeAttribute("value");
       return;
     }
-    const { stage, step, total, fraction, eta_s } = progress;
-    this.stateText.textContent = [say.stages[stage] ?? stage, total ? (stage === "video" ? say.frame : stage === "planning" || stage === "measuring" ? say.view : say.step)(step, total) : ""].filter(Boolean).join(" · ");
-    // while views are analyzed, the time of the steps is unknown
-    this.leftText.textContent = eta_s === null || eta_s === undefined || stage === "planning" ? "" : say.left(eta_s);
-    if (total) this.bar.value = fraction;
+    const { stage, eta_s } = progress, planning = PLANNING.has(stage), checking = stage === "measuring";
+    const [done, total] = checking ? [progress.views_checked ?? 0, progress.views_to_check ?? 0] : [progress.step, progress.total];
+    this.stateText.textContent = [say.stages[stage] ?? stage, total ? (stage === "video" ? say.frame : planning || checking ? say.view : say.step)(done, total) : ""].filter(Boolean).join(" · ");
+    // before the first step, the time of the steps is unknown
+    this.leftText.textContent = eta_s === null || eta_s === undefined || planning ? "" : say.left(eta_s);
+    if (total) this.bar.value = done / total;
     else this.bar.removeAttribute("value");
   }
 

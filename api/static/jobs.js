@@ -5,7 +5,7 @@ import { announce, h, put } from "./dom.js";
 import { badge, deleteButton } from "./job.js";
 import { nameOf, stylesOf } from "./names.js";
 import { sceneOf } from "./result_stage.js";
-import { titles, UNFINISHED } from "./statuses.js";
+import { stepFraction, titles, UNFINISHED } from "./statuses.js";
 import { percent, time, words } from "./words.js";
 
 const say = words.jobs;
@@ -81,15 +81,15 @@ export class JobsView {
 
   /** Return the card of a job; it is rebuilt only if the job has changed. @param {any} job */
   card(job) {
-    const told = JSON.stringify([job.status, job.preview, job.progress?.fraction, job.queue_position, job.name]), known = this.cards.get(job.id);
+    const told = JSON.stringify([job.status, job.preview, stepFraction(job), job.queue_position, job.name]), known = this.cards.get(job.id);
     if (known?.told === told || known?.element.contains(document.activeElement)) return known.element;
     const name = nameOf(job), style = stylesOf(job);
-    const running = UNFINISHED.has(job.status), done = job.status === "succeeded";
+    const running = UNFINISHED.has(job.status), done = job.status === "succeeded", painted = stepFraction(job);
     const picture = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: "", loading: "lazy", decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
     const choose = done ? h("label.check", h("input", { type: "checkbox", checked: this.chosen.has(job.id), "aria-label": say.select(name), onchange: (/** @type {any} */ event) => this.choose(job.id, event.target.checked) }), h("small", { "aria-hidden": "true" }, say.choose)) : null;
     const element = h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", picture), h("strong", { title: name }, name), h("small", [name.includes(style) ? "" : style, time(job.created_at)].filter(Boolean).join(" · "))),
-      h("div.row", badge(job.status), running && job.progress?.total ? h("small", percent(job.progress.fraction)) : null, h("span.grow"), choose, running ? null : this.deleter(job, name)),
-      running && job.progress?.total ? h("progress", { max: 1, value: job.progress.fraction, "aria-label": words.job.progress }) : null);
+      h("div.row", badge(job.status), painted === undefined ? null : h("small", percent(painted)), done && job.result?.steps < job.result?.total ? h("small", words.job.steps(job.result.steps, job.result.total)) : null, h("span.grow"), choose, running ? null : this.deleter(job, name)),
+      painted === undefined ? null : h("progress", { max: 1, value: painted, "aria-label": words.job.progress }));
     this.cards.set(job.id, { element, told });
     return element;
   }

@@ -6,6 +6,11 @@ const states = /** @type {any} */ ("{{job_states}}");
 
 /** Text to display for each status. */
 export const titles = states.titles;
+/**
+ * Return the fraction of its steps that a job has made; undefined unless it makes steps.
+ * @param {any} job
+ */
+export const stepFraction = ({ status, progress }) => (["running", "finishing"].includes(status) && progress?.total && progress.stage !== "video" ? progress.fraction : undefined);
 export const UNFINISHED = new Set(states.unfinished);
 
 /**

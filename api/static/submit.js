@@ -529,7 +529,7 @@ export class SubmitView {
     const answer = await ask("POST", "v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: AbortSignal.any([this.leaving.signal, /** @type {AbortController} */ (this.stopping).signal]) });
     if (!answer.headers.get("content-type")?.includes("event-stream")) return void this.showPlan(body, await answer.json());
     for await (const { event, data } of eventsOf(answer)) {
-      if (event === "planning") this.sending.tell(say.planned(data.step, data.total), data.fraction);
+      if (event === "planning") this.sending.tell(data.stage === "planning" ? say.planned(data.step, data.total) : words.job.stages[data.stage], data.total ? data.fraction : undefined);
       else if (event === "problem") throw new Problem(data.status, data);
       else if (event === "plan") {
         this.showPlan(body, data);

@@ -211,8 +211,8 @@ class Inspector:
             inputs: `role`, `name`, `sha256` and `size` of each file.
             rows: Blob rows by digest.
             parameters: Parameters of the job.
-            show: Callback that receives the progress of planning: `step`, `total`, `fraction` and `eta_s`. One step is
-                one view.
+            show: Callback that receives the progress of planning: `stage`, `step`, `total`, `fraction` and `eta_s`. One
+                step is one view.
 
         Raises:
             RefusedInputError: If the inputs cannot be used.

@@ -86,6 +86,8 @@ MAX_ANSWER = 64 << 20
 #: Maximum number of progress messages of one child that are passed on. The calling process keeps them until its client
 #: has read them.
 MAX_REPORTS = 10_000
+#: Fields of a progress message; all but the first are numbers.
+_PROGRESS = ("stage", "step", "total", "fraction", "eta_s")
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
 #: Remaining weight (1 minus the sum of weights) up to which it counts as zero, because floats are rounded.
@@ -315,7 +317,7 @@ def video(staged: Staged, parameters: JobParameters, limits: dict[str, Any], sho
 
     def progress(done: int, total: int) -> None:
         left = (time.monotonic() - started) / done * (total - done)
-        show(PlanningProgress(done, total, left))
+        show(PlanningProgress(done, total, left, "video"))
 
     cameras = render_video(request, progress, in_place=True)
     return {"width": cameras[0].width, "height": cameras[0].height, "frames": len(cameras)}
@@ -469,7 +471,8 @@ def _run_child(request: dict[str, Any], writing: int) -> NoReturn:
         with os.fdopen(writing, "w") as file:
 
             def show(now: PlanningProgress) -> None:
-                progress = {"step": now.done, "total": now.total, "fraction": now.fraction, "eta_s": now.seconds_left}
+                values = (now.stage, now.done, now.total, now.fraction, now.seconds_left)
+                progress = dict(zip(_PROGRESS, values, strict=True))
                 print(json.dumps({"planning": progress}), file=file, flush=True)
 
             try:
@@ -596,9 +599,11 @@ def _is_response(answer: Any) -> bool:
     if not isinstance(answer, dict) or not answer.keys() & {"planning", "findings", "error"}:
         return False
     planning = answer.get("planning", {})
-    if not isinstance(planning, dict) or (planning and planning.keys() != {"step", "total", "fraction", "eta_s"}):
+    if not isinstance(planning, dict) or (planning and planning.keys() != set(_PROGRESS)):
         return False
-    if not all(value is None or isinstance(value, int | float) for value in planning.values()):
+    if not isinstance(planning.get("stage", ""), str):
+        return False
+    if not all(value is None or isinstance(value, int | float) for key, value in planning.items() if key != "stage"):
         return False
     error = answer.get("error", {"code": "", "message": "", "input": None})
     if not isinstance(error, dict) or error.keys() != {"code", "message", "input"}:

@@ -92,7 +92,8 @@ class VideoMaker:
             job: Job with a result.
             options: Options of the video.
             quotas: Quotas of the job's owner.
-            show: Callback that receives the progress: `step`, `total`, `fraction` and `eta_s`. One step is one frame.
+            show: Callback that receives the progress: `stage`, `step`, `total`, `fraction` and `eta_s`. One step is one
+                frame.
 
         Raises:
             NotFoundError: If the job has no result, or was deleted meanwhile.

@@ -164,11 +164,11 @@ class AttemptProcess:
 
 
 def report_planning(now: PlanningProgress) -> None:
-    """Report the progress of planning; one step is one view."""
+    """Report the progress of a stage before the steps; one step is one view."""
     send(
         {
             "kind": "stage",
-            "stage": "planning",
+            "stage": now.stage,
             "step": now.done,
             "total": now.total,
             "seconds_left": now.seconds_left,
@@ -214,6 +214,7 @@ def report_progress(now: Progress) -> None:
             "scales": list(now.scales) or None,
             "mean_loss": now.mean_loss,
             "mean_scales": list(now.mean_scales) or None,
+            "views": now.views,
         }
     )
 
@@ -239,6 +240,7 @@ def summary(result: Result) -> dict[str, Any]:
     return {
         "stopped": result.stopped,
         "steps": result.step,
+        "total": result.total,
         "loss_before": before,
         "loss_after": after,
         "report_error": result.report_error,

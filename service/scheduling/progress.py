@@ -60,8 +60,9 @@ def progress_seconds(elapsed: float) -> float:
 
 
 def progress_record(message: Message, attempt: int) -> dict[str, Any]:
-    """Convert a message to the progress entry of a job's record; in the stage `planning`, a step is a view."""
+    """Convert a message to the progress entry of a job's record; before the steps, a step is a view."""
     step, total = message.get("step", 0), message.get("total", 0)
+    checked, to_check = message.get("views") or (None, None)
     return {
         "stage": message.get("stage", "coarse" if message["kind"] == "progress" else "starting"),
         "step": step,
@@ -73,5 +74,7 @@ def progress_record(message: Message, attempt: int) -> dict[str, Any]:
         "mean_loss": message.get("mean_loss"),
         "mean_scales": message.get("mean_scales"),
         "seconds": message.get("seconds"),
+        "views_checked": checked,
+        "views_to_check": to_check,
         "attempt": attempt,
     }

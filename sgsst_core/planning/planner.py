@@ -20,7 +20,7 @@ from sgsst_core.planning.context import PlanningContext, equip
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import measure, probe_link
-from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
+from sgsst_core.planning.survey import PROBING, ShowPlanning, Survey, survey_views
 from sgsst_core.planning.view_costs import MAP_BYTES, MAPS_PER_RENDER
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
@@ -62,7 +62,7 @@ def make_plan(
         collectives: Ranks of the job.
         survey: Survey from an earlier plan of the same job; None to survey the views.
         measured: Whether the job will be measured between its steps; see `decide`.
-        show: Callback for the progress of the survey.
+        show: Callback for the progress of the survey and the probe.
         timer: Timer that records the survey as "survey", and everything else as "planning".
         orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
         about_inputs: Decisions about cameras and photos that start the plan.
@@ -97,6 +97,8 @@ def make_plan(
         if resolved is not None and resolved.mapped:
             maps = len(resolved.active)
         weighted = resolved is not None and resolved.content_weights(settings.content_weight) is not None
+        if show:
+            show(PROBING)
         link = probe_link(collectives, planning_context.network.device)
 
         def decide_here() -> Plan:

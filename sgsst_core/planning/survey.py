@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -26,25 +27,29 @@ SEEN_COVERAGE = 1 / 255
 
 @dataclass(frozen=True)
 class PlanningProgress:
-    """Progress of a survey.
+    """Progress of a stage before the steps.
 
     Attributes:
-        done: Views surveyed by all ranks together.
-        total: Views to survey.
-        seconds_left: Remaining seconds of the survey at the current rate; None before the first view is done.
+        done: Views completed by all ranks together, or frames of a video.
+        total: All views of the stage; 0 if it does not go by views, so that its length is unknown.
+        seconds_left: Remaining seconds of the stage at the current rate; None if unknown.
+        stage: "planning" (survey of the views), "refining" (choice of the Gaussians to split), "probing" (measurement
+            of the speed of the network and the rasterizer) or "video".
     """
 
     done: int
     total: int
     seconds_left: float | None = None
+    stage: Literal["planning", "refining", "probing", "video"] = "planning"
 
     @property
     def fraction(self) -> float:
-        """Fraction of the views, 0 to 1."""
+        """Fraction of the views, 0 to 1; 0 while the length is unknown."""
         return self.done / max(self.total, 1)
 
 
 ShowPlanning = Callable[[PlanningProgress], None]
+PROBING = PlanningProgress(0, 0, stage="probing")
 
 
 def progress_of(surveyed: int, total: int, ranks: int, seconds: float) -> PlanningProgress:

@@ -21,7 +21,7 @@ from sgsst_core.loss.terms import layers_of
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName
-from sgsst_core.stylizing.evaluation import Evaluation, evaluate
+from sgsst_core.stylizing.evaluation import Evaluation, ShowViews, evaluate, show_nothing
 from sgsst_core.stylizing.job import StyleTargetCache
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.view_targets import ViewTargets
@@ -125,11 +125,10 @@ class Float32Reference(ExactLoss):
             content_maps=stylizer.job.styles.content_maps(rasterizer, self.shown),
         )
 
-    def evaluate(self, indices: list[int], sh_dc: Tensor) -> Evaluation:
+    def evaluate(self, indices: list[int], sh_dc: Tensor, show: ShowViews = show_nothing) -> Evaluation:
         """Return the mean SOS loss over views, by scale, for colors [N, 3] of the whole scene."""
-        return evaluate(
-            self.view_targets, self.style_targets, indices, sh_dc[self.shown].to(self.views.rasterizer.device)
-        )
+        values = sh_dc[self.shown].to(self.views.rasterizer.device)
+        return evaluate(self.view_targets, self.style_targets, indices, values, show)
 
     def gradient(self, index: int, sh_dc: Tensor, scales: list[int]) -> tuple[Tensor, float]:
         """Compute dE/dsh_dc [N, 3] for colors [N, 3] of the whole scene.

@@ -26,7 +26,7 @@ from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViews
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.evaluation import Evaluation
+from sgsst_core.stylizing.evaluation import Evaluation, ShowViews, show_nothing
 from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.stylizer import Stylizer
 
@@ -46,10 +46,11 @@ class Measurements:
 
     Args:
         stylizer: Job, at any step.
+        show: Callback before each view of a measurement, with the number of completed and of all views.
     """
 
-    def __init__(self, stylizer: Stylizer) -> None:
-        self._stylizer = stylizer
+    def __init__(self, stylizer: Stylizer, show: ShowViews = show_nothing) -> None:
+        self._stylizer, self._show = stylizer, show
         self.approximated = approximations(stylizer)
         self._exact: Float32Reference | None = None
         self._novel_views: NovelViews | None = None
@@ -99,12 +100,12 @@ class Measurements:
         """Return the exact loss on the evaluation views, for the current colors or the unstylized scene."""
         stylizer = self._stylizer
         if unstylized and not self.approximated:
-            return stylizer.start()
+            return stylizer.start(self._show)
         with stylizer.measuring():
             if not self.approximated:
-                return stylizer.evaluate(stylizer.job.evaluation_views, stylizer.shown())
+                return stylizer.evaluate(stylizer.job.evaluation_views, stylizer.shown(), self._show)
             colors = stylizer.job.scene.sh_dc if unstylized else stylizer.stylized()
-            return self.exact.evaluate(stylizer.job.evaluation_views, colors)
+            return self.exact.evaluate(stylizer.job.evaluation_views, colors, self._show)
 
     def at_the_end(self) -> None:
         """Measure the step at which the job stopped, if it has not been measured yet, and judge the result."""
@@ -176,7 +177,7 @@ class Measurements:
             own["approximated"] = self.approximated
         if not novel_views.views:
             return None
-        measured = novel_views.measure(colors.to(novel_views.rasterizer.device))
+        measured = novel_views.measure(colors.to(novel_views.rasterizer.device), self._show)
         if not start and (
             not stylizer.measured or stylizer.measured[0]["step"]
         ):  # relative values require a measured start

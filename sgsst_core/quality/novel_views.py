@@ -34,6 +34,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions.maps import ViewMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.stylizing.evaluation import ShowViews, show_nothing
 from sgsst_core.stylizing.view_colors import ViewColors
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
@@ -138,8 +139,8 @@ class NovelViews:
         self._image_memory = memory // 4
 
     @torch.no_grad()
-    def measure(self, sh_dc: Tensor) -> NovelViewMoment:
-        """Measure the scene with colors `sh_dc` [N, 3].
+    def measure(self, sh_dc: Tensor, show: ShowViews = show_nothing) -> NovelViewMoment:
+        """Measure the scene with colors `sh_dc` [N, 3]; `show` is called before each view.
 
         Raises:
             ValueError: If an image contains NaN or infinity.
@@ -150,7 +151,7 @@ class NovelViews:
         def image(index: int) -> Tensor:
             return images.get(index, lambda: self._image(index, sh_dc))
 
-        gram = self._gram(image)
+        gram = self._gram(image, show)
         self.first = self.first or gram
         start = _mean(self.first)
         return NovelViewMoment(
@@ -165,10 +166,11 @@ class NovelViews:
         camera = self.cameras[index]
         return shown(self.rasterizer.render(self._colors(index, sh_dc), camera), camera, self.rasterizer.device)
 
-    def _gram(self, image: Callable[[int], Tensor]) -> dict[int, float]:
+    def _gram(self, image: Callable[[int], Tensor], show: ShowViews) -> dict[int, float]:
         """Compute the Gram distance by scale, as the mean over the views that have the scale."""
         values: dict[int, list[float]] = {}
-        for index in self.views:
+        for done, index in enumerate(self.views):
+            show(done, len(self.views))
             coverage = None
             if self.weighted:
                 coverage = self._coverage.get(index, partial(self.rasterizer.coverage, self.cameras[index]))

@@ -20,15 +20,26 @@ from sgsst_core.stylizing.state import StepRecord
 from sgsst_core.stylizing.view_targets import ViewTargets
 
 Evaluation = dict[int, LossTerms]
+#: Callback that receives the number of completed and of all views.
+ShowViews = Callable[[int, int], None]
+
+
+def show_nothing(done: int, total: int) -> None:
+    """Ignore the progress."""
 
 
 def evaluate(
-    targets: ViewTargets, style_targets: Callable[[Camera], StyleTargets], indices: Sequence[int], sh_dc: Tensor
+    targets: ViewTargets,
+    style_targets: Callable[[Camera], StyleTargets],
+    indices: Sequence[int],
+    sh_dc: Tensor,
+    show: ShowViews = show_nothing,
 ) -> Evaluation:
-    """Return the mean SOS loss of colors [n, 3] over views, split by scale."""
+    """Return the mean SOS loss of colors [n, 3] over views, split by scale; `show` is called before each view."""
     views, loss = targets.views, targets.loss
     evaluations = []
-    for index in indices:
+    for done, index in enumerate(indices):
+        show(done, len(indices))
         camera = views.cameras[index]
         with torch.no_grad():
             image = views.render(index, views.colors(index, sh_dc))

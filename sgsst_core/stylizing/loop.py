@@ -34,6 +34,7 @@ class Progress:
         scales: Loss of the step by scale, full size first; None for skipped scales.
         mean_loss: Loss of the last round of views.
         mean_scales: Loss of the last round of views by scale, as in `scales`.
+        views: Number of completed and of all views of a quality check after this step; None if none has started.
     """
 
     stage: str
@@ -45,6 +46,7 @@ class Progress:
     scales: tuple[float | None, ...] = ()
     mean_loss: float | None = None
     mean_scales: tuple[float | None, ...] = ()
+    views: tuple[int, int] | None = None
 
 
 class Measuring(Protocol):

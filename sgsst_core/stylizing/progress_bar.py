@@ -16,7 +16,12 @@ if TYPE_CHECKING:
 
 #: Seconds between lines if there is no terminal, such as in a log file.
 LOG_SECONDS = 60.0
-_STAGES = {"coarse": "coarsest scale", "sos": "all scales", "measuring": "measuring"}
+_PLANNING = {
+    "planning": "Surveying the views",
+    "refining": "Choosing Gaussians to split",
+    "probing": "Measuring the speed",
+}
+_STAGES = {"coarse": "coarsest scale", "sos": "all scales", "measuring": "checking quality"}
 
 
 def live_bar(console: Console, *columns: ProgressColumn, enabled: bool = True) -> Progress:
@@ -28,6 +33,11 @@ def live_bar(console: Console, *columns: ProgressColumn, enabled: bool = True) -
     return Progress(*columns, console=console, transient=True, disable=not (enabled and live))
 
 
+def set_total(bar: Progress, total: float | None) -> None:
+    """Set the total of a bar's only task; None if it is unknown, which `Progress.update` would ignore."""
+    bar.tasks[0].total = total
+
+
 class JobBar:
     """Progress of a job, from reading the scene to the last step; see `job_bar`."""
 
@@ -37,28 +47,31 @@ class JobBar:
         self._last_line = time.monotonic()
 
     def show_planning(self, planning: PlanningProgress) -> None:
-        """Show how many views have been surveyed."""
-        left = "" if planning.seconds_left is None else f"{clock(planning.seconds_left)} left"
-        self._show("Surveying the views", planning.done, planning.total, left)
-        self._print_now_and_then(f"Surveying the views: {planning.done} of {planning.total}", left)
+        """Show the stage, and how many of its views are completed."""
+        stage, left = _PLANNING[planning.stage], time_left(planning.seconds_left)
+        self._show(stage, planning.done, planning.total or None, left)
+        done = f": {planning.done} of {planning.total}" if planning.total else ""
+        self._print_now_and_then(f"{stage}{done}", left)
 
     def start(self, step: int, total: int) -> None:
         """Show the number of completed steps, before the next one."""
         self._show("starting", step, total, "")
 
     def show(self, progress: StepProgress) -> None:
-        """Show a step."""
-        stage = _STAGES[progress.stage]
-        loss, left = f"loss {progress.mean_loss or progress.loss:.3g}", f"{clock(progress.seconds_left)} left"
-        self._show(stage, progress.step, progress.total, f"{loss} {left}")
-        self._print_now_and_then(f"{stage}: step {progress.step} of {progress.total}", loss, left)
+        """Show a step, or the views of a quality check."""
+        stage, left = _STAGES[progress.stage], time_left(progress.seconds_left)
+        loss = f"loss {progress.mean_loss or progress.loss:.3g}"
+        done, total = progress.views or (progress.step, progress.total)
+        self._show(stage, done, total, f"{loss} {left}")
+        self._print_now_and_then(f"{stage}: {'view' if progress.views else 'step'} {done} of {total}", loss, left)
 
     def show_compiling(self) -> None:
         """Show that kernels are being compiled, which takes half a minute in the first job on a machine."""
         self._bar.update(self._task, description="Compiling kernels, once on this machine")
 
-    def _show(self, description: str, done: int, total: int, note: str) -> None:
-        self._bar.update(self._task, description=description, completed=done, total=total, note=note)
+    def _show(self, description: str, done: int, total: int | None, note: str) -> None:
+        set_total(self._bar, total)
+        self._bar.update(self._task, description=description, completed=done, note=note)
 
     def _print_now_and_then(self, *parts: str) -> None:
         if self._bar.disable and time.monotonic() - self._last_line >= LOG_SECONDS:
@@ -81,6 +94,13 @@ def job_bar(console: Console) -> Iterator[JobBar]:
         bar = JobBar(live)
         with compilations_reported(bar.show_compiling):
             yield bar
+
+
+def time_left(seconds: float | None) -> str:
+    """Return the remaining time of a stage as text; empty if it is unknown."""
+    if seconds is None:
+        return ""
+    return f"{clock(seconds)} left" if seconds >= 1 else "almost done"
 
 
 def clock(seconds: float) -> str:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -26,7 +27,7 @@ from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.context import PlanningContext, equip
-from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
+from sgsst_core.planning.survey import PlanningProgress, ShowPlanning, progress_of, sees_something
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, finest_size, most_children
 from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split
@@ -73,7 +74,8 @@ def refine(
         rasterizer: Name of the rasterizer, as in `make_plan`.
         collectives: Ranks of the job.
         regions: Regions of the scene; frozen Gaussians are not split.
-        show: Callback, called before each view that is surveyed, and before each view whose gradient is computed.
+        show: Callback, called before each view that is surveyed, before each view whose gradient is computed, and
+            before images are compared.
 
     Returns:
         The refinement; None if `settings.refine` turns it off.
@@ -149,6 +151,8 @@ class _Refining:
         )
         chosen = int((piece_counts(pieces) > 1).sum())
         fitted = spread_evenly(covered, GRADIENT_VIEWS)
+        if self._show:
+            self._show(PlanningProgress(0, 0, stage="refining"))
         pieces, change = self._undo_until_images_are_preserved(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
         counts = piece_counts(pieces)
         parents = int((counts > 1).sum())
@@ -184,7 +188,7 @@ class _Refining:
         """Survey every view, and return those that see anything."""
         collectives, cameras = self._collectives, self._planning_context.cameras
         covered = []
-        for index in self._shown(range(len(cameras))):
+        for index in self._shown(range(len(cameras)), "planning"):
             coverage, weights = self._rasterizer.survey(cameras[index])
             if sees_something(coverage):
                 covered.append(index)
@@ -208,7 +212,7 @@ class _Refining:
         )
         targets: dict[tuple[int, int], StyleTargets] = {}
         sums = torch.zeros((len(scene), 2), dtype=torch.float64)
-        for index in self._shown(views):
+        for index in self._shown(views, "refining"):
             camera = cameras[index]
             size = (camera.height, camera.width)
             if size not in targets:
@@ -275,12 +279,13 @@ class _Refining:
         """Return the views that this rank processes."""
         return views[self._collectives.rank :: self._collectives.size]
 
-    def _shown(self, views: Sequence[int]) -> Iterator[int]:
+    def _shown(self, views: Sequence[int], stage: Literal["planning", "refining"]) -> Iterator[int]:
         """Yield the views that this rank processes, one by one, and report progress."""
         started = time.perf_counter()
         for done, index in enumerate(self._of_this_rank(views)):
             if self._show:
-                self._show(progress_of(done, len(views), self._collectives.size, time.perf_counter() - started))
+                now = progress_of(done, len(views), self._collectives.size, time.perf_counter() - started)
+                self._show(replace(now, stage=stage))
             yield index
 
     def _sum(self, values: Tensor) -> Tensor:

@@ -30,9 +30,11 @@ from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.evaluation import (
     Evaluation,
+    ShowViews,
     evaluate,
     mean_evaluation,
     mean_loss,
+    show_nothing,
 )
 from sgsst_core.stylizing.job import StylizationJob, plan_job
 from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
@@ -144,11 +146,11 @@ class Stylizer:
         """Return the completed fraction of the schedule, 0 to 1, which determines the learning rate."""
         return self.step / max(self.job.total_steps - 1, 1)
 
-    def start(self) -> Evaluation:
+    def start(self, show: ShowViews = show_nothing) -> Evaluation:
         """Return the loss of the unstylized scene on the evaluation views; evaluated once, at the first call."""
         if self._start is None:
             with self.measuring():
-                self._start = self.evaluate(self.job.evaluation_views, self.job.views.scene.sh_dc)
+                self._start = self.evaluate(self.job.evaluation_views, self.job.views.scene.sh_dc, show)
         return self._start
 
     @contextmanager
@@ -300,7 +302,9 @@ class Stylizer:
         """Remaining views of this round, next one first."""
         return self._order.left[::-1]
 
-    def evaluate(self, indices: Sequence[int], sh_dc: Tensor | None = None) -> Evaluation:
+    def evaluate(
+        self, indices: Sequence[int], sh_dc: Tensor | None = None, show: ShowViews = show_nothing
+    ) -> Evaluation:
         """Return the mean SOS loss over views, split by scale.
 
         This does not affect steps, and its time is not recorded.
@@ -308,11 +312,12 @@ class Stylizer:
         Args:
             indices: Indices of the views.
             sh_dc: [n, 3], colors of the rendered Gaussians to evaluate; None for the present ones.
+            show: Callback that receives the number of completed and of all views.
         """
         self._cache_visited()
         values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
         job = self.job
-        return with_second_attempt(job, lambda: evaluate(job.view_targets, job.style_targets, indices, values))
+        return with_second_attempt(job, lambda: evaluate(job.view_targets, job.style_targets, indices, values, show))
 
     def gradient(self, index: int, scales: Sequence[int]) -> tuple[Tensor, float]:
         """Return dE/dsh_dc [n, 3] of the rendered Gaussians on the CPU, as a step computes it, and its time in seconds.

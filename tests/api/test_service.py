@@ -103,7 +103,7 @@ def wait_until(service: Service, client: httpx.Client, job_id: str, *statuses: s
 def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int, attempt: int = 1) -> None:
     def there() -> bool:
         progress = job(client, job_id)["progress"] or {}
-        stepping = progress.get("stage") not in ("planning", "starting")
+        stepping = progress.get("stage") not in ("planning", "probing", "starting")
         return stepping and progress.get("attempt") == attempt and progress.get("step", 0) >= step
 
     wait_for(there, f"step {step}", service.said)
@@ -175,6 +175,7 @@ def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], tm
         assert (shown_job["status"], shown_job["name"], shown_job["attempt"]) == ("succeeded", "my wall", 1)
         assert shown_job["progress"]["fraction"] == 1
         assert shown_job["result"]["loss_after"] < shown_job["result"]["loss_before"]
+        assert shown_job["result"]["steps"] == shown_job["result"]["total"] == FEW_STEPS
         same = client.get(f"/v1/jobs/{job_id}", headers={"If-None-Match": first.headers["etag"]})
         assert (same.status_code, same.content) == (304, b"")
         listed = client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]

@@ -88,13 +88,13 @@ def test_planning_is_shown_and_resume_reuses_the_plan(request_: StylizeRequest, 
     run_job(prepare(whole))
     planned: list[PlanningProgress] = []
     first = prepare(request_, show_planning=planned.append)
-    assert [(now.done, now.total) for now in planned] == [(0, 3), (1, 3), (2, 3), (3, 3)]
-    assert [now.seconds_left is None for now in planned] == [True, False, False, False]
-    assert planned[-1].fraction == 1.0
-    assert planned[-1].seconds_left == 0.0
+    assert [(now.done, now.total) for now in planned] == [(0, 3), (1, 3), (2, 3), (3, 3), (0, 0)]
+    assert [now.seconds_left is None for now in planned] == [True, False, False, False, True]
+    assert planned[-2].fraction == 1.0
+    assert planned[-2].seconds_left == 0.0
     assert run_job(first, steps=3).stopped == "interrupted"
     second = prepare(request_, resume=Resume(True), show_planning=planned.append)
-    assert len(planned) == 4, "nothing is looked at again"
+    assert len(planned) == 5, "nothing is looked at again"
     assert second.resumed is not None
     assert second.resumed.state.step == 3
     assert second.stylizer.job.plan == second.resumed.plan
@@ -184,7 +184,7 @@ def test_planning_is_shown(request_: StylizeRequest) -> None:
     reports: list[PlanningProgress] = []
     job = prepare(request_, show_planning=reports.append)
     views = len(job.stylizer.job.views)
-    assert [progress.done for progress in reports] == list(range(views + 1))
+    assert [progress.done for progress in reports] == [*range(views + 1), 0]
 
 
 def test_report_has_seconds_before_the_first_step(request_: StylizeRequest) -> None:

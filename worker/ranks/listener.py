@@ -32,8 +32,8 @@ class Listener:
         left_out: Called with the GPUs that the job released because the plan does not use them, by their names in
             CUDA_VISIBLE_DEVICES on their machine.
         stored: Called with the workplace's description of each stored file, in order.
-        planning: Called with the progress of the survey of the views, a few times per second. An attempt repeats the
-            survey if no earlier attempt has saved its plan.
+        planning: Called with the progress of the stages before the steps, a few times per second. An attempt repeats
+            the survey if no earlier attempt has saved its plan.
     """
 
     prepared: Callable[[Prepared], None] = lambda prepared: None
@@ -72,7 +72,8 @@ class Relay:
         self.first_step: int | None = None
         self.safe_at = time.monotonic()
         self._prepared = False
-        self._planned = -1  # surveyed views at the last notification
+        self._planned: PlanningProgress | None = None
+        self._progress: Progress | None = None
         self._warned = self._previewed = self._reported_files = 0
         self.stored: list[Any] = []
 
@@ -85,7 +86,7 @@ class Relay:
         """Reset the state of the current attempt for a new set of ranks."""
         self.first_step, self.last_step = None, self.saved or 0
         self._warned = self._previewed = self._reported_files = 0
-        self._planned = -1
+        self._planned = self._progress = None
 
     def pass_on(self, status: RankStatus) -> None:
         """Notify the listener of everything that is new in the latest status of rank 0."""
@@ -106,8 +107,8 @@ class Relay:
             self.saved, self.safe_at = status.saved, time.monotonic()
 
     def _pass_on_planning(self, status: RankStatus) -> None:
-        if status.planning is not None and status.planning.done != self._planned:
-            self._planned = status.planning.done
+        if status.planning is not None and status.planning != self._planned:
+            self._planned = status.planning
             self._listener.planning(status.planning)
 
     def _pass_on_prepared(self, status: RankStatus) -> None:
@@ -120,10 +121,12 @@ class Relay:
             self._listener.prepared(status.prepared)
 
     def _pass_on_progress(self, status: RankStatus) -> None:
-        if status.progress is None or status.progress.step == self.last_step:
+        if status.progress is None or status.progress == self._progress:
             return
-        if self.last_step == self.first_step:
-            self._resumed()
-        self.last_step = status.progress.step
-        self.step = max(self.step, self.last_step)
+        self._progress = status.progress
+        if status.progress.step != self.last_step:
+            if self.last_step == self.first_step:
+                self._resumed()
+            self.last_step = status.progress.step
+            self.step = max(self.step, self.last_step)
         self._listener.progress(status.progress)

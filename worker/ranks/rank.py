@@ -117,7 +117,7 @@ class RankStatus:
     """Status of a rank, which it returns when it is polled.
 
     Attributes:
-        planning: Progress of the survey of the views; None before it starts.
+        planning: Progress of the current stage before the steps; None before the first one.
         prepared: Summary of the prepared job; set on rank 0 only.
         progress: Progress of the last step; set on rank 0 only.
         saved: Step of the last checkpoint. With a workplace, a checkpoint counts once it is stored.

@@ -77,7 +77,7 @@ def test_masks_of_regions_are_sent(
     assert second == bytes([1, *bytes(76)])
 
 
-def finish(service: Service, job_id: str, content: bytes, folder: Path) -> None:
+def finish(service: Service, job_id: str, content: bytes, folder: Path, **result: Any) -> None:
     """Finish a queued job in place of a dispatcher, with this content as its result."""
     settings = ServiceSettings(data=service.data)
     store = open_store(settings)
@@ -85,9 +85,9 @@ def finish(service: Service, job_id: str, content: bytes, folder: Path) -> None:
     path.write_bytes(content)
     try:
         while (lease := store.leases.take("test")) is not None:
-            result = Artifacts(settings.artifacts_url).put(lease.job_id, lease.epoch, "stylized.ply", path)
+            file = Artifacts(settings.artifacts_url).put(lease.job_id, lease.epoch, "stylized.ply", path)
             store.leases.start(lease)
-            store.leases.succeed(lease, [result], {"steps": 1, "loss_before": 2.0, "loss_after": 1.0})
+            store.leases.succeed(lease, [file], {"steps": 1, "loss_before": 2.0, "loss_after": 1.0, **result})
             if lease.job_id == job_id:
                 return
     finally:
@@ -118,6 +118,19 @@ def test_exit_codes_and_errors_as_json(files: list[str], capsys: pytest.CaptureF
     capsys.readouterr()
     assert main(["status", MISSING]) == 3
     assert capsys.readouterr().err == f"error: There is no job {MISSING}.\n"
+
+
+def test_job_that_ended_early_says_how_little_was_done(
+    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+) -> None:
+    job_id = submit(files, capsys)
+    finish(service, job_id, b"result", tmp_path, stopped="max-seconds", steps=2, total=60, loss_after=1.94)
+    assert main(["status", job_id]) == 0
+    shown = capsys.readouterr().out
+    assert "2 of 60: it reached --max-seconds (submit it again with more seconds" in shown
+    assert "(97.0%)" in shown
+    assert main(["watch", job_id]) == 0
+    assert "2 of 60: it reached --max-seconds" in capsys.readouterr().out
 
 
 def test_service_that_is_not_there_is_reported_at_once(

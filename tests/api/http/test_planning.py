@@ -57,6 +57,8 @@ def test_events_report_views_and_same_plan(service: Service, files: dict[str, by
         *planning, last = events(client, files)
         assert {sent.event for sent in planning} == {"planning"}
         now = [sent.json() for sent in planning]
+        assert now.pop() == {"stage": "probing", "step": 0, "total": 0, "fraction": 0.0, "eta_s": None}
+        assert {entry["stage"] for entry in now} == {"planning"}
         assert [entry["total"] for entry in now] == [3] * len(now)
         assert [entry["step"] for entry in now] == sorted(entry["step"] for entry in now)
         assert (now[-1]["step"], now[-1]["fraction"]) == (3, 1.0)

@@ -110,22 +110,86 @@ def fill_the_screen(watched: Watched) -> None:
     page.locator(".stage:not(:fullscreen)").wait_for()
 
 
-def test_no_remaining_time_is_shown_while_views_are_analyzed(visit: Visit, finished: str) -> None:
-    """The survey's own remaining time, which ends at 0, is not that of the job."""
+@pytest.mark.parametrize(
+    ("stage", "views", "text"),
+    [
+        ("planning", {"step": 9, "total": 9, "fraction": 1.0, "eta_s": 0.0}, "Analyzing views · view 9 of 9"),
+        ("probing", {"step": 0, "total": 0, "fraction": 0.0, "eta_s": None}, "Measuring the speed"),
+        ("measuring", {"step": 60, "total": 60, "fraction": 1.0, "eta_s": 0.0}, "Checking quality · view 3 of 8"),
+    ],
+)
+def test_stages_beside_steps_count_their_own_views(
+    visit: Visit, finished: str, stage: str, views: dict[str, Any], text: str
+) -> None:
+    """The survey's own remaining time, which ends at 0, is not that of the job, and its views are not steps."""
+    status = "running" if stage == "measuring" else "starting"
+    checked = {"views_checked": 3, "views_to_check": 8} if stage == "measuring" else {}
+    changed = {"status": status, "progress": {"stage": stage, **views, **checked}}
 
-    def planning(route: Any) -> None:
-        progress = {"stage": "planning", "step": 9, "total": 9, "fraction": 1.0, "eta_s": 0.0}
-        job = route.fetch().json() | {"status": "running", "progress": progress}
-        route.fulfill(json=job)
+    def change(route: Any) -> None:
+        content = route.fetch().json()
+        jobs = [job | changed for job in content.get("jobs", [])]
+        route.fulfill(json={**content, "jobs": jobs} if jobs else content | changed)
 
     watched = visit("/#/jobs")
     page = watched.page
-    page.route(f"**/v1/jobs/{finished}", planning)
+    page.route(f"**/v1/jobs/{finished}", change)
+    page.route("**/v1/jobs?*", change)
     page.route(f"**/v1/jobs/{finished}/events", lambda route: None)  # its events are those of the real job
     page.goto(f"{watched.url}/#/jobs/{finished}")
-    page.get_by_text("Analyzing views · view 9 of 9").wait_for()
-    assert page.locator(".state .left").inner_text() == ""
+    page.get_by_text(text, exact=True).wait_for()
+    assert page.locator(".state .left").inner_text() == ("almost done" if stage == "measuring" else "")
+    bar = {"planning": "1", "probing": None, "measuring": "0.375"}[stage]
+    assert page.locator(".state progress").get_attribute("value") == bar
     page.get_by_role("heading", name="How it will run").wait_for()
+    page.goto(f"{watched.url}/#/jobs")
+    card = page.locator(".tile", has=page.locator(f"a[href='#/jobs/{finished}']"))
+    card.locator(".badge", has_text="Running" if stage == "measuring" else "Starting").wait_for()
+    assert card.get_by_text("100%").count() == card.locator("progress").count() == (stage == "measuring")
+    page.unroute_all(behavior="ignoreErrors")
+    watched.check()
+
+
+@pytest.mark.parametrize(
+    ("result", "text"),
+    [
+        (
+            {"stopped": "max-seconds", "steps": 2, "total": 60, "loss_after": 97.0},
+            "The time limit ended this job early: 2 of 60 steps, 97% of the loss is left. For more, choose “Same with "
+            "changes” and raise the time limit.",
+        ),
+        (
+            {"stopped": "on-request", "steps": 5, "total": 60, "loss_after": 130.0},
+            "This job was stopped early: 5 of 60 steps, the loss is 30% above that of the original. For all steps, "
+            "choose “Same with changes” and start again.",
+        ),
+        (
+            {"stopped": "finished", "steps": 60, "total": 60, "loss_after": 130.0},
+            "The loss has risen: choose “Same with changes” and give it more steps.",
+        ),
+    ],
+)
+def test_job_that_did_little_is_not_just_done(visit: Visit, finished: str, result: dict[str, Any], text: str) -> None:
+    def change(route: Any) -> None:
+        content = route.fetch().json()
+        jobs = [job | {"result": {**result, "loss_before": 100.0}} for job in content.get("jobs", [])]
+        route.fulfill(
+            json={**content, "jobs": jobs} if jobs else content | {"result": {**result, "loss_before": 100.0}}
+        )
+
+    watched = visit("/#/jobs")
+    page = watched.page
+    page.get_by_role("link", name="Jobs").wait_for()
+    page.route(f"**/v1/jobs/{finished}", change)
+    page.route("**/v1/jobs?*", change)
+    page.goto(f"{watched.url}/#/jobs/{finished}")
+    page.locator(".badge", has_text="Done").wait_for()
+    assert page.locator(".warnings").inner_text() == text
+    page.goto(f"{watched.url}/#/jobs")
+    card = page.locator(".tile", has=page.locator(f"a[href='#/jobs/{finished}']"))
+    card.locator(".badge", has_text="Done").wait_for()
+    early = result["steps"] < result["total"]
+    assert card.get_by_text(f"{result['steps']} of 60 steps").count() == early
     page.unroute_all(behavior="ignoreErrors")
     watched.check()
 

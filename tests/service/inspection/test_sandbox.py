@@ -167,7 +167,7 @@ def forger(folder: Path, answer: str) -> Path:
         pytest.param('{"error": {}}', marks=pytest.mark.slow),
         pytest.param('{"error": {"code": 1, "message": [], "input": {}}}', marks=pytest.mark.slow),
         '{"findings": 7}',
-        '{"planning": {"step": "x", "total": [], "fraction": {}, "eta_s": null}}\n{"findings": {}}',
+        '{"planning": {"stage": "planning", "step": "x", "total": [], "fraction": {}, "eta_s": 0}}\n{"findings": {}}',
         '{"findings": {}}\n{"findings": {"gaussians": 7}}',
     ],
 )
@@ -184,7 +184,7 @@ def test_forged_response_affects_only_its_own_request(
 
 
 def test_flood_of_progress_is_bounded(inspect_shared: Inspect, tmp_path: Path, files: dict[str, Path]) -> None:
-    progress = {"step": 1, "total": 2, "fraction": 0.5, "eta_s": None}
+    progress = {"stage": "planning", "step": 1, "total": 2, "fraction": 0.5, "eta_s": None}
     flood = (json.dumps({"planning": progress}) + "\n") * (2 * MAX_REPORTS)
     scene = forger(tmp_path, flood + '{"findings": {}}')
     shown: list[dict[str, Any]] = []

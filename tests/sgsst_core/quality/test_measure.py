@@ -55,6 +55,19 @@ def test_cheap_measurements_cover_all_moments(tiny_weights: BackboneWeights) -> 
     assert stylizer.seconds_by_part["measuring"] >= sum(entry["seconds"] for entry in stylizer.measured)
 
 
+def test_checked_views_are_shown(tiny_weights: BackboneWeights) -> None:
+    stylizer, checked = make(tiny_weights, level=NOTHING - 1), list[tuple[int, int]]()
+    measure = Measurements(stylizer, lambda done, total: checked.append((done, total)))
+    run(stylizer)
+    measure.at_the_end()
+    novel = len(stylizer.measured[0]["novel_view_names"])
+    assert checked == [(done, novel) for done in range(novel)]
+    checked.clear()
+    measure.evaluate(unstylized=True)
+    views = len(stylizer.job.evaluation_views)
+    assert checked == [(done, views) for done in range(views)]
+
+
 @pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
 def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: BackboneWeights, style_loss: str) -> None:
     usual, other = (make(tiny_weights, level=NOTHING - 2, style_loss=each) for each in ("sos", style_loss))

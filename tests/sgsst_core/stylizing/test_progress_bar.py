@@ -9,7 +9,7 @@ import numba
 import pytest
 from rich.console import Console
 
-from sgsst_core.planning.survey import PlanningProgress
+from sgsst_core.planning.survey import PROBING, PlanningProgress
 from sgsst_core.stylizing import progress_bar
 from sgsst_core.stylizing.loop import Progress
 from sgsst_core.stylizing.progress_bar import clock, job_bar
@@ -22,10 +22,14 @@ def shown(*, terminal: bool) -> str:
         for done, left in [(0, None), (3, 125.0), (8, 0.0)]:
             bar.show_planning(PlanningProgress(done, 8, left))
             bar._bar.refresh()  # now, instead of within a tenth of a second
+        bar.show_planning(PROBING)
+        bar._bar.refresh()
         bar.start(0, 50)
         for step in (1, 2):
             bar.show(Progress("coarse", step, 50, 123.4, 1.0, 61.0))
             bar._bar.refresh()
+        bar.show(Progress("measuring", 2, 50, 123.4, 1.0, 0.4, views=(3, 6)))
+        bar._bar.refresh()
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -34,6 +38,9 @@ def test_terminal_shows_views_then_steps() -> None:
     output = shown(terminal=True)
     for text in ("Surveying the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123 1:01 left"):
         assert text in output
+    measuring, checking = output.index("Measuring the speed"), output.index("checking quality")
+    assert "8/8" not in output[measuring:], "the survey is over"
+    assert "3/6 loss 123 almost done" in output[checking:]
 
 
 def test_terminal_shows_compilation_of_kernels() -> None:
@@ -55,9 +62,11 @@ def test_log_prints_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None
     assert shown(terminal=False).strip().splitlines() == [
         "Surveying the views: 0 of 8",
         "Surveying the views: 3 of 8, 2:05 left",
-        "Surveying the views: 8 of 8, 0:00 left",
+        "Surveying the views: 8 of 8, almost done",
+        "Measuring the speed",
         "coarsest scale: step 1 of 50, loss 123, 1:01 left",
         "coarsest scale: step 2 of 50, loss 123, 1:01 left",
+        "checking quality: view 3 of 6, loss 123, almost done",
     ]
 
 

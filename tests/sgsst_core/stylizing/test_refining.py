@@ -182,16 +182,17 @@ def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> N
 
 
 def test_refinement_reports_its_progress(tiny_weights: BackboneWeights) -> None:
-    reports: list[tuple[int, int]] = []
+    reports: list[tuple[str, int, int]] = []
     refine(
         large_wall(),
         cameras(),
         style(),
         settings(refine=2.0),
         weights=tiny_weights,
-        show=lambda now: reports.append((now.done, now.total)),
+        show=lambda now: reports.append((now.stage, now.done, now.total)),
     )
-    assert reports == 2 * [(0, 3), (1, 3), (2, 3)]  # surveyed, and asked for their gradient
+    stages = [(stage, done, 3) for stage in ("planning", "refining") for done in range(3)]
+    assert reports == [*stages, ("refining", 0, 0)]
 
 
 def test_views_are_spread_evenly() -> None:

@@ -62,6 +62,13 @@ def test_planning_progress_is_relayed_until_prepared() -> None:
     ]
 
 
+def test_views_of_a_quality_check_are_relayed() -> None:
+    recorder = EventRecorder()
+    done = RankStatus(prepared=Prepared([], 0, 10), progress=step(10))
+    checks = [replace(done, progress=replace(step(10), stage="measuring", views=(view, 2))) for view in (0, 0, 1)]
+    assert recorder.after(done, *checks)[1:] == [("resumed", None), ("step", 10), ("step", 10), ("step", 10)]
+
+
 def test_new_attempt_relays_planning_again() -> None:
     recorder = EventRecorder()
     recorder.after(planned(3))
