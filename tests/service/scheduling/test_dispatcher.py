@@ -86,7 +86,7 @@ def test_attempt_whose_files_hang_ends_by_the_store(
     job, _ = store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
 
     def error() -> dict[str, str] | None:
-        attempts = store.jobs.detail(job.id, None)[2]
+        attempts = store.jobs.detail(job.id, None)[1]
         return attempts[0].error if attempts else None
 
     with at_work(settings, store):

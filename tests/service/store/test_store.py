@@ -115,10 +115,9 @@ def test_queue_positions_match_the_order_of_leases(store: Store, clock: Clock) -
     for number, priority in enumerate([0, 5, 0, 5, -1, 0]):
         clock.now += number % 2  # two jobs at a time
         ids.append(queue(store, priority=priority))
-    by_position = {store.jobs.detail(job_id, "local")[1]: job_id for job_id in ids}
-    assert {store.jobs.detail(job_id, None)[0].position: job_id for job_id in ids} == by_position
+    by_position = {store.jobs.detail(job_id, "local")[0].position: job_id for job_id in ids}
     assert [lease(store).job_id for _ in ids] == [by_position[place] for place in range(1, len(ids) + 1)]
-    assert store.jobs.detail(ids[0], "local")[1] is None
+    assert store.jobs.detail(ids[0], "local")[0].position is None
 
 
 def test_concurrent_requests_with_one_idempotency_key_create_one_job(store: Store) -> None:
@@ -209,7 +208,7 @@ def test_job_that_kills_its_dispatchers_fails(store: Store, clock: Clock) -> Non
     assert store.leases.take("another") is None
     job = store.jobs.get(job_id, "local")
     assert (job.status, (job.error or {})["code"]) == ("failed", "dispatcher-lost")
-    assert [row.outcome for row in store.jobs.detail(job_id, None)[2]] == ["lost"] * MAX_LOSSES
+    assert [row.outcome for row in store.jobs.detail(job_id, None)[1]] == ["lost"] * MAX_LOSSES
 
 
 @pytest.mark.parametrize("next_dispatcher", ["one", "two"])
@@ -223,7 +222,7 @@ def test_database_outages_never_fail_a_job(store: Store, clock: Clock, next_disp
         held = lease(store, next_dispatcher)
         assert held.job.attempt == attempt
         assert held.job.failures == 0
-    ends = store.jobs.detail(job_id, None)[2][:-1]
+    ends = store.jobs.detail(job_id, None)[1][:-1]
     assert {(row.outcome, (row.error or {})["cause"]) for row in ends} == {("lost", "database")}
     counted = {labels: value for name, labels, value in store.operations.counters() if name == "sgsst_outages_total"}
     assert counted == {'cause="database"': len(ends)}
@@ -238,7 +237,7 @@ def test_loss_counts_once_without_free_capacity(store: Store, clock: Clock) -> N
         assert store.leases.take("full", lambda job: False) is None
     assert (store.jobs.get(job_id, None).status, store.jobs.get(job_id, None).failures) == ("queued", 0)
     assert lease(store, "free").job.attempt == 2
-    assert [row.outcome for row in store.jobs.detail(job_id, None)[2]] == ["lost", None]
+    assert [row.outcome for row in store.jobs.detail(job_id, None)[1]] == ["lost", None]
 
 
 def test_retry_delay_grows_with_each_failure(store: Store, clock: Clock) -> None:
