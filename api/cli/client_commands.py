@@ -355,14 +355,14 @@ def _sending_and_planning() -> Iterator[tuple[Any, Any]]:
         task = bar.add_task("checking", total=None, text="")
 
         def sent(done: int, total: int) -> None:
-            set_total(bar, None if done == total else total)
+            set_total(bar, None if done == total else total or None)
             bar.update(task, description="sending", completed=done, text=f"{done / 1e6:.0f} MB")
             if done == total:
                 bar.update(task, description="checking", text="")
 
         def planned(done: int, total: int) -> None:
-            text = f"view {done} of {total}" if total else "measuring the speed"
-            set_total(bar, total or None)
+            text = "measuring the speed" if done == total else f"view {done} of {total}"
+            set_total(bar, None if done == total else total)
             bar.update(task, description="planning", completed=done, text=text)
 
         yield sent, planned

@@ -127,7 +127,8 @@ class Transport:
                 return
             data = json.loads(event.data)
             if event.event == step:
-                progress(data["step"], data["total"])
+                if data["total"]:  # stages of unknown length have no steps
+                    progress(data["step"], data["total"])
             elif event.event == "problem":
                 raise refusal(data["detail"], data["status"], data)
             else:

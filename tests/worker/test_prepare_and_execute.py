@@ -21,6 +21,7 @@ from sgsst_core.planning.survey import PlanningProgress
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint
+from sgsst_core.stylizing.loop import Progress
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.small_scenes import wall
 from tests.worker.ranks.faults import Fault, small_request
@@ -40,9 +41,9 @@ def run_job(
     """Run a job; if `steps` is given, interrupt it after that many steps."""
     done = 0
 
-    def count(progress: object) -> None:
+    def count(progress: Progress) -> None:
         nonlocal done
-        done += 1
+        done += progress.views is None  # views of a quality check are no steps
 
     return execute(
         job,
@@ -127,10 +128,10 @@ def test_first_preview_precedes_planning(request_: StylizeRequest, tmp_path: Pat
     happened: list[str | tuple[int, int]] = []
     previews = Previews(tmp_path / "previews", 3600, lambda path: happened.append(path.name), pytest.fail)
     job = prepare(request_, preview=previews, show_planning=lambda now: happened.append((now.done, now.total)))
-    assert happened == ["step_0000000.jpg", (0, 3), (1, 3), (2, 3), (3, 3)]
+    assert happened == ["step_0000000.jpg", (0, 3), (1, 3), (2, 3), (3, 3), (0, 0)]
     first = (tmp_path / "previews" / "step_0000000.jpg").read_bytes()
     execute(job, progress=lambda now: None, stop=lambda: False, warn=pytest.fail, preview=previews)
-    assert happened[5:] == ["thumbnail.jpg"], "the first preview is written once, and the hour is not over"
+    assert happened[6:] == ["thumbnail.jpg"], "the first preview is written once, and the hour is not over"
     assert (tmp_path / "previews" / "step_0000000.jpg").read_bytes() == first
     without = small_request(tmp_path / "without", 8)
     run_job(prepare(without))
