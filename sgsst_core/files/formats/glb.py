@@ -46,7 +46,8 @@ _MAX_BYTES = (1 << 32) - 1
 _EXTENSION = "KHR_gaussian_splatting"
 #: Extensions that change nothing in what is read. Files that require another one are refused.
 _HARMLESS = re.compile(
-    rf"{_EXTENSION}|KHR_mesh_quantization|[A-Z]+_(materials|texture|lights|xmp|audio|animation)(_\w+)?"
+    rf"{_EXTENSION}|KHR_mesh_quantization|EXT_(mesh_features|structural_metadata)"
+    r"|[A-Z]+_(materials|texture|lights|xmp|audio|animation)(_\w+)?"
 )
 _SUPPORTED = {
     "kernel": "ellipse",

@@ -20,6 +20,8 @@ _MOST_OUTSIDE = 0.2
 _LEAST_GAUSSIANS, _SAMPLE = 16, 100_000
 #: SH coefficient of degree 0 above which colors are not those of 3DGS: eight times as bright as white.
 _LARGEST_COLOR = 26.0
+#: Range of the largest logit that is doubtful if none is negative: more than trainers reach, at most a byte.
+_DOUBTFUL_LOGITS = (40.0, 255.0)
 #: Ends of the range that coefficients fill if they are colors of 0 to 1.
 _COLOR_ENDS = (0.1, 0.9)
 _HINT = "Export the scene again with logarithms of scales and logits of opacities, as 3DGS trainers write them."
@@ -58,7 +60,7 @@ def logits(path: Path, opacities: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def check_units(path: Path, arrays: Arrays, flat: float, *, logits_stored: bool) -> tuple[str, ...]:
-    """Check that values are logarithms, logits and SH coefficients, and return a note on doubtful colors.
+    """Check that values are logarithms, logits and SH coefficients, and return notes on doubtful ones.
 
     Args:
         path: Path of the file, for messages.
@@ -92,12 +94,18 @@ def check_units(path: Path, arrays: Arrays, flat: float, *, logits_stored: bool)
             f"{path}: its colors (f_dc) go from {colors[0]:.3g} to {colors[1]:.3g}: they seem to be colors of 0 to "
             "255, not SH coefficients. Export the scene again with (color / 255 - 0.5) / 0.2821."
         )
-    if 0 <= colors[0] < _COLOR_ENDS[0] and _COLOR_ENDS[1] < colors[1] <= 1:
-        return (
-            f"colors (f_dc) go from {colors[0]:.3g} to {colors[1]:.3g}, which is gray to light; if they are colors of "
-            "0 to 1, export the scene again with (color - 0.5) / 0.2821",
+    notes = []
+    if opacities[0] >= 0 and _DOUBTFUL_LOGITS[0] < opacities[1] <= _DOUBTFUL_LOGITS[1]:
+        notes.append(
+            f"logits of opacities go from {opacities[0]:.3g} to {opacities[1]:.3g}, which is opaque; if they are "
+            "opacities of 0 to 100 or 255, export the scene again with logits"
         )
-    return ()
+    if 0 <= colors[0] < _COLOR_ENDS[0] and _COLOR_ENDS[1] < colors[1] <= 1:
+        notes.append(
+            f"colors (f_dc) go from {colors[0]:.3g} to {colors[1]:.3g}, which is gray to light; if they are colors of "
+            "0 to 1, export the scene again with (color - 0.5) / 0.2821"
+        )
+    return tuple(notes)
 
 
 def _range(values: NDArray[np.float32]) -> tuple[float, float]:

@@ -93,8 +93,9 @@ _KNOWN: tuple[tuple[Callable[[bytes, str], bool], str], ...] = (
 _CHANGED_MEANING: tuple[tuple[re.Pattern[str], str], ...] = (
     (
         re.compile(
-            r"t|times?|t_(center|mean|scale|sigma)|trbf_\w+|motion_\d+|omega_\d+|f_t_\d+|(scale|scales|scaling)_t"
-            r"|(rot|rotation)_r(_\d+)?|velocit(y|ies)(_\w+)?|durations?|life(span|time)"
+            r"t|times?|(t|time)_(center|mean|scale|sigma|start|end)|(start|end)_time|trbf_\w+|motion_\w+|omega_\w+"
+            r"|f_t_\d+|(scale|scales|scaling|rot|rotation|opacity|xyz|mean|mu|center|sigma|cov)_t"
+            r"|(rot|rotation)_r(_\w+)?|v[xyz]|vel(ocity|ocities)?(_\w+)?|durations?|life(span|time)"
         ),
         "a dynamic scene, whose Gaussians move or exist at certain moments only. Export one moment as a static scene",
     ),

@@ -191,7 +191,10 @@ def test_all_sets_of_gaussians_become_one_scene(tmp_path: Path) -> None:
     assert rest[4:].abs().sum() == 2 * 3 * (0.5 + 0.5 + 1 + 2)
 
 
-@pytest.mark.parametrize("name", ["KHR_materials_unlit", "EXT_texture_webp", "KHR_lights_punctual", "KHR_xmp_json_ld"])
+@pytest.mark.parametrize(
+    "name",
+    ["KHR_materials_unlit", "EXT_texture_webp", "KHR_lights_punctual", "KHR_xmp_json_ld", "EXT_structural_metadata"],
+)
 def test_required_extensions_of_other_objects_are_harmless(tmp_path: Path, name: str) -> None:
     required = ["KHR_gaussian_splatting", name]
     assert len(read(tmp_path, by_hand(extensionsRequired=required))) == 2

@@ -242,6 +242,16 @@ def test_colors_in_place_of_coefficients_are_noticed(tmp_path: Path) -> None:
     assert ["if they are colors of 0 to 1" in note for note in read_scene(path).notes] == [True]
 
 
+@pytest.mark.parametrize("largest", [100, 255])
+def test_opacities_of_0_to_100_or_255_are_noticed(tmp_path: Path, largest: int) -> None:
+    path, opacities = tmp_path / "scene.ply", torch.linspace(0, largest, 616)
+    write_scene(path, replace(wall(), opacities=opacities))
+    (note,) = read_scene(path).notes
+    assert note.startswith(f"logits of opacities go from 0 to {largest}, which is opaque; if they are opacities")
+    write_scene(path, replace(wall(), opacities=opacities - 3))
+    assert read_scene(path).notes == ()
+
+
 @pytest.mark.parametrize(
     ("attribute", "values", "message"),
     [
@@ -280,6 +290,10 @@ def test_logarithms_in_a_ksplat_are_refused(tmp_path: Path, level: int) -> None:
         (("t", "scale_t", "rot_r_0"), "'t', so it is a dynamic scene"),
         (("rot_r_3",), "'rot_r_3', so it is a dynamic scene"),
         (("velocity_x",), "'velocity_x', so it is a dynamic scene"),
+        (("motion_x",), "'motion_x', so it is a dynamic scene"),
+        (("opacity_t",), "'opacity_t', so it is a dynamic scene"),
+        (("t_start", "t_end"), "'t_start', so it is a dynamic scene"),
+        (("vx", "vy", "vz"), "'vx', so it is a dynamic scene"),
         (("binding_0",), "'binding_0', .*relative to a mesh"),
         (("beta",), "'beta', .*another kernel"),
     ],
@@ -293,3 +307,15 @@ def test_properties_that_change_the_meaning_are_refused(
     lines = "".join(f"property float {each}\n" for each in names).encode()
     head, _, body = data.partition(end)
     refused(tmp_path, head + lines + end + body + bytes(4 * 616 * len(names)), message)
+
+
+def test_properties_of_other_meanings_are_read(tmp_path: Path) -> None:
+    """Names that begin or end as those of dynamic scenes do."""
+    names = ("label", "confidence", "type", "tint", "weight", "variance", "rot_reference", "shading", "timestamp")
+    data = encoded(tmp_path, by_name("ply"))
+    lines = "".join(f"property float {each}\n" for each in names).encode()
+    head, _, body = data.partition(b"end_header\n")
+    row = len(body) // 616
+    rows = b"".join(body[i : i + row] + bytes(4 * len(names)) for i in range(0, len(body), row))
+    (tmp_path / "scene.ply").write_bytes(head + lines + b"end_header\n" + rows)
+    assert read_scene(tmp_path / "scene.ply").notes == ()
