@@ -24,6 +24,8 @@ TRIES = 6
 
 #: Variables of the environment that name proxies, and hosts to reach without them.
 _PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
+#: Variables that name files for encrypted connections.
+_CERTIFICATES = ("SSL_CERT_FILE", "SSLKEYLOGFILE")
 #: Methods of requests that change nothing.
 _READS = ("GET", "HEAD")
 
@@ -198,7 +200,7 @@ def _is_address(url: str) -> bool:
         parsed.host.encode("idna")
     except (httpx.InvalidURL, UnicodeError):
         return False
-    return parsed.scheme in ("http", "https") and bool(parsed.host) and (parsed.port or 0) < 1 << 16
+    return parsed.scheme in ("http", "https") and bool(parsed.host) and 0 <= (parsed.port or 0) < 1 << 16
 
 
 def _http_client(url: str, headers: dict[str, str]) -> httpx.AsyncClient:
@@ -213,7 +215,7 @@ def _http_client(url: str, headers: dict[str, str]) -> httpx.AsyncClient:
             raise ValueError(f"{_without_password(proxy)} is no address")
         return httpx.AsyncClient(base_url=url, headers=headers, timeout=httpx.Timeout(30.0, read=900.0, write=120.0))
     except Exception as error:  # httpx raises errors of many types here, some of them built-in
-        names = ("SSL_CERT_FILE",) if isinstance(error, OSError) else _PROXIES
+        names = _CERTIFICATES if isinstance(error, OSError) else _PROXIES
         given = {name: value for name, value in sorted(os.environ.items()) if name.upper() in names and value}
         shown = " or ".join(f"{name}={_without_password(value)}" for name, value in given.items())
         raise RequestError(f"{shown} cannot be used: {str(error).rstrip('.')}. Correct or unset it.") from error

@@ -304,6 +304,7 @@ def test_id_that_no_job_has_is_refused(command: str, job_id: str, capsys: pytest
         ("--url", "http://127.0.0.1:abc", "not an address of a service"),
         ("--url", "http://", "not an address of a service"),
         ("--url", "http://127.0.0.1:65536", "not an address of a service"),
+        ("--url", "http://127.0.0.1:-1", "not an address of a service"),
         ("--url", "http://a..b", "not an address of a service"),
         ("--key", "kéy", "Copy it again"),
         ("--key", "a\nb", "Copy it again"),
@@ -325,12 +326,14 @@ def test_address_or_key_that_cannot_be_used_is_refused(
         ("HTTPS_PROXY", "http://[::1", "HTTPS_PROXY=http://[::1 cannot be used"),
         ("SSL_CERT_FILE", "/nonexistent", "SSL_CERT_FILE=/nonexistent cannot be used"),
         ("SSL_CERT_FILE", os.devnull, f"SSL_CERT_FILE={os.devnull} cannot be used"),
+        ("SSLKEYLOGFILE", "/nonexistent/keys", "SSLKEYLOGFILE=/nonexistent/keys cannot be used"),
     ],
 )
 def test_environment_that_cannot_be_used_is_reported(
     variable: str, value: str, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No thread is left that would keep the process running."""
+    monkeypatch.delenv("SSL_CERT_FILE", raising=False)
     monkeypatch.setenv("no_proxy", "elsewhere.example")
     monkeypatch.setenv(variable, value)
     before = threading.enumerate()
