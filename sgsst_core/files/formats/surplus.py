@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 
 from sgsst_core.errors import SceneError
@@ -12,8 +13,6 @@ _BLANKS, _PADDING = b" \t\r\n\x1a", b"\0 \t\r\n\x1a"
 _MAX_PADDING, _SAMPLE_BYTES = 1 << 16, 1 << 20
 #: Least number of line ends that show a transfer as text if all of them are CR LF.
 _LEAST_LINE_ENDS = 8
-#: UTF-8 of the character that replaces bytes which are no text, and its minimum fraction of the bytes.
-_REPLACEMENT, _REPLACED = b"\xef\xbf\xbd", 0.01
 
 
 def is_padding(data: bytes) -> bool:
@@ -61,15 +60,23 @@ def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: i
     if start >= end:
         return
     data = _bytes(path, header_bytes, min(start, header_bytes + _SAMPLE_BYTES))
-    line_ends, replaced = data.count(b"\n"), data.count(_REPLACEMENT)
+    line_ends = data.count(b"\n")
     changed = newline == b"\r\n" or (line_ends == data.count(b"\r\n") and line_ends >= _LEAST_LINE_ENDS)
     blank = not _bytes(path, start, min(end, start + _MAX_PADDING)).strip(_BLANKS)
-    if (changed and not blank) or replaced > _REPLACED * len(data):
+    if (changed and not blank) or _is_utf8(data):
         surplus = number_of(end - start, "byte")
         raise SceneError(
             f"{path}: has {surplus} more than its header declares. Was it transferred as text, which changes line ends "
             "and other bytes? Copy it again in binary mode."
         )
+
+
+def _is_utf8(data: bytes) -> bool:
+    """Return whether data is UTF-8 beyond ASCII, which binary numbers never are; its end may cut off a character."""
+    try:
+        return not codecs.getincrementaldecoder("utf-8")().decode(data).isascii()
+    except UnicodeDecodeError:
+        return False
 
 
 def _bytes(path: Path, start: int, end: int) -> bytes:

@@ -89,8 +89,16 @@ def as_utf_8(data: bytes) -> bytes:
     return head + b"end_header\n" + body.decode(errors="replace").encode()
 
 
+def from_latin_1_to_utf_8(data: bytes) -> bytes:
+    head, _, body = data.partition(b"end_header\n")
+    return head + b"end_header\n" + body.decode("latin-1").encode()
+
+
 @pytest.mark.parametrize("name", ["ply", "compressed.ply"])
-@pytest.mark.parametrize("change", [text_transfer, text_transfer_of_the_end, text_transfer_of_the_data, as_utf_8])
+@pytest.mark.parametrize(
+    "change",
+    [text_transfer, text_transfer_of_the_end, text_transfer_of_the_data, as_utf_8, from_latin_1_to_utf_8],
+)
 def test_binary_plys_that_were_transferred_as_text_are_refused(
     tmp_path: Path, name: str, change: Callable[[bytes], bytes]
 ) -> None:
