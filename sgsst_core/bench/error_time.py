@@ -17,9 +17,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from matplotlib.axes import Axes
 from torch import Tensor
 
 from sgsst_core.bench.judging import make_judge, make_novel_views
@@ -47,6 +46,9 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, Settings, make_settings
 from sgsst_core.stylizing.evaluation import relative_loss
 from sgsst_core.stylizing.stylizer import Stylizer
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Number of slices of the time budget. Variants take turns slice by slice, so that a temporary slowdown of the machine
 #: affects all of them.

@@ -1,1 +1,8 @@
-"""Reports of finished jobs: JSON document, HTML page, charts and contact sheet."""
+"""Reports of finished jobs: JSON document, HTML page, charts and contact sheet; only they import matplotlib."""
+
+import logging
+
+# Without a writable home folder, matplotlib uses a temporary one, and warns about it and about its search for fonts.
+_matplotlib = logging.getLogger("matplotlib")
+if _matplotlib.level == logging.NOTSET:  # the level of a program that uses this library has precedence
+    _matplotlib.setLevel(logging.ERROR)

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -40,3 +43,12 @@ def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         write_loss_chart(tmp_path / "missing" / "c.png", sample_report())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("home", ["/proc/absent", None])
+def test_charts_need_no_home_folder(home: str | None, tmp_path: Path) -> None:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MPL", "XDG_", "HOME"))}
+    environment |= {"TMPDIR": str(tmp_path), **({"HOME": home} if home else {})}
+    command = [sys.executable, "-c", "import sgsst_core.report.charts"]
+    shown = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert shown.stdout + shown.stderr == ""
