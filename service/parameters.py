@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 from sgsst_core.errors import SettingsError
 from sgsst_core.options import RENAMED, Option
 from sgsst_core.settings import checked
-from worker.options import JobVideo, StylizeOptions
+from worker.options import GROUPS, JobVideo, StylizeOptions
 from worker.region_requests import MOST_REGIONS, NO_CONTROLS, RegionOptions, RegionRequest, region_requests
 from worker.styles import MOST_STYLE_IMAGES
 
@@ -23,7 +23,10 @@ class JobParameters(StylizeOptions):
     """Parameters of a job; omitted ones take the preset's values, as for `sgsst stylize`."""
 
     model_config = ConfigDict(
-        json_schema_extra={"examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}]},
+        json_schema_extra={
+            "examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}],
+            "x-groups": dict(GROUPS),
+        },
     )
 
     name: Annotated[JobName, Option(default="the names of scene and style")] = Field(

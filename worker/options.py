@@ -32,6 +32,8 @@ from sgsst_core.settings import (
 
 Backbone = Literal["auto", "vgg19", "vgg16"]
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
+#: Titles of groups of options; see `GROUPS`.
+ESSENTIALS, VIEWS, REGIONS, EXPERT = "Essentials", "Views", "Regions", "Expert"
 #: Number of views of an orbit.
 Views = Annotated[int, Ge(1), Le(2000)] | Literal["auto"]
 #: Default longer side of a video in pixels; cameras of smaller images keep theirs.
@@ -139,6 +141,25 @@ class StylizeOptions(_Chosen):
             SettingsError: If values contradict each other.
         """
         return make_settings(self.preset, **self.given_settings())
+
+
+#: Options by group, in the order of the page, the help texts and docs/options.md.
+GROUPS: dict[str, list[str]] = {
+    ESSENTIALS: ["preset", "content_weight", "resolution", "views", "max_seconds"],
+    VIEWS: ["orbit", "up", "elevation", "radius"],
+    "Look": [
+        "style_scale",
+        "style_rotation",
+        "preserve_colors",
+        "background",
+        "style_background",
+        "refine",
+        "sh_attenuation",
+        "unseen",
+    ],
+    REGIONS: ["regions"],
+}
+GROUPS[EXPERT] = [name for name in declared(StylizeOptions) if not any(name in names for names in GROUPS.values())]
 
 
 class VideoOptions(BaseModel):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from sgsst_core.errors import OutputError
@@ -14,10 +15,10 @@ def result_format(out: Path) -> SceneFormat:
     """Return the format of a scene to write, by its file name.
 
     Raises:
-        OutputError: If the name does not end in a suffix of a format that can be written, or the path is a folder.
+        OutputError: If the name does not end in a suffix of a format that can be written.
     """
     format = format_of_name(out.name)
-    if format is None or format.write is None or out.is_dir():
+    if format is None or format.write is None:
         raise OutputError(f"{out}: does not end in {RESULT_SUFFIXES}. Name the scene file to write.")
     return format
 
@@ -36,6 +37,17 @@ def check_is_not_input(out: Path, path: Path, description: str = "scene itself",
     """
     if out.exists() and path.exists() and out.samefile(path):
         raise OutputError(f"{out}{remark}: is the {description}, which would be overwritten. Give another file name.")
+
+
+def check_file(out: Path) -> None:
+    """Check that a file can be written, in a folder that may be missing. Creates nothing.
+
+    Raises:
+        OutputError: If it is a folder, or its folder cannot be written or created.
+    """
+    if out.is_dir():
+        raise OutputError(f"{out}: is a folder. Name a file in it.")
+    check_folder(Path(os.path.realpath(out)).parent)
 
 
 def check_folder(folder: Path) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sgsst_core.errors import CameraError, OutputError, SettingsError
+from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.formats import format_of_name
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoints
 from worker.options import Backbone, JobVideo, ViewOptions
-from worker.outputs import check_folder, check_is_not_input, result_format
+from worker.outputs import check_file, check_is_not_input, result_format
 from worker.region_requests import RegionRequest
 from worker.styles import StyleFile
 
@@ -211,12 +211,10 @@ def check_request(request: StylizeRequest) -> Outputs:
     check_steps(request.settings)
     check_choice(request.source, request.images)
     out = request.out
-    if out.is_dir():
-        raise OutputError(f"{out}: is a folder. Give the PLY file to write, such as {out / 'stylized.ply'}.")
+    check_file(out)
     outputs = Outputs.of(out)
     for path in (outputs.ply, outputs.compressed):
         if path is not None:
             remark = "" if path == out else f" (the PLY beside {out.name})"
             check_is_not_input(path, request.source.scene, remark=remark)
-    check_folder(out.parent)
     return outputs

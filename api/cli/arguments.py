@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sgsst_core.errors import SettingsError
+from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import SUFFIXES
-from worker.options import StylizeOptions
+from worker.options import ESSENTIALS, REGIONS, VIEWS, StylizeOptions
+from worker.outputs import check_file, check_folder
 from worker.region_requests import RegionOptions, region_options, region_requests
 from worker.styles import parse_styles
 
@@ -32,14 +34,37 @@ def local_path(text: str) -> Path:
     return path
 
 
+def file_to_write(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Check the file that an option names, before the command reads anything; see `check_file`."""
+    return _checked(check_file, parameter, path)
+
+
+def folder_to_write(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Check the folder that an option names, before the command reads anything; see `check_folder`."""
+    return _checked(check_folder, parameter, path)
+
+
+def _checked(check: Callable[[Path], None], parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Check a path to write; the message names the option."""
+    try:
+        if path is not None:
+            check(path)
+    except OutputError as error:
+        raise OutputError(f"{parameter.metavar or parameter.opts[0]}: {error}") from error
+    return path
+
+
 _SCENE: dict[str, Any] = {"metavar": "SCENE", "help": f"3DGS scene: {SUFFIXES}.", "show_default": False}
 _CAMERAS: dict[str, Any] = {
     "metavar": "PATH",
     "help": "cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender).",
+    "rich_help_panel": ESSENTIALS,
 }
 SceneArgument = Annotated[Path, typer.Argument(parser=local_path, **_SCENE)]
 CamerasOption = Annotated[Path | None, typer.Option(parser=local_path, **_CAMERAS)]
-_STYLE: Any = typer.Option(parser=local_path, metavar="PATH", help="Style image.", show_default=False)
+_STYLE: Any = typer.Option(
+    parser=local_path, metavar="PATH", help="Style image.", show_default=False, rich_help_panel=ESSENTIALS
+)
 StyleOption = Annotated[Path, _STYLE]
 OptionalStyleOption = Annotated[Path | None, _STYLE]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -58,12 +83,16 @@ class JobInputs:
         typer.Option(
             metavar="FILE[:WEIGHT]",
             help="Style image; may be repeated. Several are mixed in proportion to their weights.",
+            rich_help_panel=ESSENTIALS,
             show_default=False,
         ),
     ]
     cameras: Annotated[str | None, typer.Option(**_CAMERAS)] = None
     images: Annotated[
-        Path | None, typer.Option(help="Folder of photos for the content term. [default: unstylized renders]")
+        Path | None,
+        typer.Option(
+            help="Folder of photos for the content term. [default: unstylized renders]", rich_help_panel=VIEWS
+        ),
     ] = None
     region: Annotated[
         list[str] | None,
@@ -72,22 +101,31 @@ class JobInputs:
             help="Region of the scene: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, half-space=A,B,C,D (Ax+By+Cz>=D), "
             "property=NAME>VALUE, mask=FILE (a flag for each Gaussian: packed bits in a .bin, or .npy) or masks=FOLDER "
             "(images of views, white inside the region). May be repeated; where regions overlap, the later one wins.",
+            rich_help_panel=REGIONS,
         ),
     ] = None
     region_style: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=FILE[:WEIGHT]", help="Style image of a region. Several are mixed. [default: the job's style]"
+            metavar="NAME=FILE[:WEIGHT]",
+            help="Style image of a region. Several are mixed. [default: the job's style]",
+            rich_help_panel=REGIONS,
         ),
     ] = None
     region_weight: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=WEIGHT", help="Weight of a region's style in the loss. [default: 1]"),
+        typer.Option(
+            metavar="NAME=WEIGHT",
+            help="Weight of a region's style in the loss. [default: 1]",
+            rich_help_panel=REGIONS,
+        ),
     ] = None
     region_freeze: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME", help="Freeze a region: its colors stay bit-identical. rest: all Gaussians without a region."
+            metavar="NAME",
+            help="Freeze a region: its colors stay bit-identical. rest: all Gaussians without a region.",
+            rich_help_panel=REGIONS,
         ),
     ] = None
 
@@ -96,6 +134,7 @@ class JobInputs:
         typer.Option(
             metavar="NAME=W",
             help="Weight of the content term in a region: a number, light, balanced or strong. [default: the job's]",
+            rich_help_panel=REGIONS,
         ),
     ] = None
 

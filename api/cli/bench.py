@@ -25,7 +25,6 @@ from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.report.machine import machine
 from sgsst_core.scene.camera import Camera
 from worker.inputs import read_scene_and_capture
-from worker.outputs import check_folder
 from worker.request import SceneRequest, check_choice
 
 Result = TypeVar("Result")
@@ -74,7 +73,6 @@ class _Inputs:
         """Check and read the files of a request; the quick checks come first."""
         check_choice(request.source)
         variants = choose_variants(request.variants)
-        check_folder(request.out)
         weights = load_network_weights(request.backbone)
         style = load_image(request.style)
         file, capture = read_scene_and_capture(request.source)
@@ -235,10 +233,8 @@ def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> li
         raise SettingsError(
             f"No case or group is called {only!r}, or contains it in its name. Omit --only to run all cases."
         )
-    if out is not None:
-        if out.is_dir() or out.suffix.lower() != ".json":
-            raise OutputError(f"{out}: not the name of a JSON file. Give one, such as stability.json.")
-        check_folder(out.parent)
+    if out is not None and out.suffix.lower() != ".json":
+        raise OutputError(f"{out}: not the name of a JSON file. Give one, such as stability.json.")
     measurements = []
     for case in chosen:
         progress(case)

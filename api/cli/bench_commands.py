@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from api.cli.arguments import CamerasOption, SceneArgument, StyleOption
+from api.cli.arguments import CamerasOption, SceneArgument, StyleOption, file_to_write, folder_to_write
 from api.cli.console import FAILURE, error_console, out_console, print_field
 from api.cli.options import with_arguments, with_options
 from worker.options import StylizeOptions, ViewOptions
@@ -53,7 +53,9 @@ class VariantsInputs:
 @with_arguments(VariantsInputs)
 def error_time(
     inputs: VariantsInputs,
-    out: Annotated[Path, typer.Option(help="Folder for table, plot, JSON and scenes.")] = Path("error_time"),
+    out: Annotated[
+        Path, typer.Option(help="Folder for table, plot, JSON and scenes.", callback=folder_to_write)
+    ] = Path("error_time"),
     variants: Annotated[str, typer.Option(help="Names of variants, separated by commas. [default: all]")] = "",
     *,
     options: ViewOptions,
@@ -74,7 +76,9 @@ def error_time(
 @with_arguments(VariantsInputs)
 def quality(
     inputs: VariantsInputs,
-    out: Annotated[Path, typer.Option(help="Folder for JSON, plots, images and scenes.")] = Path("quality"),
+    out: Annotated[
+        Path, typer.Option(help="Folder for JSON, plots, images and scenes.", callback=folder_to_write)
+    ] = Path("quality"),
     variants: Annotated[
         str, typer.Option(help="Names of variants, separated by commas.")
     ] = "standard,one-scale,cold-start",
@@ -105,7 +109,7 @@ def stability(
         str, typer.Option(metavar="TEXT", help="Run only cases whose name contains TEXT, or the group TEXT.")
     ] = "",
     quick: Annotated[bool, typer.Option("--quick", help="Use smaller sizes; minutes faster.")] = False,
-    out: Annotated[Path | None, typer.Option(help="JSON file to write.")] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file to write.", callback=file_to_write)] = None,
 ) -> None:
     """Compare hard cases with float64 references; exit with 1 if one exceeds its bound."""
     from api.cli.bench import run_stability, stability_table

@@ -15,7 +15,7 @@ import typer
 from rich.progress import BarColumn, ProgressColumn, TextColumn
 from rich.table import Table
 
-from api.cli.arguments import JobInputs, JsonOption
+from api.cli.arguments import JobInputs, JsonOption, file_to_write
 from api.cli.console import (
     EARLY_ENDS,
     INTERRUPTED,
@@ -40,7 +40,8 @@ from sgsst_core.files.formats import (
 )
 from sgsst_core.number_format import duration
 from sgsst_core.stylizing.progress_bar import live_bar, set_total, time_left
-from worker.outputs import check_folder, check_is_not_input, result_format
+from worker.options import ESSENTIALS
+from worker.outputs import check_file, check_folder, check_is_not_input, result_format
 from worker.region_requests import RegionOptions, RegionRequest, region_requests
 from worker.styles import parse_styles, split_weight
 
@@ -67,7 +68,11 @@ def submit(
     webhook: Annotated[str | None, typer.Option(help="URL to notify when the job ends.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help=f"Wait for the job, and write the scene to this file: {RESULT_SUFFIXES}."),
+        typer.Option(
+            help=f"Wait for the job, and write the scene to this file: {RESULT_SUFFIXES}.",
+            callback=file_to_write,
+            rich_help_panel=ESSENTIALS,
+        ),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check the inputs and plan the job without queueing it.")
@@ -83,7 +88,6 @@ def submit(
     if out is not None:
         result_format(out)
         check_is_not_input(out, Path(inputs.scene))
-        check_folder(out.parent)
     styles, settings = _styles_and_parameters(inputs, options, parameters)
     files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": _masks(inputs.regions)}
     with _client(url, key) as client:
@@ -189,7 +193,10 @@ def download(
         raise SettingsError(f"--format {format}: only stylized.ply is compressed. Omit --format for {name}.")
     if format is None and out is not None and name == "stylized.ply":
         format = _format_of(out)
-    if out is not None and name != "all":
+    if name == "all":
+        check_folder(out or Path(job))
+    elif out is not None:
+        check_file(out)
         _check_format(out, _stored_name(name, format))
     with _client(url, key) as client:
         digests = {entry["name"]: entry["sha256"] for entry in client.artifacts(job)}

@@ -23,6 +23,7 @@ from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_o
 from sgsst_core.files.atomic import DISK_FULL
 from sgsst_core.files.camera_folder import CameraWarning
 from sgsst_core.options import renamed_hint
+from worker.options import EXPERT, GROUPS
 
 #: Base of errors in the arguments, which typer does not export.
 _UsageError: Any = typer.BadParameter.__base__
@@ -40,11 +41,28 @@ class _Program(typer.core.TyperGroup):
             raise typer.Abort() from interrupt
 
 
+class _Command(typer.core.TyperCommand):
+    """Command whose help lists its options by group."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, then the options of each group; options without a group come before the experts'."""
+        titles = ("Arguments", *(title for title in GROUPS if title != EXPERT), "Options", EXPERT)
+        sections: dict[str, list[tuple[str, str]]] = {title: [] for title in titles}
+        for parameter in self.get_params(ctx):
+            title = "Arguments" if parameter.param_type_name == "argument" else parameter.rich_help_panel or "Options"
+            if (record := parameter.get_help_record(ctx)) is not None:
+                sections[title].append(record)
+        for title, records in sections.items():
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+
 app = typer.Typer(
     cls=_Program,
     help="Style transfer for 3D Gaussian Splatting scenes (SGSST).",
     no_args_is_help=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -60,7 +78,7 @@ for command in (
     *client_commands.COMMANDS,
     *operator_commands.COMMANDS,
 ):
-    app.command()(command)
+    app.command(cls=_Command)(command)
 app.add_typer(weights_app, name="weights")
 app.add_typer(bench_app, name="bench")
 app.add_typer(study_app, name="study")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 from collections.abc import Callable, Collection, Mapping
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -13,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from sgsst_core.errors import SettingsError
 from sgsst_core.options import Declared, declared, merged, reason
 from sgsst_core.settings import BY_PRESET
+from worker.options import GROUPS
 
 Command = Callable[..., None]
 M = TypeVar("M", bound=BaseModel)
@@ -34,8 +36,10 @@ def with_options(
         only: Names of the options to offer; None for all.
         without: Names of options to leave out.
     """
-    names = (declared(model).keys() if only is None else set(only)) - set(without)
-    parameters = {name: _parameter(option) for name, option in declared(model).items() if name in names}
+    options = declared(model)
+    names = (options.keys() if only is None else set(only)) - set(without)
+    in_order = [*itertools.chain(*GROUPS.values()), *options]
+    parameters = {name: _parameter(options[name]) for name in in_order if name in options.keys() & names}
 
     def build(given: dict[str, Any]) -> BaseModel:
         return _checked(model, {name: value for name, value in given.items() if value is not None})
@@ -117,7 +121,10 @@ def _parameter(option: Declared) -> inspect.Parameter:
     """Return an option as a function parameter. typer validates words and switches, the model all other values."""
     kind: Any = kind_of(option) if is_switch(option) or get_origin(kind_of(option)) is Literal else str
     placeholder: dict[str, Any] = {} if is_switch(option) else {"metavar": metavar(option)}
-    declaration = typer.Option(flags(option), help=help_text(option), parser=_parser(option), **placeholder)
+    group = next((title for title, names in GROUPS.items() if option.name in names), None)
+    declaration = typer.Option(
+        flags(option), help=help_text(option), parser=_parser(option), rich_help_panel=group, **placeholder
+    )
     return inspect.Parameter(
         option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, declaration]
     )

@@ -12,14 +12,22 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
-from api.cli.arguments import CamerasOption, JobInputs, OptionalStyleOption, SceneArgument, local_path
+from api.cli.arguments import (
+    CamerasOption,
+    JobInputs,
+    OptionalStyleOption,
+    SceneArgument,
+    file_to_write,
+    folder_to_write,
+    local_path,
+)
 from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
 from sgsst_core.number_format import duration
 from sgsst_core.stylizing.progress_bar import clock, job_bar, live_bar
-from worker.options import StylizeOptions, VideoOptions, ViewOptions
+from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
     from sgsst_core.planning.plan import Plan
@@ -35,8 +43,13 @@ _TIMED_FRAMES = 6
 @with_arguments(JobInputs)
 def plan(
     inputs: JobInputs,
-    out: Annotated[Path, typer.Option(help="JSON file to write the plan to.")] = Path("plan.json"),
-    sheet: Annotated[Path | None, typer.Option(help="JPEG file to write with images of the views.")] = None,
+    out: Annotated[
+        Path,
+        typer.Option(help="JSON file to write the plan to.", callback=file_to_write, rich_help_panel=ESSENTIALS),
+    ] = Path("plan.json"),
+    sheet: Annotated[
+        Path | None, typer.Option(help="JPEG file to write with images of the views.", callback=file_to_write)
+    ] = None,
     *,
     options: StylizeOptions,
 ) -> None:
@@ -98,12 +111,16 @@ def check(
 @with_options(StylizeOptions, "chosen", only=("background",))
 def render(
     scene: SceneArgument,
-    out: Annotated[Path | None, typer.Option(help="Folder for a PNG image of each view.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for a PNG image of each view.", callback=folder_to_write, rich_help_panel=ESSENTIALS),
+    ] = None,
     video: Annotated[
         Path | None,
         typer.Option(
             help="Video to write instead: a .mp4 file (H.264), a .webm file (VP9), a folder or a pattern such as "
-            "frame_%04d.png for PNG images."
+            "frame_%04d.png for PNG images.",
+            rich_help_panel=ESSENTIALS,
         ),
     ] = None,
     cameras: CamerasOption = None,
@@ -187,6 +204,7 @@ def convert(
         typer.Argument(
             metavar="OUT",
             help=f"Scene to write: {RESULT_SUFFIXES}; meta.json for an unpacked SOG, .usdc for OpenUSD.",
+            callback=file_to_write,
             show_default=False,
         ),
     ],
@@ -227,7 +245,15 @@ def blend(
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option(help=f"Scene to write: {RESULT_SUFFIXES}.", show_default=False)],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help=f"Scene to write: {RESULT_SUFFIXES}.",
+            callback=file_to_write,
+            show_default=False,
+            rich_help_panel=ESSENTIALS,
+        ),
+    ],
     *,
     options: ViewOptions,
 ) -> None:

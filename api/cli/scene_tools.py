@@ -44,7 +44,7 @@ from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import about_notes, about_rendering, choose_axes, read_capture
 from worker.description import describe_scene
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
-from worker.outputs import check_folder, check_is_not_input, result_format
+from worker.outputs import check_is_not_input, result_format
 from worker.request import SceneRequest, StylizeRequest, check_choice
 from worker.styles import split_weight
 
@@ -67,17 +67,15 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     """
     source, settings, out = request.source, request.settings, request.out
     check_choice(source, request.images)
-    if out.is_dir() or out.suffix.lower() != ".json":  # a mistyped path must not overwrite a scene or its cameras
+    if out.suffix.lower() != ".json":  # a mistyped path must not overwrite a scene or its cameras
         raise OutputError(f"{out}: not the name of a JSON file. Give one, such as plan.json.")
     if source.cameras:
         check_is_not_input(out, source.cameras, "camera file")
-    check_folder(out.parent)
     if sheet is not None:
-        if sheet.is_dir() or sheet.suffix.lower() not in (".jpg", ".jpeg"):
+        if sheet.suffix.lower() not in (".jpg", ".jpeg"):
             raise OutputError(f"{sheet}: not the name of a JPEG file. Give one, such as views.jpg.")
         for path, description in _input_images(request):
             check_is_not_input(sheet, path, description)
-        check_folder(sheet.parent)
     file, capture = read_scene_and_capture(source, request.images)
     cameras = capture.cameras
     check_sh_attenuation(file, settings.sh_attenuation)
@@ -162,7 +160,6 @@ def render_views(
         InvalidInputError: If scene, cameras or folder cannot be used.
     """
     check_choice(source)
-    check_folder(out)
     file, capture = read_scene_and_capture(source)
     scene, cameras = file.scene, capture.cameras
     rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
@@ -225,7 +222,6 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
     """
     _check_target(out, compare)
     check_is_not_input(out, source.scene)
-    check_folder(out.parent)
     if compare and source.cameras is None:
         source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
     axes, decisions = choose_axes(source)
@@ -246,7 +242,7 @@ def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
 
 def _check_target(out: Path, compare: bool) -> None:
     """Check that the name of a file determines a format that can be written and, if requested, compared."""
-    if out.suffix.lower() in USD_SUFFIXES and not out.is_dir():
+    if out.suffix.lower() in USD_SUFFIXES:
         check_usd(out)
         if compare:
             raise OutputError(f"{out}: USD can only be written, so it cannot be compared. Omit --compare.")
@@ -297,7 +293,6 @@ def blend_files(texts: Sequence[str], out: Path, *, drop_invalid: bool, spz_axes
     result_format(out)
     for path in paths:
         check_is_not_input(out, path)
-    check_folder(out.parent)
     files = [read_scene(path, drop_invalid=drop_invalid, spz_axes=spz_axes) for path in paths]
     blend = blend_scenes(files, weights)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,6 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from worker.inputs import check_something_seen, read_scene_and_capture
-from worker.outputs import check_folder
 from worker.request import SceneRequest, check_choice
 
 #: Longer side in pixels of the views on the page, unless the request has another.
@@ -45,9 +44,8 @@ def make_study(
     """
     named = [_named(text) for text in variants]
     check_names([name for name, _ in named])
-    if page.is_dir() or page.suffix.lower() not in (".html", ".htm"):
+    if page.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{page}: not the name of an HTML file. Give one, such as study.html.")
-    check_folder(page.parent)
     sources = [source.model_copy(update={"scene": path}) for _, path in named]
     for each in sources:
         check_choice(each)

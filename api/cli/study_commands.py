@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.arguments import CamerasOption, StyleOption
+from api.cli.arguments import CamerasOption, StyleOption, file_to_write
 from api.cli.console import out_console, print_field, spinner
 from api.cli.options import with_options
 from worker.options import StylizeOptions, ViewOptions
@@ -27,7 +27,7 @@ def make(
         typer.Argument(metavar="[NAME=]SCENE...", help="Two to four scenes to compare.", show_default=False),
     ],
     style: StyleOption,
-    out: Annotated[Path, typer.Option(help="HTML page to write.")] = Path("study.html"),
+    out: Annotated[Path, typer.Option(help="HTML page to write.", callback=file_to_write)] = Path("study.html"),
     cameras: CamerasOption = None,
     *,
     options: ViewOptions,

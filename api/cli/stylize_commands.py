@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from api.cli.arguments import JobInputs
+from api.cli.arguments import JobInputs, file_to_write, folder_to_write
 from api.cli.console import EARLY_ENDS, FAILURE, error_console, loss_text, out_console, print_field, spinner
 from api.cli.interrupt import stop_on_signal
 from api.cli.options import with_arguments, with_options
@@ -18,7 +18,7 @@ from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.progress_bar import clock, job_bar
-from worker.options import RunOptions, StylizeOptions
+from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
     from worker.description import Prepared
@@ -41,7 +41,9 @@ def stylize(
         Path,
         typer.Option(
             help="Stylized PLY to write; report and images go beside it. "
-            f"A {EXTRA_SUFFIXES} is written in addition to a PLY of the same name."
+            f"A {EXTRA_SUFFIXES} is written in addition to a PLY of the same name.",
+            callback=file_to_write,
+            rich_help_panel=ESSENTIALS,
         ),
     ],
     *,
@@ -56,16 +58,16 @@ def stylize(
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the scene and the results.")] = Path("demo"),
+    out: Annotated[Path, typer.Option(help="Folder for the scene and the results.", callback=folder_to_write)] = Path(
+        "demo"
+    ),
 ) -> None:
     """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
     from api.cli.demo_scene import build_demo
     from sgsst_core.features.network_weights import load_network_weights
-    from worker.outputs import check_folder
     from worker.request import SceneRequest, StylizeRequest
     from worker.styles import StyleFile
 
-    check_folder(out)
     try:
         load_network_weights("auto")
     except WeightsError:

@@ -30,12 +30,6 @@ export const titleOf = (name) => {
   return text[0].toUpperCase() + text.slice(1);
 };
 
-/** Options by group; those of no other group are for experts. @type {{essentials: string[], look: string[]}} */
-export const GROUPS = {
-  essentials: ["content_weight", "resolution", "views", "max_seconds"],
-  look: ["style_scale", "style_rotation", "preserve_colors", "background", "style_background", "refine", "sh_attenuation", "unseen"],
-};
-
 /**
  * @param {string} name
  * @param {any} schema schema of the parameter

@@ -7,7 +7,7 @@ import { forgetDraft, keepDraft, keptDraft } from "./draft.js";
 import { listenToDrops, sorted } from "./drops.js";
 import { Gallery } from "./gallery.js";
 import { defaultName } from "./names.js";
-import { GROUPS, optionControl, plainly, showWrong } from "./options.js";
+import { optionControl, plainly, showWrong } from "./options.js";
 import { costCard } from "./plan.js";
 import { RegionList } from "./regions.js";
 import { accepted } from "./scene_formats.js";
@@ -24,9 +24,6 @@ import { percent, seconds, size, words } from "./words.js";
 /** @typedef {import("./stored.js").Chosen} Chosen */
 
 const say = words.submit;
-const ORBIT = ["orbit", "up", "elevation", "radius"];
-/** Options with an input outside of the folds. */
-const PLACED = new Set(["name", "preset", "style_weights", "regions", ...ORBIT, ...GROUPS.essentials]);
 const UPS = /** @type {Record<string, number[]>} */ ({ x: [1, 0, 0], "-x": [-1, 0, 0], y: [0, 1, 0], "-y": [0, -1, 0], z: [0, 0, 1], "-z": [0, 0, -1] });
 
 /** View of a new job. When it ends, its uploads stop: other views have no place to show them. */
@@ -47,6 +44,8 @@ export class SubmitView {
     this.name = optionControl("name", { type: "string" }, { title: say.name, hint: false });
     /** @type {Map<string, Control>} */
     this.controls = new Map([["name", this.name]]);
+    /** Names of options by group, from the API's document. @type {Record<string, string[]>} */
+    this.groups = { Essentials: [], Views: [], Look: [], Expert: [] };
     this.leaving = new AbortController();
     this.sending = new SendingCard(() => this.stop());
     /** Inputs for the shares of the paintings in a blend, by the paintings' names. @type {Record<string, any>} */
@@ -176,8 +175,9 @@ export class SubmitView {
   async loadOptions() {
     let schema;
     try {
-      const document = await get("openapi.json", this.leaving.signal);
-      schema = document.components.schemas.JobParameters.properties;
+      const document = await get("openapi.json", this.leaving.signal), parameters = document.components.schemas.JobParameters;
+      schema = parameters.properties;
+      this.groups = parameters["x-groups"];
     } catch {
       if (!this.leaving.signal.aborted) put(this.main, h("p.quiet", say.optionsAway));
       return;
@@ -188,10 +188,10 @@ export class SubmitView {
     }
     this.makePresets(schema.preset);
     const elements = (/** @type {string[]} */ names) => names.map((name) => this.controls.get(name)?.element).filter(Boolean);
-    put(this.main, ...elements(GROUPS.essentials));
-    put(this.ring, ...elements(ORBIT));
-    put(this.lookOptions, ...elements(GROUPS.look));
-    put(this.expertOptions, ...elements([...this.controls.keys()].filter((name) => !PLACED.has(name) && !GROUPS.look.includes(name))));
+    put(this.main, ...elements(this.groups.Essentials));
+    put(this.ring, ...elements(this.groups.Views));
+    put(this.lookOptions, ...elements(this.groups.Look));
+    put(this.expertOptions, ...elements(this.groups.Expert));
     this.ring.addEventListener("input", () => this.camerasChanged());
     const followStrength = addPictures(/** @type {Control} */ (this.controls.get("content_weight")));
     this.schema = schema;
@@ -257,7 +257,7 @@ export class SubmitView {
     const wanted = this.search.value.trim().toLowerCase();
     let shown = 0;
     for (const { name, title, help, element } of this.controls.values()) {
-      if (PLACED.has(name)) continue;
+      if (!this.groups.Look.includes(name) && !this.groups.Expert.includes(name)) continue;
       element.hidden = !!wanted && !`${title} ${name.replaceAll("_", " ")} ${name} ${help}`.toLowerCase().includes(wanted);
       shown += element.hidden ? 0 : 1;
     }
@@ -428,7 +428,7 @@ export class SubmitView {
     /** @type {Record<string, any>} */
     const values = {};
     for (const [name, control] of this.controls) {
-      if (!this.orbiting && ORBIT.includes(name)) continue;
+      if (!this.orbiting && this.groups.Views.includes(name)) continue;
       const value = control.value();
       if (value !== undefined) values[name] = value;
     }
@@ -451,7 +451,7 @@ export class SubmitView {
 
   /** Mark inputs whose text is not what they ask for. */
   markInvalid() {
-    for (const control of this.controls.values()) if (this.orbiting || !ORBIT.includes(control.name)) control.wrong(control.problem());
+    for (const control of this.controls.values()) if (this.orbiting || !this.groups.Views.includes(control.name)) control.wrong(control.problem());
     const weight = this.jobs === 1 && Object.values(this.weights).find((input) => !(Number(input.value) > 0) || !Number.isFinite(Number(input.value)));
     if (weight) showWrong(weight, this.shareError, words.refusals.weight(weight.getAttribute("aria-label")));
   }

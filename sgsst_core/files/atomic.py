@@ -102,9 +102,11 @@ def _reserve(final: Path) -> Path:
     try:
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     except OSError as error:
-        raise OutputError(
-            f"{final.parent}: is not writable: {error.strerror}. Create the folder, or name another one."
-        ) from error
+        folder = final.parent
+        if not folder.exists():
+            raise OutputError(f"{folder}: does not exist. Create the folder, or name another one.") from error
+        reason = "" if error.errno == errno.ENOENT else f": {error.strerror}"  # as in /proc
+        raise OutputError(f"{folder}: is not writable{reason}. Name another folder.") from error
     return temporary
 
 

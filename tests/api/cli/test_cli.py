@@ -24,10 +24,11 @@ import av
 import numpy as np
 import pytest
 import torch
+import typer
 from PIL import Image
 from plyfile import PlyData
 
-from api.cli.main import main
+from api.cli.main import app, main
 from api.cli.scene_tools import view_file_names
 from sgsst_core.bench.error_time import Curve
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
@@ -1336,3 +1337,59 @@ def test_check_reports_extremes_and_consequences(files: Files, capsys: pytest.Ca
     files.ply.write_bytes(b"not a scene")
     assert main(["check", str(files.ply), *options]) == 2
     assert str(files.ply) in capsys.readouterr().err
+
+
+#: Commands that write, up to the file or folder, all with inputs that do not exist.
+_WRITING = [
+    ["stylize", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "s.ply"],
+    ["plan", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "plan.json"],
+    ["plan", "no.ply", "--style", "no.png", "--orbit", "3", "--sheet", "views.jpg"],
+    ["render", "no.ply", "--orbit", "3", "--out", "views"],
+    ["render", "no.ply", "--video", "frame_%04d.png"],
+    ["convert", "no.ply", "OUT", "s.sog"],
+    ["convert", "no.ply", "OUT", "meta.json"],
+    ["blend", "no.ply", "nor.ply", "--out", "s.ply"],
+    ["demo", "--out", "demo"],
+    ["submit", "no.ply", "--style", "no.png", "--url", "http://127.0.0.1:1", "--out", "s.ply"],
+    ["download", "no-job", "--url", "http://127.0.0.1:1", "--out", "s.ply"],
+    ["download", "no-job", "all", "--url", "http://127.0.0.1:1", "--out", "all"],
+    ["study make", "no.ply", "nor.ply", "--style", "no.png", "--orbit", "3", "--out", "study.html"],
+    ["bench error-time", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "results"],
+    ["bench quality", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "results"],
+    ["bench stability", "--out", "stability.json"],
+]
+
+
+@pytest.mark.parametrize("command", _WRITING, ids=lambda command: f"{command[0]} {command[-2]}")
+def test_outputs_are_checked_before_inputs_are_read(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    name, *arguments, flag, out = command
+    places = [(f"file/below/{out}", "file: cannot be used as output folder: there is a file of that name")]
+    if Path("/proc/self").is_dir():  # not even root can write there
+        places.append((f"/proc/absent/{out}", "/proc: is not writable. Name another folder."))
+    if Path(out).suffix and "%" not in out:
+        (tmp_path / out).mkdir()
+        places.append((out, "is a folder"))
+    before = _everything(tmp_path)
+    for path, message in places:
+        assert main([*name.split(), *arguments, *([] if flag == "OUT" else [flag]), path]) == 2
+        shown = capsys.readouterr()
+        assert message in shown.err
+        assert shown.err.count("\n") == 1
+    assert _everything(tmp_path) == before
+
+
+def test_every_command_that_writes_is_tested() -> None:
+    def writing(group: Any, prefix: str = "") -> set[str]:
+        found = set()
+        for name, command in group.commands.items():
+            if hasattr(command, "commands"):
+                found |= writing(command, f"{name} ")
+            elif any(each.name == "out" for each in command.params):
+                found.add(prefix + name)
+        return found
+
+    assert writing(typer.main.get_command(app)) == {command[0] for command in _WRITING}

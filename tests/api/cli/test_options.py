@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any, get_origin
 
@@ -19,7 +20,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.option_parsers import parse_strength
 from sgsst_core.options import REMOVED, RENAMED, Declared, declared
 from sgsst_core.settings import EVERYTHING, Settings, checked, make_settings
-from worker.options import RunOptions, StylizeOptions, ViewOptions
+from worker.options import GROUPS, RunOptions, StylizeOptions, ViewOptions
 from worker.request import SceneRequest
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -70,6 +71,27 @@ def test_commands_and_parameters_offer_every_option() -> None:
     for name, option in OPTIONS.items():
         assert properties[name]["description"] == option.help
         assert properties[name].get("x-unit", "") == option.option.unit
+
+
+@pytest.mark.parametrize("command", ["stylize", "submit", "plan", "check"])
+def test_help_has_the_groups_of_the_page(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    parts = re.split(r"^(\w+):\n", capsys.readouterr().out, flags=re.MULTILINE)
+    groups = {
+        title: [name.replace("-", "_") for name in re.findall(r"^  (?:-h, )?--([\w-]+)", text, flags=re.MULTILINE)]
+        for title, text in zip(parts[1::2], parts[2::2], strict=True)
+    }
+    on_page = JobParameters.model_json_schema()["x-groups"]
+    assert on_page == GROUPS
+    assert [title for title in groups if title in GROUPS] == [title for title in GROUPS if title in groups]
+    assert list(groups)[:2] == ["Arguments", "Essentials"]
+    assert {"style", "cameras", "resolution", "views"} <= set(groups["Essentials"])
+    for title, names in groups.items():
+        assert [name for name in names if name in OPTIONS] == [name for name in on_page.get(title, ()) if name in names]
+    group: Any = typer.main.get_command(app)
+    offered = [each.opts[0] for each in group.commands[command].params if each.param_type_name == "option"]
+    listed = {"--" + name.replace("_", "-") for names in groups.values() for name in names}
+    assert listed == {*offered, "--help"}
 
 
 def outside(option: Declared) -> list[float]:

@@ -13,6 +13,7 @@ from PIL import Image
 from tests.api.page.actions import LONG, REFUSED, Visit, choose, drop, expand, set_options, write_selection
 from tests.api.page.browser import FLAGS, Watched, chromium
 from tests.api.service import Service, wait_for
+from worker.options import GROUPS
 
 pytestmark = pytest.mark.slow
 
@@ -321,3 +322,14 @@ def test_estimate_warns_and_can_be_stopped(visit: Visit, files: dict[str, Path])
     cost.get_by_role("alert").get_by_text("region empty: ignored, because it has no Gaussians").wait_for()
     cost.get_by_text("for the whole job").wait_for()
     watched.check("net::ERR")
+
+
+def test_options_are_in_the_groups_of_the_command_line(visit: Visit) -> None:
+    page = visit().page
+    page.locator("[data-name=resolution]").wait_for()
+    page.get_by_label("Orbit the object").check()
+    page.locator("details.group").evaluate_all("(folds) => folds.forEach((fold) => { fold.open = true; })")
+    for title, names in GROUPS.items():
+        part = page.locator("section, details.fold").filter(has=page.locator(f":is(h2, summary):text-is('{title}')"))
+        on_page = part.last.locator(".option[data-name]").evaluate_all("(all) => all.map((it) => it.dataset.name)")
+        assert on_page == [name for name in names if name not in ("preset", "regions")], title

@@ -61,6 +61,6 @@ def test_missing_extra_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="is not writable"):
+    with pytest.raises(OutputError, match="does not exist"):
         write_usd(tmp_path / "missing" / "scene.usdc", cloud(10))
     assert not [*tmp_path.iterdir()]
