@@ -25,7 +25,7 @@ class JobParameters(StylizeOptions):
     model_config = ConfigDict(
         json_schema_extra={
             "examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}],
-            "x-groups": dict(GROUPS),
+            "x-groups": {title: [*names] for title, names in GROUPS.items()},
         },
     )
 

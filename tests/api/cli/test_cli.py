@@ -1367,14 +1367,14 @@ def test_outputs_are_checked_before_inputs_are_read(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     name, *arguments, flag, out = command
-    places = [(f"file/below/{out}", "file: cannot be used as output folder: there is a file of that name")]
+    targets = [(f"file/below/{out}", "file: cannot be used as output folder: there is a file of that name")]
     if Path("/proc/self").is_dir():  # not even root can write there
-        places.append((f"/proc/absent/{out}", "/proc: is not writable. Name another folder."))
+        targets.append((f"/proc/absent/{out}", "/proc: is not writable. Name another folder."))
     if Path(out).suffix and "%" not in out:
         (tmp_path / out).mkdir()
-        places.append((out, "is a folder"))
+        targets.append((out, "is a folder"))
     before = _everything(tmp_path)
-    for path, message in places:
+    for path, message in targets:
         assert main([*name.split(), *arguments, *([] if flag == "OUT" else [flag]), path]) == 2
         shown = capsys.readouterr()
         assert message in shown.err
@@ -1384,12 +1384,12 @@ def test_outputs_are_checked_before_inputs_are_read(
 
 def test_every_command_that_writes_is_tested() -> None:
     def writing(group: Any, prefix: str = "") -> set[str]:
-        found = set()
+        names = set()
         for name, command in group.commands.items():
             if hasattr(command, "commands"):
-                found |= writing(command, f"{name} ")
+                names |= writing(command, f"{name} ")
             elif any(each.name == "out" for each in command.params):
-                found.add(prefix + name)
-        return found
+                names.add(prefix + name)
+        return names
 
     assert writing(typer.main.get_command(app)) == {command[0] for command in _WRITING}
