@@ -1189,7 +1189,7 @@ def test_convert_refuses_what_it_cannot_write(files: Files, capsys: pytest.Captu
     before = files.ply.read_bytes()
     for out, message in (
         (files.ply, "is the scene itself"),
-        (files.ply.parent, f"does not end in {RESULT_SUFFIXES}"),
+        (files.ply.parent, "is a folder. Name a file in it"),
         (files.out.with_name("scene.splat"), f"does not end in {RESULT_SUFFIXES}"),
         (files.ply / "scene.spz", "there is a file of that name"),
     ):
