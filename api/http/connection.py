@@ -39,7 +39,16 @@ def _session_cookie(cookies: bytes) -> bytes:
     return b"; ".join(pair for pair in pairs if pair.startswith(_SESSION) and b'"' not in pair)
 
 
-class _Undelimited(RequestResponseCycle):
+class _Response(RequestResponseCycle):
+    """Response that ends where its connection was closed: an earlier one of pipelined requests is not told of that."""
+
+    async def send(self, message: Any) -> None:
+        """Send a part of the response."""
+        self.disconnected = self.disconnected or self.transport.is_closing()
+        await super().send(message)
+
+
+class _Undelimited(_Response):
     """Response to an HTTP/1.0 client, which knows no chunks: without a length, it ends with the connection."""
 
     has_length = True
@@ -163,8 +172,7 @@ class Connection(HttpToolsProtocol):
         self._steps += 1
         self._stop_timer()
         super().on_headers_complete()
-        if self.scope["http_version"] == "1.0":
-            self.cycle.__class__ = _Undelimited
+        self.cycle.__class__ = _Undelimited if self.scope["http_version"] == "1.0" else _Response
 
     def on_body(self, body: bytes) -> None:
         """Pass a block of a body to the app, and pause reading until the app has taken it."""

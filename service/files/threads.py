@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
+from contextvars import copy_context
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -72,7 +73,7 @@ class FileThreads:
             async with asyncio.timeout(self._seconds + size / LEAST_RATE) as limit:
                 await free.acquire()
                 try:
-                    future = self._pool.submit(function, *arguments)
+                    future = self._pool.submit(copy_context().run, function, *arguments)
                 except BaseException:
                     free.release()
                     raise

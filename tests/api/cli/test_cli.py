@@ -163,7 +163,7 @@ def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.
     ("options", "message"),
     [
         (["--region", "a:cube=1"], "is not a known selection"),
-        (["--region", "a:mask=nowhere.npy"], "cannot be read as .npy"),
+        (["--region", "a:mask=nowhere.npy"], "nowhere.npy: cannot be read: No such file"),
         (["--region", "a:property=color>1"], "no property 'color'"),
         (["--region-freeze", "rest"], "Every Gaussian is frozen (rest)"),
         (["--region", "a:half-space=0,0,1,0", "--region-style", "a=nowhere.png"], "nowhere.png"),

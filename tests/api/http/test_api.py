@@ -332,7 +332,8 @@ def test_masks_select_regions(client: httpx.Client, files: dict[str, bytes]) -> 
     body = {"scene": uploads["scene.ply"], "style": uploads["style.png"], "mask": [uploads["left.bin"]]}
     job = client.post("/v1/jobs", json={**body, "parameters": {"orbit": 2, "regions": regions[1:]}})
     assert job.status_code == 202, job.text
-    assert [entry["name"] for entry in job.json()["inputs"] if entry["role"] == "mask"] == ["left.bin"]
+    inputs = client.get(f"/v1/jobs/{job.json()['id']}/inputs").json()["inputs"]
+    assert [entry["name"] for entry in inputs if entry["role"] == "mask"] == ["left.bin"]
     sent = client.get(f"/v1/jobs/{job.json()['id']}/inputs/mask")
     assert (sent.content, sent.headers["content-type"]) == (LEFT, "application/octet-stream")
 

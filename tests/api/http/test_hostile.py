@@ -1710,7 +1710,8 @@ def test_paths_cannot_inject_log_lines(service: Service, client: httpx.Client) -
     lines = wait_for(lambda: logged() if len(logged()) == 5 else None, "the requests in the log")
     for line in lines:
         assert line.isprintable()
-        assert re.fullmatch(r'\S+ info {4}request  method=GET path="/v1/[^"]*forged" status=404 seconds=\S+', line)
+        pattern = r'\S+ info {4}request  method=GET path="/v1/[^"]*forged" status=404 seconds=\S+ request_id=\S+'
+        assert re.fullmatch(pattern, line)
 
 
 def test_hostile_requests_leave_no_files(service: Service, client: httpx.Client, store: Store) -> None:
