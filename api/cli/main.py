@@ -49,7 +49,8 @@ class _Command(typer.core.TyperCommand):
         titles = ("Arguments", *(title for title in GROUPS if title != EXPERT), "Options", EXPERT)
         sections: dict[str, list[tuple[str, str]]] = {title: [] for title in titles}
         for parameter in self.get_params(ctx):
-            title = "Arguments" if parameter.param_type_name == "argument" else parameter.rich_help_panel or "Options"
+            panel = getattr(parameter, "rich_help_panel", None)
+            title = "Arguments" if parameter.param_type_name == "argument" else panel or "Options"
             if (record := parameter.get_help_record(ctx)) is not None:
                 sections[title].append(record)
         for title, records in sections.items():

@@ -28,6 +28,7 @@ class Message(TypedDict, total=False):
     scales: list[float | None] | None
     mean_loss: float | None
     mean_scales: list[float | None] | None
+    views: tuple[int, int] | None
     path: str
     gpus: list[str]
     file: dict[str, Any]

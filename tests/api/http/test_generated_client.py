@@ -22,8 +22,8 @@ pytestmark = pytest.mark.slow
 #: Generator, at the version that the test ran with. It needs older versions of other packages than the project, so it
 #: is installed into an environment of its own.
 GENERATOR = "openapi-python-client==0.29.1"
-#: Command in the documentation that writes the configuration of the generator.
-CONFIG = re.compile(r"^    (echo '.*' > config\.yaml)$", re.MULTILINE)
+#: Commands in the documentation that write the configuration of the generator.
+CONFIG = re.compile(r"^    (echo '.*' >>? config\.yaml)$", re.MULTILINE)
 #: Program that uploads its files in parts, plans a job with them, and queues it: `PROGRAM URL SCENE CAMERAS STYLE`.
 PROGRAM = """
 import base64, io, sys
@@ -75,9 +75,8 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_generated_client_uploads_plans_and_submits(commands: Path, tmp_path: Path) -> None:
     """Generation has no warnings, and the client's operations work against a real service."""
     (tmp_path / "openapi.json").write_text(json.dumps(create_app(ServiceSettings()).openapi()))
-    config = CONFIG.search((ROOT / "docs" / "service.md").read_text())
-    assert config is not None
-    subprocess.run(config[1], shell=True, cwd=tmp_path, check=True)
+    config = "\n".join(CONFIG.findall((ROOT / "docs" / "service.md").read_text()))
+    subprocess.run(config, shell=True, cwd=tmp_path, check=True)
     options = ["--path", "openapi.json", "--config", "config.yaml", "--output-path", "generated", "--meta", "none"]
     generate = [str(commands / "openapi-python-client"), "generate", *options, "--fail-on-warning"]
     environment = os.environ | {"PATH": "/usr/bin:/bin"}  # without ruff

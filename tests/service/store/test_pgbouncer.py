@@ -48,6 +48,7 @@ def pooled(postgres: str) -> Iterator[str]:
     user: dict[str, Any] = {}
     if os.geteuid() == 0:  # it refuses to run as root
         shutil.chown(folder, "postgres")
+        shutil.chown(folder / "pgbouncer.ini", "postgres")
         user = {"user": "postgres", "group": "postgres", "extra_groups": []}
     process = subprocess.Popen([program, "--quiet", folder / "pgbouncer.ini"], cwd=folder, **user)
 
