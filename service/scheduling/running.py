@@ -132,7 +132,7 @@ class RunningAttempt:
             wait([removed], _CANCEL_SECONDS)  # if the folder hangs, it is removed afterwards
             self._files.shutdown(wait=False)
 
-    def _within(self, work: Callable[[], Result], seconds: float = _FILE_SECONDS, size: int = 0) -> Result:
+    def _within(self, work: Callable[[], Result], seconds: float | None = None, size: int = 0) -> Result:
         """Return the result of work on files, after all earlier work.
 
         Raises:
@@ -140,7 +140,7 @@ class RunningAttempt:
         """
         future = self._files.submit(work)
         try:
-            return future.result(seconds + size / LEAST_RATE)
+            return future.result((seconds or _FILE_SECONDS) + size / LEAST_RATE)
         except TimeoutError as error:
             if future.done():
                 raise

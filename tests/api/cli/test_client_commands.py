@@ -61,7 +61,7 @@ def submit(files: list[str], capsys: pytest.CaptureFixture[str], *options: str) 
 def test_masks_of_regions_are_sent(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:
-    """Each mask is sent under its region's name, so that two files of one name do not collide."""
+    """Each mask is sent under a name of its own, so that two files of one name do not collide."""
     for folder, content in (("a", bytes(77)), ("b", bytes([1, *bytes(76)]))):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "mask.bin").write_bytes(content)
@@ -71,9 +71,14 @@ def test_masks_of_regions_are_sent(
     with service.client() as client:
         job = client.get(f"/v1/jobs/{job_id}").json()
         second = client.get(f"/v1/jobs/{job_id}/inputs/mask:1").content
-    assert [each["select"] for each in job["parameters"]["regions"]] == ["mask=one.bin", "mask=two.bin", "masks=three"]
-    names = [entry["name"] for entry in job["inputs"] if entry["role"] == "mask"]
-    assert names == ["one.bin", "two.bin", "three/view_0.png"]
+        inputs = client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]
+    assert [each["select"] for each in job["parameters"]["regions"]] == [
+        "mask=region_0.bin",
+        "mask=region_1.bin",
+        "masks=region_2",
+    ]
+    names = [entry["name"] for entry in inputs if entry["role"] == "mask"]
+    assert names == ["region_0.bin", "region_1.bin", "region_2/view_0.png"]
     assert second == bytes([1, *bytes(76)])
 
 
