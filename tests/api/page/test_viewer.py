@@ -39,7 +39,7 @@ Visit = Callable[..., Watched]
 
 def base_of(watched: Watched) -> str:
     """Return the base URL of the page's modules."""
-    source: str = watched.page.locator("script[type=module]").get_attribute("src")
+    source: str = watched.page.locator("script[type=module]").evaluate("script => script.src")
     return source.rsplit("/", 1)[0]
 
 
