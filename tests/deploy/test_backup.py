@@ -95,7 +95,7 @@ def test_jobs_continue_after_a_restore(kind: str, tmp_path: Path, tiny_installed
         expected = client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content
         running = submit(client, tmp_path)
         waiting = submit(client, tmp_path, steps_sos=20)
-        wait_for(lambda: (job(client, running)["progress"] or {}).get("step", 0) > 60, "steps", service.said)
+        wait_for(lambda: (job(client, running)["progress"] or {}).get("step", 0) > 300, "steps", service.said)
         for _ in range(2):  # the second backup adds to the first
             ended = backup({"SGSST_DATA": str(service.data), **before}, "save", saved)
             assert ended.returncode == 0, ended.stderr
