@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -34,9 +35,9 @@ def evaluate(
     network = FeatureNetwork(weights, dtype=dtype)
     seen, forward = [], network.forward
 
-    def record_size(rgb: torch.Tensor, *, cache: bool = True) -> object:
+    def record_size(rgb: torch.Tensor, **options: Any) -> object:
         seen.append((int(rgb.shape[0]), int(rgb.shape[1])))
-        return forward(rgb, cache=cache)
+        return forward(rgb, **options)
 
     network.forward = record_size  # type: ignore[method-assign, assignment]
     loss = SosLoss(network, tile_size=tile_size, coarsest=COARSEST, scales=ScaleWeights(values))
