@@ -243,7 +243,7 @@ def test_file_that_shrinks_during_a_read_is_refused(tmp_path: Path, monkeypatch:
         return header
 
     monkeypatch.setattr(scene_file, "read_scene_header", shrink)
-    with pytest.raises(SceneError, match="was changed|is truncated"):
+    with pytest.raises(SceneError, match=r"was changed|is truncated"):
         read_scene(path, held_bytes=0)
 
 
