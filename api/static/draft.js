@@ -1,5 +1,5 @@
 // @ts-check
-/** What was entered into the form for a new job, for when another view was shown or the page was loaded again. */
+/** Draft of a new job: the content of its form, restored after another view or a reload. */
 import { paintingsOf } from "./regions.js";
 import { allInputs, StoredFile } from "./stored.js";
 import { strengthName } from "./strength.js";
