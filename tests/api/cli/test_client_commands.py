@@ -242,7 +242,7 @@ def test_outputs_are_checked_before_a_job_is_queued(
     (tmp_path / "file").touch()
     for out, message in (
         (files[0], "is the scene itself"),
-        (tmp_path, "does not end in .ply"),
+        (tmp_path, "is a folder. Name a file in it"),
         (tmp_path / "out.splat", "does not end in .ply"),
         (tmp_path / "file" / "out.ply", "there is a file of that name"),
     ):
