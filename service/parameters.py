@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import RENAMED, Option
+from sgsst_core.options import Option
 from sgsst_core.settings import checked
 from worker.options import GROUPS, JobVideo, StylizeOptions
 from worker.region_requests import MOST_REGIONS, NO_CONTROLS, RegionOptions, RegionRequest, region_requests
@@ -70,24 +70,14 @@ class JobParameters(StylizeOptions):
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
-    """Return the parameters of a stored job; an earlier version may have stored them under former names.
+    """Return the parameters of a stored job.
 
     Raises:
         SettingsError: If this version does not support them.
     """
     try:
-        return checked(JobParameters, _with_current_names(values))
+        return checked(JobParameters, values)
     except SettingsError as error:
         raise SettingsError(
             f"{error} The job was stored by an earlier version that accepted this. Submit a new job without it."
         ) from error
-
-
-def _with_current_names(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Rename stored parameters of a job or region to their current names."""
-    renamed = {RENAMED.get(name, name): value for name, value in values.items()}
-    if renamed.get("regions"):
-        renamed["regions"] = [_with_current_names(region) for region in renamed["regions"]]
-    if "unseen" in renamed:
-        renamed["unseen"] = {"neighbours": "neighbors", "keep": "freeze"}.get(renamed["unseen"], renamed["unseen"])
-    return renamed

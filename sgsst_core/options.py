@@ -19,40 +19,8 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails
 
-#: Former names of options and parameters, mapped to their present names. Only error messages and stored jobs use them.
-RENAMED = {
-    "keep": "freeze",
-    "keep_colours": "preserve_colors",
-    "keep_everything": "compute_everything",
-    "kept_weights": "cached_weights",
-    "region_keep": "region_freeze",
-    "revive": "clamp_aware_gradient",
-    "sh_fade": "sh_attenuation",
-    "surround": "training_background",
-}
-#: Removed options and parameters, with advice. Only error messages use them.
-REMOVED = {
-    "prune_weight": "it saved no time",
-    "similar_views": "use fewer views instead (--views)",
-}
-
-
 #: Parts of an error's location that name a type of a union.
 _MEMBER = re.compile(r"constrained-\w+|\w+\[.*\]")
-
-
-def renamed_hint(name: str) -> str:
-    """Return a hint about a renamed or removed option or parameter; empty if it is neither.
-
-    Args:
-        name: Name of a parameter ("sh_fade", "regions.0.keep") or a flag ("--sh-fade", "--no-revive").
-    """
-    flag = name.startswith("--")
-    plain = name.removeprefix("--").removeprefix("no-").replace("-", "_").rpartition(".")[2]
-    if plain in REMOVED:
-        return f"it was removed: {REMOVED[plain]}"
-    new = RENAMED.get(plain, "")
-    return f"it is called {'--' + new.replace('_', '-') if flag else new} now" if new else ""
 
 
 def unknown_text(name: str, known: Iterable[str]) -> str:

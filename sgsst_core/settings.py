@@ -29,7 +29,7 @@ from sgsst_core.option_parsers import (
     parse_strength,
     parse_weights,
 )
-from sgsst_core.options import Declared, Option, declared, merged, reason, renamed_hint, unknown_text
+from sgsst_core.options import Declared, Option, declared, merged, reason, unknown_text
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]
@@ -397,9 +397,9 @@ def checked(model: type[M], values: Mapping[str, object]) -> M:
     except ValidationError as error:
         first = merged(error.errors())[0]
         name = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden" and not renamed_hint(name):
+        if first["type"] == "extra_forbidden":
             raise SettingsError(f"Setting {name} {unknown_text(name, declared(model))}") from error
-        raise SettingsError(f"Setting {name} = {first['input']!r}: {renamed_hint(name) or reason(first)}.") from error
+        raise SettingsError(f"Setting {name} = {first['input']!r}: {reason(first)}.") from error
 
 
 def preset_texts(setting: Declared) -> dict[str, str]:

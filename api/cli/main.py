@@ -19,10 +19,9 @@ from api.cli.scene_commands import blend, check, convert, plan, render
 from api.cli.study_commands import study_app
 from api.cli.stylize_commands import demo, stylize
 from api.cli.weights_commands import weights_app
-from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_out_of_memory
+from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import DISK_FULL
 from sgsst_core.files.camera_folder import CameraWarning
-from sgsst_core.options import renamed_hint
 from worker.options import EXPERT, GROUPS
 
 #: Base of errors in the arguments, which typer does not export.
@@ -101,7 +100,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     warnings.formatwarning = _format_warning
     try:
-        _check_names(arguments)
         code = app(args=arguments, prog_name="sgsst", obj=arguments, standalone_mode=False)
         return code if isinstance(code, int) else 0
     except SystemExit as end:
@@ -166,14 +164,6 @@ def _exit_code(error: SgsstError) -> int:
 def _print_json(code: str, detail: str, problem: Mapping[str, object] | None = None) -> None:
     """Print an error as a line of JSON on stderr, with the fields of a problem document."""
     print(json.dumps({"code": code, "detail": detail, **(problem or {})}), file=sys.stderr)
-
-
-def _check_names(arguments: Sequence[str]) -> None:
-    """Raise a SettingsError if an option is given by a former name."""
-    for argument in arguments:
-        flag = argument.partition("=")[0]
-        if flag.startswith("--") and (hint := renamed_hint(flag)):
-            raise SettingsError(f"{flag}: {hint}.")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from service.errors import NoSpaceError, ServiceError
 from service.files.cache import is_full
 from service.parameters import JobParameters
 from sgsst_core.errors import InvalidInputError
-from sgsst_core.options import merged, reason, renamed_hint, unknown_text
+from sgsst_core.options import merged, reason, unknown_text
 from worker.region_requests import RegionOptions
 
 MEDIA_TYPE = "application/problem+json"
@@ -132,7 +132,7 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     errors = [
         {
             "at": (at := ".".join(str(part) for part in entry["loc"])[:_SHOWN]),
-            "message": renamed_hint(at) or (_unknown(at) if entry["type"] == "extra_forbidden" else reason(entry)),
+            "message": _unknown(at) if entry["type"] == "extra_forbidden" else reason(entry),
         }
         for entry in merged(error.errors())[:20]
     ]

@@ -15,10 +15,10 @@ from pydantic import ValidationError
 from api.cli.main import app, main
 from api.cli.options import flags, help_text, kind_of
 from api.cli.options_table import reference
-from service.parameters import JobParameters, stored_parameters
+from service.parameters import JobParameters
 from sgsst_core.errors import SettingsError
 from sgsst_core.option_parsers import parse_strength
-from sgsst_core.options import REMOVED, RENAMED, Declared, declared
+from sgsst_core.options import Declared, declared
 from sgsst_core.settings import EVERYTHING, Settings, checked, make_settings
 from worker.options import GROUPS, RunOptions, StylizeOptions, ViewOptions
 from worker.request import SceneRequest
@@ -190,35 +190,3 @@ def test_content_weight_accepts_numbers_and_strengths(text: str, weight: float) 
 def test_unknown_strength_is_rejected() -> None:
     with pytest.raises(ValueError, match="light, balanced, strong"):
         parse_strength("weak")
-
-
-@pytest.mark.parametrize(("old", "new"), RENAMED.items())
-def test_former_names_are_rejected_with_new_name(old: str, new: str, capsys: pytest.CaptureFixture[str]) -> None:
-    flag = "--" + old.replace("_", "-")
-    assert main(["stylize", "scene.ply", flag, "x"]) == 2
-    assert f"{flag}: it is called --{new.replace('_', '-')} now" in capsys.readouterr().err
-    if old in {"keep", "region_keep"}:
-        return
-    with pytest.raises(SettingsError, match=f"it is called {new} now"):
-        checked(JobParameters, {old: "x"})
-
-
-@pytest.mark.parametrize(("name", "advice"), REMOVED.items())
-def test_removed_options_are_rejected_with_advice(name: str, advice: str, capsys: pytest.CaptureFixture[str]) -> None:
-    flag = "--" + name.replace("_", "-")
-    assert main(["stylize", "scene.ply", flag, "1"]) == 2
-    assert f"{flag}: it was removed: {advice}" in capsys.readouterr().err
-    with pytest.raises(SettingsError, match="it was removed"):
-        checked(JobParameters, {name: 1.0})
-    with pytest.raises(SettingsError, match="stored by an earlier version"):
-        stored_parameters({name: 1.0})
-
-
-def test_stored_jobs_accept_former_names() -> None:
-    stored = {"sh_fade": 0.5, "unseen": "neighbours", "regions": [{"name": "rest", "keep": True}]}
-    parameters = stored_parameters(stored).model_dump()
-    assert (parameters["sh_attenuation"], parameters["unseen"], parameters["regions"][0]["freeze"]) == (
-        0.5,
-        "neighbors",
-        True,
-    )
