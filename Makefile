@@ -16,7 +16,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 \
 
 SPELLED := api benchmarks deploy docs service sgsst_core tests worker *.md Makefile mkdocs.yml pyproject.toml
 
-.PHONY: demo test test-all test-slow test-ptx lint lint-page docs clean
+.PHONY: demo test test-all test-slow test-ptx stability lint lint-page docs clean
 
 # Stylize the built-in scene and print where the results are.
 demo: $(VENV)/installed
@@ -36,6 +36,11 @@ test-slow: $(VENV)/installed-dev
 # Run the compiled GPU kernels in an interpreter of PTX, against their references. `test-slow` includes this.
 test-ptx: $(VENV)/installed-dev
 	$(BIN)/pytest tests/ptx
+
+# Measure the hard cases against their float64 references at full size, and store them in benchmarks/results.
+stability: $(VENV)/installed
+	$(BIN)/sgsst weights fetch vgg16
+	$(BIN)/python -m benchmarks.stability
 
 test-all: test
 	$(MAKE) test-slow

@@ -3,7 +3,7 @@
 python -m benchmarks.stability_search [--seconds 600] [--first 0] [--only SEED]
 
 Each seed defines a job (`drawn`). The job may be refused with one of the project's own errors; otherwise, it must stay
-within the bounds of `sgsst_core.bench.stability.situations`. Violations and unexpected errors are printed and stored
+within the bounds of `benchmarks.stability.situations`. Violations and unexpected errors are printed and stored
 with their seed, and `--only SEED` runs that job again. Each failure found in this way is added to the hard cases
 (`job_cases`).
 """
@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.machine import write_result
-from sgsst_core.bench.stability.situations import STEPS, Situation, crowd, even_network, strain, views
+from benchmarks.stability.situations import STEPS, Situation, crowd, even_network, strain, views
 from sgsst_core.errors import SgsstError
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held

@@ -14,8 +14,6 @@ from torch import Tensor
 from sgsst_core.bench.error_time import Curve, Variant, as_dict, choose_variants, error_time, write_plot
 from sgsst_core.bench.quality import Quality, compare_quality, write_sheet
 from sgsst_core.bench.quality import write_plot as write_quality_plot
-from sgsst_core.bench.stability import Case, Measurement, all_cases, measure
-from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.images import load_image
@@ -219,59 +217,3 @@ def point_line(curve: Curve) -> str:
     name, point = curve.variant.name, curve.points[-1]
     remains = "the initial loss was 0," if point.relative is None else f"{point.relative:.2%} of the loss remains"
     return f"{name}: {remains} after {point.seconds:.1f} s, {point.step} steps"
-
-
-def run_stability(only: str, quick: bool, out: Path | None, progress: Any) -> list[tuple[Case, Measurement]]:
-    """Measure the stability cases whose name contains `only` or whose group is `only`.
-
-    Raises:
-        SettingsError: If no case matches.
-        OutputError: If the file cannot be written.
-    """
-    chosen = [case for case in all_cases() if only in case.name or only == case.group]
-    if not chosen:
-        raise SettingsError(
-            f"No case or group is called {only!r}, or contains it in its name. Omit --only to run all cases."
-        )
-    if out is not None and out.suffix.lower() != ".json":
-        raise OutputError(f"{out}: not the name of a JSON file. Give one, such as stability.json.")
-    measurements = []
-    for case in chosen:
-        progress(case)
-        measurements.append((case, measure(case, full=not quick)))
-    if out is not None:
-        values = {"version": 1, "full": not quick, "machine": machine(torch.device("cpu"))}
-        write_json(out, {**values, "cases": [_stability_row(*pair) for pair in measurements]})
-    return measurements
-
-
-def stability_table(measurements: Sequence[tuple[Case, Measurement]]) -> Table:
-    """Return a table of the error of each case."""
-    result = Table("case", "measure", "error", "bound", "", "note", title="Numerical stability")
-    group = ""
-    for case, measured in measurements:
-        if case.group != group:
-            group = case.group
-            result.add_section()
-            result.add_row(f"[bold]{group}[/bold]")
-        outcome = measured.result
-        mark = "ok" if outcome.passed else "[red]MISSED[/red]"
-        numbers = (f"{outcome.error:.1e}" if outcome.error else "0", f"{outcome.bound:.0e}" if outcome.bound else "0")
-        result.add_row(case.name, case.measure, *numbers, mark, outcome.note)
-    return result
-
-
-def _stability_row(case: Case, measured: Measurement) -> dict[str, object]:
-    """Return one case as a JSON object, with non-finite errors as strings."""
-    outcome = measured.result
-    return {
-        "group": case.group,
-        "case": case.name,
-        "measure": case.measure,
-        "error": outcome.error if outcome.error < float("inf") else str(outcome.error),
-        "bound": outcome.bound,
-        "passed": outcome.passed,
-        "note": outcome.note,
-        "seconds": round(measured.seconds, 3),
-        "peak_growth": measured.peak_growth,
-    }

@@ -1,4 +1,4 @@
-"""Benchmarks that users run on their own scene and machine: `bench error-time`, `quality` and `stability`."""
+"""Benchmarks that users run on their own scene and machine: `bench error-time` and `bench quality`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from api.cli.arguments import CamerasOption, SceneArgument, StyleOption, file_to_write, folder_to_write
-from api.cli.console import FAILURE, error_console, out_console, print_field
+from api.cli.arguments import CamerasOption, SceneArgument, StyleOption, folder_to_write
+from api.cli.console import error_console, out_console, print_field
 from api.cli.options import with_arguments, with_options
 from worker.options import StylizeOptions, ViewOptions
 
@@ -101,20 +101,3 @@ def _print_skipped_variants(curves: Sequence[Curve], out: Path) -> None:
         if curve.left_out:
             out_console.print(f"{curve.variant.name} was skipped: {curve.left_out}")
     print_field("results", out)
-
-
-@bench_app.command()
-def stability(
-    only: Annotated[
-        str, typer.Option(metavar="TEXT", help="Run only cases whose name contains TEXT, or the group TEXT.")
-    ] = "",
-    quick: Annotated[bool, typer.Option("--quick", help="Use smaller sizes; minutes faster.")] = False,
-    out: Annotated[Path | None, typer.Option(help="JSON file to write.", callback=file_to_write)] = None,
-) -> None:
-    """Compare hard cases with float64 references; exit with 1 if one exceeds its bound."""
-    from api.cli.bench import run_stability, stability_table
-
-    measurements = run_stability(only, quick, out, lambda case: error_console.print(f"{case.group}: {case.name}"))
-    Console(width=_TABLE_WIDTH).print(stability_table(measurements))
-    if not all(measured.result.passed for _, measured in measurements):
-        raise typer.Exit(FAILURE)

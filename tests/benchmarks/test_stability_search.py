@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from benchmarks.stability import situations
 from benchmarks.stability_search import drawn, outcome, search
-from sgsst_core.bench.stability import situations
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

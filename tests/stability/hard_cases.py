@@ -1,8 +1,8 @@
-"""Shared check of the tests that run the hard cases of `sgsst bench stability`."""
+"""Shared check of the tests that run the hard cases of `make stability`."""
 
 from __future__ import annotations
 
-from sgsst_core.bench.stability import Case, measure
+from benchmarks.stability import Case, measure
 
 #: Maximum growth of memory. No case needs more than a few hundred megabytes; an allocation error takes many gigabytes.
 LARGEST_GROWTH = 1 << 30

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sgsst_core.bench.stability import Case
-from sgsst_core.bench.stability import gaussian_cases as gaussians
-from sgsst_core.bench.stability.case import camera
+from benchmarks.stability import Case
+from benchmarks.stability import gaussian_cases as gaussians
+from benchmarks.stability.case import camera
 from sgsst_core.rasterizer.projection import Outcome, project
 from sgsst_core.rasterizer.reference import splat
 from tests.stability.hard_cases import check

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sgsst_core.bench.stability import Case
-from sgsst_core.bench.stability import job_cases as jobs
+from benchmarks.stability import Case
+from benchmarks.stability import job_cases as jobs
 from tests.stability.hard_cases import check
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")

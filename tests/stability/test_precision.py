@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 from typing import get_args
 
 import pytest
 
-from sgsst_core.bench.stability import Case, CaseResult, Group, all_cases
-from sgsst_core.bench.stability import precision_cases as precision
+from benchmarks.stability import Case, CaseResult, Group, all_cases
+from benchmarks.stability import precision_cases as precision
+from benchmarks.stability.__main__ import main
 from tests.stability.hard_cases import check
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
@@ -29,3 +32,15 @@ def test_case_names_are_unique() -> None:
     names = [case.name for case in all_cases()]
     assert len(names) == len(set(names))
     assert {case.group for case in all_cases()} == set(get_args(Group))
+
+
+def test_report_has_the_selected_cases(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "found.json"
+    assert main(["--quick", "--only", "nan in", "--out", str(out)]) == 0
+    cases = json.loads(out.read_text())["cases"]
+    assert cases
+    assert all("nan in" in case["case"] and case["passed"] for case in cases)
+    assert "Numerical stability" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["--only", "no such case"])
+    assert "no such case" in capsys.readouterr().err

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sgsst_core.bench.stability import Case
-from sgsst_core.bench.stability import optimization_cases as optimization
+from benchmarks.stability import Case
+from benchmarks.stability import optimization_cases as optimization
 from sgsst_core.errors import DivergedError
 from tests.stability.hard_cases import check
 

@@ -1,7 +1,7 @@
 """Tests of hard cases of the GPU kernels, run on a GPU if there is one, otherwise in Triton's interpreter.
 
 The interpreter is about a thousand times slower than a GPU. Cases have fewer Gaussians here, but more in a raster tile
-than the kernels prepare at once; `sgsst bench stability` runs them at full size on a GPU.
+than the kernels prepare at once; `make stability` runs them at full size on a GPU.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from functools import partial
 import pytest
 import torch
 
-from sgsst_core.bench.stability import Case, case
-from sgsst_core.bench.stability import gaussian_cases as gaussians
-from sgsst_core.bench.stability import view_cases as views
-from sgsst_core.bench.stability.case import among_ordinary, camera, compare_rasterizers, repeated
+from benchmarks.stability import Case, case
+from benchmarks.stability import gaussian_cases as gaussians
+from benchmarks.stability import view_cases as views
+from benchmarks.stability.case import among_ordinary, camera, compare_rasterizers, repeated
 from sgsst_core.scene.gaussians import Scene
 from tests.stability.hard_cases import check
 

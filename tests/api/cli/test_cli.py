@@ -538,18 +538,6 @@ def test_bench_quality_writes_table_plot_images_and_scenes(files: Files, capsys:
     assert len(read_scene(folder / "transfer.ply").scene) == len(wall())
 
 
-def test_bench_stability_runs_selected_cases(files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "found.json"
-    assert main(["bench", "stability", "--quick", "--only", "nan in", "--out", str(out)]) == 0
-    shown = capsys.readouterr().out
-    cases = json.loads(out.read_text())["cases"]
-    assert cases
-    assert all("nan in" in case["case"] and case["passed"] for case in cases)
-    assert "Numerical stability" in shown
-    assert main(["bench", "stability", "--only", "no such case"]) == 2
-    assert "no such case" in capsys.readouterr().err
-
-
 def test_failed_report_preserves_scene(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     files.out.with_name("stylized.report.json").mkdir(parents=True)
     assert main(files.stylize("--steps-sos", "1")) == 1
@@ -1356,7 +1344,6 @@ _WRITING = [
     ["study make", "no.ply", "nor.ply", "--style", "no.png", "--orbit", "3", "--out", "study.html"],
     ["bench error-time", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "results"],
     ["bench quality", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "results"],
-    ["bench stability", "--out", "stability.json"],
 ]
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sgsst_core.bench.stability.case import Case, CaseResult, Group, ordinary, repeated
+from benchmarks.stability.case import Case, CaseResult, Group, ordinary, repeated
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import InvalidInputError
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from sgsst_core.bench.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, flat, texture, vgg16
+from benchmarks.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, flat, texture, vgg16
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from sgsst_core.bench.stability.case import CLOSE_TO_CUTOFF, Case, CaseResult, camera, ordinary, texture, vgg16
+from benchmarks.stability.case import CLOSE_TO_CUTOFF, Case, CaseResult, camera, ordinary, texture, vgg16
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.statistics import (
     LayerStatistics,

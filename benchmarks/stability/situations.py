@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.bench.stability.case import CaseResult, DecisionsOf, camera, evaluate, gradient_error, ordinary
+from benchmarks.stability.case import CaseResult, DecisionsOf, camera, evaluate, gradient_error, ordinary
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights

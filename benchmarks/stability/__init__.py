@@ -6,14 +6,14 @@ If the input must be rejected, the case checks that it is.
 
 from __future__ import annotations
 
-from sgsst_core.bench.stability import format_cases as formats
-from sgsst_core.bench.stability import gaussian_cases as gaussians
-from sgsst_core.bench.stability import image_cases as images
-from sgsst_core.bench.stability import job_cases as jobs
-from sgsst_core.bench.stability import optimization_cases as optimization
-from sgsst_core.bench.stability import precision_cases as precision
-from sgsst_core.bench.stability import view_cases as views
-from sgsst_core.bench.stability.case import Case, CaseResult, Group, Measurement, measure
+from benchmarks.stability import format_cases as formats
+from benchmarks.stability import gaussian_cases as gaussians
+from benchmarks.stability import image_cases as images
+from benchmarks.stability import job_cases as jobs
+from benchmarks.stability import optimization_cases as optimization
+from benchmarks.stability import precision_cases as precision
+from benchmarks.stability import view_cases as views
+from benchmarks.stability.case import Case, CaseResult, Group, Measurement, measure
 
 __all__ = ["Case", "CaseResult", "Group", "Measurement", "all_cases", "measure"]
 

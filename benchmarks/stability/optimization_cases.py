@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.bench.stability.case import Case, CaseResult, compare_losses, texture, vgg16
+from benchmarks.stability.case import Case, CaseResult, compare_losses, texture, vgg16
 from sgsst_core.constants import ALPHA_MIN, COLOR_OFFSET, SH_C0, TRANSMITTANCE_MIN
 from sgsst_core.errors import DivergedError
 from sgsst_core.scene.camera import Camera

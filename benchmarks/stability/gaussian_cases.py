@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sgsst_core.bench.stability.case import (
+from benchmarks.stability.case import (
     Case,
     CaseResult,
     among_ordinary,

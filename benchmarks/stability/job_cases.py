@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.bench.stability.case import Case, CaseResult, flat, repeated, texture, vgg16
-from sgsst_core.bench.stability.situations import (
+from benchmarks.stability.case import Case, CaseResult, flat, repeated, texture, vgg16
+from benchmarks.stability.situations import (
     Situation,
     colored,
     crowd,

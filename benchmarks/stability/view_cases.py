@@ -10,7 +10,7 @@ from functools import partial
 import psutil
 import torch
 
-from sgsst_core.bench.stability.case import (
+from benchmarks.stability.case import (
     Case,
     CaseResult,
     camera,

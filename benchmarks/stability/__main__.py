@@ -1,0 +1,78 @@
+"""Report of the hard cases against their float64 references: `make stability`.
+
+python -m benchmarks.stability [--only TEXT] [--quick] [--out FILE.json]
+
+Each case is printed with its error and bound, and stored with them; the exit status is 1 if a case exceeds its bound.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.machine import RESULTS, write_result
+from benchmarks.stability import Case, Measurement, all_cases, measure
+
+#: Width in characters of the table, which a narrower terminal would truncate.
+_WIDTH = 180
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure the chosen cases, store and print them, and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", metavar="TEXT", help="only cases whose name contains TEXT, or group TEXT")
+    parser.add_argument("--quick", action="store_true", help="smaller sizes; minutes faster")
+    parser.add_argument("--out", type=Path, default=RESULTS / "stability.json", help="JSON file to write")
+    chosen = parser.parse_args(arguments)
+    cases = [case for case in all_cases() if chosen.only in case.name or chosen.only == case.group]
+    if not cases:
+        parser.error(f"no case or group is called {chosen.only!r}, or contains it in its name")
+    measurements = []
+    for case in cases:
+        print(f"{case.group}: {case.name}", file=sys.stderr)
+        measurements.append((case, measure(case, full=not chosen.quick)))
+    figures = {"full": not chosen.quick, "cases": [_row(*pair) for pair in measurements]}
+    write_result(chosen.out.stem, figures, chosen.out.parent)
+    Console(width=_WIDTH).print(_table(measurements))
+    return int(not all(measured.result.passed for _, measured in measurements))
+
+
+def _table(measurements: Sequence[tuple[Case, Measurement]]) -> Table:
+    """Return a table of the error of each case."""
+    table = Table("case", "measure", "error", "bound", "", "note", title="Numerical stability")
+    group = ""
+    for case, measured in measurements:
+        if case.group != group:
+            group = case.group
+            table.add_section()
+            table.add_row(f"[bold]{group}[/bold]")
+        result = measured.result
+        mark = "ok" if result.passed else "[red]MISSED[/red]"
+        numbers = (f"{result.error:.1e}" if result.error else "0", f"{result.bound:.0e}" if result.bound else "0")
+        table.add_row(case.name, case.measure, *numbers, mark, result.note)
+    return table
+
+
+def _row(case: Case, measured: Measurement) -> dict[str, object]:
+    """Return one case as a JSON object, with non-finite errors as strings."""
+    result = measured.result
+    return {
+        "group": case.group,
+        "case": case.name,
+        "measure": case.measure,
+        "error": result.error if result.error < float("inf") else str(result.error),
+        "bound": result.bound,
+        "passed": result.passed,
+        "note": result.note,
+        "seconds": round(measured.seconds, 3),
+        "peak_growth": measured.peak_growth,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())
