@@ -42,8 +42,8 @@ from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_col
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.result_colors import NEIGHBORS, neighbors_change
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.unseen import NEIGHBORS, neighbors_change
 from sgsst_core.timing import Timer
 
 PARTS = ("reading", "harmonics", "survey", "first step", "unseen")

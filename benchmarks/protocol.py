@@ -40,7 +40,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.view_colors import ViewColors
+from sgsst_core.stylizing.views import ViewColors
 
 RANGES = {"short": SHORT_RANGE, "long": LONG_RANGE}
 #: Places of a scene in a folder, in order of preference.

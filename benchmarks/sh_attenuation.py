@@ -20,10 +20,9 @@ from torch import Tensor
 from benchmarks.inputs import input_parser, read_inputs
 from sgsst_core.quality.judge import frechet_distance
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene.color_moments import color_moments, style_moments
 from sgsst_core.scene.spherical_harmonics import harmonics_energy, scene_colors
 from sgsst_core.scene.stored_harmonics import held
-from sgsst_core.style import Style
+from sgsst_core.style import Style, color_moments, style_moments
 from sgsst_core.stylizing.warm_start import warm_start
 
 

@@ -20,16 +20,21 @@ from pydantic_core import CoreSchema, core_schema
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, NEAR
 from sgsst_core.errors import SettingsError
-from sgsst_core.option_parsers import (
+from sgsst_core.options import (
     COLOR_SYNTAX,
     STRENGTHS,
+    Declared,
+    Option,
+    declared,
+    merged,
     parse_bytes,
     parse_color,
     parse_growth,
     parse_strength,
     parse_weights,
+    reason,
+    unknown_text,
 )
-from sgsst_core.options import Declared, Option, declared, merged, reason, unknown_text
 
 PresetName = Literal["preview", "standard", "paper"]
 Precision = Literal["float32", "tf32", "bfloat16"]

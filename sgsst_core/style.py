@@ -27,6 +27,8 @@ _CHANNELS = (1, 3, 4)
 _PIXELS = 1 << 16
 #: Fractional part of the golden ratio; its multiples modulo 1 fill the unit interval evenly.
 _GOLDEN = 0.6180339887498949
+#: Mean [3] and covariance [3, 3], float64.
+Moments = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -198,3 +200,25 @@ def mixed_moments(moments: Sequence[tuple[Tensor, Tensor]], weights: Sequence[fl
 
 def _sum(parts: Sequence[Tensor]) -> Tensor:
     return torch.stack(list(parts)).sum(dim=0)
+
+
+def color_moments(colors: Tensor, weights: Tensor | None = None) -> Moments:
+    """Return the mean and covariance of colors [n, 3], weighted by [n]; None for equal weights."""
+    colors = colors.double()
+    weights = colors.new_ones(len(colors)) if weights is None else weights.double()
+    total = weights.sum()
+    mean = (weights[:, None] * colors).sum(dim=0) / total
+    centered = colors - mean
+    return mean, (weights[:, None] * centered).T @ centered / total
+
+
+def style_moments(style: Style) -> Moments:
+    """Return the mean and covariance of the pixels of a style; those of several images are mixed."""
+    return mixed_moments([color_moments(image.reshape(-1, 3)) for image in style.images], style.weights)
+
+
+def square_root(matrix: Tensor) -> Tensor:
+    """Return the square root of a symmetric matrix that is positive semidefinite up to rounding."""
+    values, vectors = torch.linalg.eigh(matrix)
+    root: Tensor = vectors * values.clamp_min(0).sqrt() @ vectors.T
+    return root

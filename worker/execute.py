@@ -12,10 +12,9 @@ import torch
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers
-from sgsst_core.files.colors import write_colors
 from sgsst_core.files.json_files import write_json
 from sgsst_core.files.scene_file import write_scene
-from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.files.stylized_ply import write_colors, write_stylized
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.quality.compression import CompressionLoss, measure_compression
 from sgsst_core.quality.findings import findings_of

@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from sgsst_core.files.colors import write_colors
 from sgsst_core.files.scene_file import write_scene
+from sgsst_core.files.stylized_ply import write_colors
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.stylizer import Stylizer
 

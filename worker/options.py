@@ -14,8 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from sgsst_core.constants import NEAR
 from sgsst_core.files.formats.spz import SpzAxes
-from sgsst_core.option_parsers import COLOR_SYNTAX, parse_color
-from sgsst_core.options import Option, declared
+from sgsst_core.options import COLOR_SYNTAX, Option, declared, parse_color
 from sgsst_core.scene.rendering import MAX_EPS2D, RenderMode
 from sgsst_core.settings import (
     BY_PRESET,

@@ -13,8 +13,7 @@ from sgsst_core.files.images import save_jpg
 from sgsst_core.planning.measurement_choice import LOSS_VIEWS
 from sgsst_core.scene.camera import resized, spread
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.first_view import render_first_view
-from sgsst_core.stylizing.result_colors import transferred_colors
+from sgsst_core.stylizing.result_colors import render_first_view, transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.inputs import Inputs
 from worker.live import LiveColors

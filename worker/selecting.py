@@ -15,9 +15,8 @@ from sgsst_core.files.photos import Photo, find_masks, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_property
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions, check_regions
-from sgsst_core.regions.masks import count_votes, decide_by_votes
+from sgsst_core.regions.selection import count_votes, decide_by_votes, in_box, in_half_space, in_sphere, where_property
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.selection import in_box, in_half_space, in_sphere, where_property
 from sgsst_core.style import Style
 from worker.region_requests import REST, RegionRequest, Selection
 from worker.styles import StyleFile

@@ -25,7 +25,7 @@ from service.errors import NotFoundError
 from service.optional import installed_extras
 from service.store.states import ACTIONS, TITLES, UNFINISHED
 from sgsst_core.files.formats import FORMATS, RESULT_FORMATS
-from sgsst_core.option_parsers import STRENGTHS
+from sgsst_core.options import STRENGTHS
 
 FOLDER = Path(__file__).parents[1] / "static"
 #: Placeholder in pages for the URL prefix of the files.

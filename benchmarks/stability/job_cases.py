@@ -25,8 +25,8 @@ from benchmarks.stability.situations import (
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.vgg import PIXELS
 from sgsst_core.loss.feature_scale import PUBLISHED, with_scales
+from sgsst_core.scene.colors import luminance
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.stored_harmonics import held
 
 _MEASURE = "loss and gradient at the end, relative to float64; finite, bounded, repeated, not above the start"

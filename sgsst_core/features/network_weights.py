@@ -49,7 +49,7 @@ class BackboneWeights:
         convolutions: Weight [out, in, 3, 3] and bias [out] by layer ("conv1_1"), float32, in network order.
         input_scale, input_shift: Input normalization, [3] float32: rgb (0..1) * input_scale + input_shift.
         scales: Factors by which the features of layers ("relu1_1") were multiplied; empty for installed weights.
-        gray: Whether the network's input is the luminance of images (`scene.luminance.gray`).
+        gray: Whether the network's input is the luminance of images (`scene.colors.gray`).
     """
 
     name: str

@@ -20,7 +20,7 @@ from torch import Tensor
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.pooling import max_pool, max_pool_backward, max_positions, relu_backward
-from sgsst_core.scene.luminance import gray, gray_gradient
+from sgsst_core.scene.colors import gray, gray_gradient
 
 #: Layers whose Gram matrix, mean and standard deviation form the style loss (Gatys et al.; SGSST).
 STYLE_LAYERS = ("relu1_1", "relu2_1", "relu3_1", "relu4_1", "relu5_1")

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TypeVar
 
 from sgsst_core.errors import CameraError
-from sgsst_core.files.labels import label
 from sgsst_core.files.lfs_pointers import refuse_pointer
 
 T = TypeVar("T")
@@ -254,3 +253,15 @@ def _number(where: str, word: str) -> float:
     if not _NUMBER.fullmatch(word):
         raise CameraError(f"{where}: {word[:40]!r} is not a number. {_EXPORT_AGAIN}")
     return float(word)
+
+
+def label(name: bytes) -> str:
+    """Return a name as text that can be printed and stored.
+
+    A name that is not UTF-8, such as one in CP949 or GBK, gets one character per byte (ISO 8859-1): different names
+    stay different.
+    """
+    try:
+        return name.decode()
+    except UnicodeDecodeError:
+        return name.decode("latin-1")

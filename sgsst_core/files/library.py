@@ -14,13 +14,15 @@ from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, format_of_
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from sgsst_core.files.splats import Splats, scene_of_splats, stylized_splats
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.files.trainer_checkpoints import (
     CHECKPOINT_SUFFIXES,
+    Splats,
     TrainerCheckpoint,
     is_trainer_checkpoint,
     read_checkpoint,
+    scene_of_splats,
+    stylized_splats,
     write_checkpoint,
 )
 from sgsst_core.refine.split import Refinement

@@ -16,7 +16,6 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.ply import PROPERTIES, RGB
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS
 from sgsst_core.files.formats.render_tag import FILTER_3D, is_flat
-from sgsst_core.files.mip_filter import apply_filter
 from sgsst_core.scene.stored_harmonics import RowLayout
 
 #: Order of the properties in messages; f_rest_* follow.
@@ -196,3 +195,27 @@ class SceneColumns:
         if not drop_invalid:
             raise SceneError(f"{summary}. Use --drop-invalid to drop these Gaussians.")
         return retained
+
+
+def apply_filter(scales: NDArray[np.float32], opacities: NDArray[np.float32], deviations: NDArray[Any]) -> None:
+    """Convolve Gaussians with the 3D filters of Mip-Splatting, in place.
+
+    A filter limits the detail of a Gaussian to what its training views could sample. Trainers keep its deviation beside
+    the Gaussian (property `filter_3D`), which is drawn convolved, at an opacity that keeps its integral. Variances
+    along the axes become s^2 + f^2, and the opacity is multiplied by the square root of the ratio of the determinants
+    before and after. Both are computed from logarithms, so that nothing over- or underflows.
+
+    Args:
+        scales: [n, 3], log scales.
+        opacities: [n], logits.
+        deviations: [n], deviation f of each filter, in world units; 0 leaves the Gaussian unchanged.
+    """
+    before, logits = scales.astype(np.float64), opacities.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
+        filters = 2 * np.log(np.abs(deviations.astype(np.float64)))
+        after = np.logaddexp(2 * before, filters[:, None]) / 2
+        ratio = (before - after).sum(axis=1)
+        log_opacity = ratio - np.logaddexp(0, -logits)
+        filtered = log_opacity - np.log(-np.expm1(log_opacity))
+    scales[:] = after
+    opacities[:] = np.where(ratio < 0, filtered, logits)

@@ -1,4 +1,4 @@
-"""Writer of stylized PLYs, which changes only the colors.
+"""Writers of stylized PLYs, which change only the colors, and of the colors alone.
 
 With an SH attenuation, `f_rest_*` are multiplied by one factor in float32. The written coefficients equal those that
 the job optimized with, because `Scene.attenuated` multiplies the same float32 values by the same factor.
@@ -27,6 +27,11 @@ from sgsst_core.files.formats.render_tag import FILTER_3D, retagged
 from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, encode_scene, file_stamp
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import changed
+
+#: New values of all Gaussians, by property name.
+_NewColumns = dict[str, NDArray[np.float32]]
+#: Largest finite float16 value.
+_FLOAT16_MAX = 65504.0
 
 
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
@@ -158,10 +163,6 @@ def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
     return retagged(raw, header, source.scene.rendering)
 
 
-#: New values of all Gaussians, by property name.
-_NewColumns = dict[str, NDArray[np.float32]]
-
-
 def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> _NewColumns:
     """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes.
 
@@ -291,3 +292,23 @@ def _changed_line(
             text = str(value) if kind == "f4" else str(int(value)) if kind == "u1" else repr(float(value))
             line = line[: token.start()] + text + line[token.end() :]
     return line
+
+
+def write_colors(path: Path, sh_dc: Tensor) -> None:
+    """Write f_dc_0..2 of each Gaussian in order, as an N x 3 array of little-endian float16 without a header.
+
+    Values are rounded to the nearest float16. The relative error is at most 2^-11, or the absolute error at most 2^-25
+    for values below 2^-14. For displayable colors, the error is less than 0.04 of an 8-bit level. Values beyond +-65504
+    are clamped. The file is written atomically.
+
+    Args:
+        path: File to write.
+        sh_dc: Finite coefficients, [N, 3].
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    values = sh_dc.detach().cpu().numpy()
+    with atomic_path(path) as temporary, temporary.open("wb") as output:
+        for start in range(0, len(values), BLOCK_ROWS):
+            output.write(np.clip(values[start : start + BLOCK_ROWS], -_FLOAT16_MAX, _FLOAT16_MAX).astype("<f2").data)

@@ -16,7 +16,7 @@ from sgsst_core.loss.position_term import Objective, ReferenceInputs, RegionRefe
 from sgsst_core.loss.statistics_terms import PAPERS_WEIGHTS, TermWeights, statistics_layers, term_weights
 from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.loss.terms import POSITION_TERMS
-from sgsst_core.scene.luminance import WEIGHTS as LUMINANCE_WEIGHTS
+from sgsst_core.scene.colors import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import StyleLossName
 

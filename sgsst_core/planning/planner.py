@@ -26,7 +26,7 @@ from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
-from sgsst_core.scene.color_subspace import color_subspace_of
+from sgsst_core.scene.colors import color_subspace_of
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style

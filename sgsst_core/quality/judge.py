@@ -26,11 +26,10 @@ from sgsst_core.quality.dists import Dists
 from sgsst_core.quality.lpips import Lpips, unit_features
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
-from sgsst_core.scene.color_moments import Moments, color_moments, square_root, style_moments
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from sgsst_core.style import Style
+from sgsst_core.style import Moments, Style, color_moments, square_root, style_moments
 from sgsst_core.stylizing.job_styles import JobStyles
 
 #: Maximum longer side of judged views in pixels. The limit keeps results at different resolutions comparable, and

@@ -35,7 +35,7 @@ from sgsst_core.regions.maps import ViewMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.evaluation import ShowViews, show_nothing
-from sgsst_core.stylizing.view_colors import ViewColors
+from sgsst_core.stylizing.views import ViewColors
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
 MOST_VIEWS = 4

@@ -19,7 +19,7 @@ from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.regions.maps import ContentMaps, DepthBands, RegionMaps, ViewMaps
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.color_subspace import ColorSubspace, color_subspace_of
+from sgsst_core.scene.colors import ColorSubspace, color_subspace_of
 from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
 from sgsst_core.style import Style

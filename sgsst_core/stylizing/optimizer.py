@@ -6,9 +6,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from sgsst_core.scene.color_subspace import ColorSubspace
-from sgsst_core.scene.luminance import with_chroma_of
-from sgsst_core.scene.screen import on_screen, on_screen_by_luminance
+from sgsst_core.scene.colors import ColorSubspace, on_screen, on_screen_by_luminance, with_chroma_of
 
 #: Adam's epsilon: practically zero, so that Gaussians of any blend weight move at the learning rate (SGSST).
 ADAM_EPS = 1e-15
@@ -35,7 +33,7 @@ class ColorOptimizer:
         chroma_of: [n, 3], colors whose chroma is preserved: the optimized quantity is then each color's difference from
             them in luminance. None to let colors change freely.
         subspace: Color subspace that colors stay in; None to let them change freely.
-        bounded: Whether to project colors to 0..1 after each step (`scene.screen`).
+        bounded: Whether to project colors to 0..1 after each step (`on_screen`).
         frozen: [n, 1] bool, frozen colors, whose gradients are 0; None if there are none.
     """
 

@@ -6,10 +6,10 @@ Each call of `Stylizer.run_step` makes one step; `loop.run` makes all steps.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import psutil
 import torch
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.budget import device_peak
-from sgsst_core.errors import DivergedError
+from sgsst_core.errors import DeviceMemoryError, DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.sos import SosResult
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
@@ -41,9 +41,10 @@ from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.result_colors import result_colors, transferred_colors
 from sgsst_core.stylizing.schedule import Phase, ViewOrder, drawn_views, phase_at
-from sgsst_core.stylizing.second_attempt import with_second_attempt
 from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
 from sgsst_core.stylizing.training_background import Color, drawn_color
+
+T = TypeVar("T")
 
 
 class Stylizer:
@@ -453,3 +454,43 @@ class Stylizer:
         self.seconds_by_part = {**earlier, **{name: earlier.get(name, 0.0) + own[name] for name in own}}
         self.measured = list(state.measured)
         self._visited_before = state.step
+
+
+def with_second_attempt(job: StylizationJob, work: Callable[[], T]) -> T:
+    """Return the result of a function, which is called again if the GPU runs out of memory.
+
+    Before that, caches are cleared, and the memory budget for activations is halved for the rest of the job. Results
+    then differ by rounding. Several ranks make no second attempt, because the others wait for messages of the first.
+
+    Raises:
+        DeviceMemoryError: If the memory is still not enough.
+    """
+    try:
+        return work()
+    except torch.OutOfMemoryError:
+        if job.collectives.size > 1:
+            raise _not_enough(job, "") from None
+    # Outside of the handler, because the exception refers to the tensors of the first attempt.
+    _halve_activations(job)
+    try:
+        return work()
+    except torch.OutOfMemoryError:
+        raise _not_enough(job, ", not even with half of the activations in memory") from None
+
+
+def _halve_activations(job: StylizationJob) -> None:
+    """Clear what depends on the partition, and halve the memory budget for activations."""
+    job.loss.halve_memory(max(camera.height * camera.width for camera in job.views.cameras))
+    job.view_targets.forget_division()
+    if job.graphs is not None:
+        job.graphs.clear()
+    torch.cuda.empty_cache()
+
+
+def _not_enough(job: StylizationJob, attempt: str) -> DeviceMemoryError:
+    free, total = torch.cuda.mem_get_info(job.network.device)
+    return DeviceMemoryError(
+        f"The GPU's memory ({total / 1e9:.1f} GB, {free / 1e9:.1f} GB free) is not enough for a step{attempt}. Stop "
+        f"other programs on this GPU, or give a smaller --memory-limit than {job.memory_limit / 1e9:.1f} GB or a "
+        "smaller --resolution (`max_resolution` in Python)."
+    )

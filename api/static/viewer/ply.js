@@ -99,7 +99,7 @@ export function plainPly(reader, { elements, comments }) {
 }
 
 /**
- * Convolve Gaussians with the 3D filters of Mip-Splatting, as `sgsst_core/files/mip_filter.py` does.
+ * Convolve Gaussians with the 3D filters of Mip-Splatting, as `sgsst_core/files/scene_columns.py` does.
  *
  * @param {Float32Array} rows
  * @param {number} width

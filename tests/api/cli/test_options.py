@@ -17,8 +17,7 @@ from api.cli.options import flags, help_text, kind_of
 from api.cli.options_table import reference
 from service.parameters import JobParameters
 from sgsst_core.errors import SettingsError
-from sgsst_core.option_parsers import parse_strength
-from sgsst_core.options import Declared, declared
+from sgsst_core.options import Declared, declared, parse_strength
 from sgsst_core.settings import EVERYTHING, Settings, checked, make_settings
 from worker.options import GROUPS, RunOptions, StylizeOptions, ViewOptions
 from worker.request import SceneRequest

@@ -15,7 +15,7 @@ import pytest
 from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
 from service.store.states import ACTIONS, TITLES, UNFINISHED
 from sgsst_core.files.formats import FORMATS
-from sgsst_core.option_parsers import STRENGTHS
+from sgsst_core.options import STRENGTHS
 from tests.api.service import Service
 
 BUNDLE = "vendor/swagger-ui/swagger-ui-bundle.js"

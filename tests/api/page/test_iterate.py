@@ -11,7 +11,7 @@ import httpx
 import pytest
 from PIL import Image
 
-from sgsst_core.option_parsers import STRENGTHS
+from sgsst_core.options import STRENGTHS
 from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, set_options, submit
 from tests.api.page.browser import Watched
 from tests.api.service import Service

@@ -10,17 +10,17 @@ import torch
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import OutputError
-from sgsst_core.files import colors
-from sgsst_core.files.colors import write_colors
+from sgsst_core.files import stylized_ply
+from sgsst_core.files.stylized_ply import write_colors
 
 
 def test_colors_round_trip_within_the_error_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(colors, "_BLOCK_ROWS", 100)
+    monkeypatch.setattr(stylized_ply, "BLOCK_ROWS", 100)
     generator = torch.Generator().manual_seed(1)
     size = torch.rand(1003, 3, generator=generator) * 14 - 9  # from 1e-9 to 1e5
     sh_dc = torch.randn(1003, 3, generator=generator).sign() * 10.0**size
     sh_dc[0] = torch.tensor([1e30, -65520.0, 65519.0])
-    path = tmp_path / "colors.f16"
+    path = tmp_path / "stylized_ply.f16"
     write_colors(path, sh_dc)
     assert path.stat().st_size == 6 * 1003
     actual = np.fromfile(path, "<f2").reshape(-1, 3).astype(np.float64)

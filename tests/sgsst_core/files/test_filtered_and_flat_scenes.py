@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats import by_name
-from sgsst_core.files.mip_filter import apply_filter
+from sgsst_core.files.scene_columns import apply_filter
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.rasterizer import make_rasterizer

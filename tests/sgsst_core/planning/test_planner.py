@@ -15,8 +15,8 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import EVERYTHING, Item, PresetName, make_settings
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.result_colors import neighbors_change
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.unseen import neighbors_change
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, wall
 
@@ -156,7 +156,7 @@ def test_neighbors_of_unseen_gaussians_do_not_depend_on_the_chunk_size(monkeypat
     expected = (change[seen].double()[nearest[:, :8]] * own[..., None]).sum(1) / own.sum(1, keepdim=True)
     torch.testing.assert_close(actual.double(), expected, rtol=1e-6, atol=1e-6)
     for part in (1, 7, 100):
-        monkeypatch.setattr("sgsst_core.stylizing.unseen._CHUNK", part)
+        monkeypatch.setattr("sgsst_core.stylizing.result_colors._CHUNK", part)
         assert torch.equal(neighbors_change(means, change, weights), actual)
 
 

@@ -3,7 +3,7 @@
 import torch
 
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.regions.masks import count_votes, decide_by_votes
+from sgsst_core.regions.selection import count_votes, decide_by_votes
 from tests.small_scenes import cameras, wall
 
 

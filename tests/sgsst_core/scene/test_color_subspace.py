@@ -11,8 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
-from sgsst_core.scene.color_subspace import ColorSubspace, color_subspace_of
-from sgsst_core.scene.luminance import gray
+from sgsst_core.scene.colors import ColorSubspace, color_subspace_of, gray
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from tests.sgsst_core.synthetic_images import synthetic_image

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sgsst_core.scene.luminance import WEIGHTS, gray, gray_gradient, luminance, with_chroma_of
+from sgsst_core.scene.colors import WEIGHTS, gray, gray_gradient, luminance, with_chroma_of
 
 
 def colors(count: int = 200, dtype: torch.dtype = torch.float64) -> torch.Tensor:

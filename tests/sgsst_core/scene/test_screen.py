@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sgsst_core.constants import SH_C0
-from sgsst_core.scene.luminance import with_chroma_of
-from sgsst_core.scene.screen import LARGEST, on_screen, on_screen_by_luminance
+from sgsst_core.scene.colors import LARGEST, on_screen, on_screen_by_luminance, with_chroma_of
 
 COEFFICIENT = st.floats(-1e6, 1e6, width=32)
 COLOR = st.tuples(COEFFICIENT, COEFFICIENT, COEFFICIENT)

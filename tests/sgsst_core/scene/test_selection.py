@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sgsst_core.scene.selection import in_box, in_half_space, in_sphere, where_property
+from sgsst_core.regions.selection import in_box, in_half_space, in_sphere, where_property
 
 NAN = float("nan")
 MEANS = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1, 2, 1], [-3, 0, 0], [NAN, 0, 0]])

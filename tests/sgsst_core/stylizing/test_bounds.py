@@ -12,10 +12,8 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import saturated
 from sgsst_core.regions.definition import Region, Regions
-from sgsst_core.scene.color_subspace import ColorSubspace
+from sgsst_core.scene.colors import LARGEST, ColorSubspace, gray
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.luminance import gray
-from sgsst_core.scene.screen import LARGEST
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.loop import run

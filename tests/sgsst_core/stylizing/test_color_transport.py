@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.stylizing import color_transport
-from sgsst_core.stylizing.color_transport import _drawn, _round_axes, _rounds, _through, _through_compiled, transported
+from sgsst_core.stylizing import warm_start
+from sgsst_core.stylizing.warm_start import _drawn, _round_axes, _rounds, _through, _through_compiled, transported
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def sampled(own: Tensor, weight: Tensor) -> Tensor:
 
 def test_axes_are_distinct_rotations() -> None:
     rotations = list(_round_axes())
-    assert len(rotations) == color_transport.ROUNDS
+    assert len(rotations) == warm_start.ROUNDS
     for rotation in rotations:
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
         assert torch.linalg.det(rotation) == pytest.approx(1)

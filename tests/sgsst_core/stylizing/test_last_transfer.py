@@ -18,8 +18,8 @@ from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.report.contact_sheet import write_contact_sheet
+from sgsst_core.scene.colors import on_screen_by_luminance
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.screen import on_screen_by_luminance
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run

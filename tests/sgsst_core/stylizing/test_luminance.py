@@ -15,8 +15,8 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene.colors import luminance
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.luminance import luminance
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style

@@ -24,9 +24,8 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.result_colors import transferred_colors
+from sgsst_core.stylizing.result_colors import neighbors_change_by_region, transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.unseen import neighbors_change_by_region
 from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, cameras, style, wall
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.scene.colors import gray
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.luminance import gray
 from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, style, wall
 from tests.worker.ranks.spawn import on_ranks

@@ -1,12 +1,16 @@
-"""Selection of Gaussians by image masks: each Gaussian votes with its blend weights.
+"""Selection of Gaussians by image masks, position or property, as a mask [N] bool.
 
-The vote of a Gaussian is the fraction of its blend weights in the masked views that lies where masks are white. Most
-Gaussians are clearly inside or outside. Gaussians on which views disagree, and those that no masked view shows, follow
-the majority of their neighbors. The border of the selection is therefore smooth rather than scattered.
+Gaussians vote on image masks with their blend weights. The vote of a Gaussian is the fraction of its blend weights in
+the masked views that lies where masks are white. Most Gaussians are clearly inside or outside. Gaussians on which views
+disagree, and those that no masked view shows, follow the majority of their neighbors. The border of the selection is
+therefore smooth rather than scattered.
+
+Positions are compared in float64, and boundaries are included. NaN is never selected.
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 
 import torch
@@ -20,6 +24,15 @@ from sgsst_core.scene.camera import Camera
 IN, OUT = 0.6, 0.4
 #: Number of neighbors whose majority an undecided or invisible Gaussian follows.
 NEIGHBORS = 8
+#: Comparisons of a property with a number.
+COMPARISONS: dict[str, Callable[[Tensor, float], Tensor]] = {
+    ">=": operator.ge,
+    "<=": operator.le,
+    "!=": operator.ne,
+    ">": operator.gt,
+    "<": operator.lt,
+    "=": operator.eq,
+}
 
 
 def count_votes(
@@ -67,3 +80,29 @@ def decide_by_votes(means: Tensor, inside: Tensor, total: Tensor) -> Tensor:
     votes = result[decided][torch.as_tensor(nearest).reshape(-1, count)].double().mean(dim=1)
     result[open_] = torch.where(votes == 0.5, result[open_], votes > 0.5)
     return result
+
+
+def in_box(means: Tensor, corners: Sequence[float]) -> Tensor:
+    """Select positions between two opposite corners x0, y0, z0, x1, y1, z1, in any order."""
+    first, second = torch.tensor([corners[:3], corners[3:]], dtype=torch.float64)
+    positions = means.double()
+    return ((positions >= torch.minimum(first, second)) & (positions <= torch.maximum(first, second))).all(dim=1)
+
+
+def in_sphere(means: Tensor, sphere: Sequence[float]) -> Tensor:
+    """Select positions within distance r of x, y, z."""
+    *middle, radius = sphere
+    distance: Tensor = (means.double() - torch.tensor(middle, dtype=torch.float64)).norm(dim=1)
+    return distance <= radius
+
+
+def in_half_space(means: Tensor, plane: Sequence[float]) -> Tensor:
+    """Select positions with a x + b y + c z >= d."""
+    *normal, distance = plane
+    height: Tensor = means.double() @ torch.tensor(normal, dtype=torch.float64)
+    return height >= distance
+
+
+def where_property(values: Tensor, sign: str, number: float) -> Tensor:
+    """Select values [N] by comparison with a number, which is converted to their dtype so that "=" can match."""
+    return COMPARISONS[sign](values, torch.tensor(number).to(values).item()) & ~values.isnan()

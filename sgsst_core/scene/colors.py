@@ -1,0 +1,153 @@
+"""Colors that may change only in some directions: in luminance, within 0..1, or within the colors of a style.
+
+Luminance is Y = 0.299 R + 0.587 G + 0.114 B, the luma of YIQ, computed from colors as they are stored and displayed
+(gamma-encoded), as in Gatys, Ecker, Bethge, Hertzmann and Shechtman, "Controlling Perceptual Factors in Neural Style
+Transfer", CVPR 2017, section 5.1. Adding the same value to all channels of a color does not change its I and Q, which
+are its chroma.
+
+A loss on images pushes colors beyond what a screen can show, where viewers clip them and the change is lost. Projecting
+each color back after every step is projected gradient descent on a box. Adam scales each channel separately, so
+clamping each channel is the exact projection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
+from sgsst_core.settings import Settings
+from sgsst_core.style import Style, color_moments, some_pixels
+
+#: Weights of red, green and blue; their sum is 1.
+WEIGHTS = (0.299, 0.587, 0.114)
+#: Standard deviation along a principal axis of a style's colors, in 0..1, up to which the axis is left out: three of
+#: 255 levels, which are hardly visible.
+NEGLIGIBLE = 3 / 255
+
+
+def luminance(colors: Tensor) -> Tensor:
+    """Return the luminance [...] of colors [..., 3], in their dtype."""
+    red, green, blue = colors.unbind(-1)
+    return WEIGHTS[0] * red + WEIGHTS[1] * green + WEIGHTS[2] * blue
+
+
+def gray(colors: Tensor) -> Tensor:
+    """Return gray colors [..., 3], whose channels all equal the luminance of the given colors."""
+    return torch.stack([luminance(colors)] * 3, dim=-1)
+
+
+def gray_gradient(gradient: Tensor) -> Tensor:
+    """Return dL/dcolors [..., 3] from dL/dgray(colors) [..., 3]: the channel sum times the luminance weights."""
+    total = gradient.sum(dim=-1)
+    return torch.stack([weight * total for weight in WEIGHTS], dim=-1)
+
+
+def with_chroma_of(colors: Tensor, original: Tensor) -> Tensor:
+    """Remove rounding errors from the chroma of colors [n, 3] that differ from `original` only in luminance.
+
+    The difference from the original, averaged over the three channels, is added to each original channel and rounded
+    once, so errors of many steps do not accumulate. DC coefficients work too, because colors are linear in them.
+    """
+    change = (colors.double() - original.double()).mean(dim=-1, keepdim=True)
+    return (original.double() + change).to(colors.dtype)
+
+
+def _largest_coefficient() -> float:
+    """Return the largest float32 coefficient whose color is at most 1 in float64.
+
+    Its negative has the color 0, because coefficient 0 is mid-gray.
+    """
+    largest = np.float32((1 - COLOR_OFFSET) / SH_C0)
+    if COLOR_OFFSET + SH_C0 * float(largest) > 1:
+        largest = np.nextafter(largest, np.float32(0))
+    return float(largest)
+
+
+#: DC coefficients from -LARGEST to LARGEST are colors from 0 to 1.
+LARGEST = _largest_coefficient()
+
+
+def on_screen(sh_dc: Tensor) -> Tensor:
+    """Clamp DC coefficients [n, 3] so that their colors are in 0..1."""
+    return sh_dc.clamp(-LARGEST, LARGEST)
+
+
+def on_screen_by_luminance(sh_dc: Tensor) -> Tensor:
+    """Add the smallest gray shift to DC coefficients [n, 3] that brings all channels of their colors into 0..1.
+
+    If the channels differ by more than 1, no shift suffices; they then exceed the range equally on both sides.
+
+    Returns:
+        [n, 3], in the dtype of the argument; chroma is preserved up to rounding (`with_chroma_of`).
+    """
+    lowest, highest = torch.aminmax(sh_dc.double(), dim=1, keepdim=True)
+    # Slightly inside the range, so that rounded sums do not leave it again.
+    bound = LARGEST * (1 - 1e-6)
+    inwards = (-bound - lowest).clamp_min(0) - (highest - bound).clamp_min(0)
+    centered = -(lowest + highest) / 2
+    return (sh_dc.double() + torch.where(highest - lowest > 2 * bound, centered, inwards)).to(sh_dc.dtype)
+
+
+@dataclass(frozen=True)
+class ColorSubspace:
+    """Line or plane in RGB that a style's colors lie on, as an affine map of DC coefficients: c -> c @ matrix + offset.
+
+    The loss cannot tell some hues apart: it compares features that respond to several hues alike, and each channel's
+    mean and standard deviation. Patches of yellow and cyan match a black and white woodcut. Projecting colors to the
+    line or plane after each step excludes such patches.
+
+    Attributes:
+        matrix: [3, 3], orthogonal projection.
+        offset: [3].
+        dimensions: 1 for a line, 2 for a plane.
+        deviation: Largest standard deviation of the style's colors perpendicular to it, in 0..1.
+    """
+
+    matrix: Tensor
+    offset: Tensor
+    dimensions: int
+    deviation: float
+
+    @staticmethod
+    def of(style: Style) -> ColorSubspace | None:
+        """Return the color subspace of a style; None if its colors vary in all directions, or in none."""
+        mean, covariance = color_moments(some_pixels(style))
+        variances, axes = torch.linalg.eigh(covariance.cpu())
+        deviations = variances.clamp_min(0).sqrt()
+        varies = deviations > NEGLIGIBLE
+        if varies.all() or not varies.any():
+            return None
+        matrix = axes[:, varies] @ axes[:, varies].T
+        center = (mean.cpu() - COLOR_OFFSET) / SH_C0
+        offset = center - center @ matrix
+        return ColorSubspace(matrix.float(), offset.float(), int(varies.sum()), float(deviations[~varies].max()))
+
+    def to(self, device: torch.device) -> ColorSubspace:
+        """Return the subspace with its tensors on a device."""
+        return replace(self, matrix=self.matrix.to(device), offset=self.offset.to(device))
+
+    def projected(self, sh_dc: Tensor) -> Tensor:
+        """Project DC coefficients [n, 3]."""
+        return self.along(sh_dc) + self.offset
+
+    def along(self, vectors: Tensor) -> Tensor:
+        """Project vectors [n, 3], such as gradients, to the directions of the line or plane.
+
+        Products are added one by one, because matrix products differ between processors in the last bit, and ranks
+        must have the same colors.
+        """
+        red, green, blue = vectors.split(1, dim=1)
+        projected: Tensor = red * self.matrix[0] + green * self.matrix[1] + blue * self.matrix[2]
+        return projected
+
+
+def color_subspace_of(styles: Sequence[Style], settings: Settings) -> ColorSubspace | None:
+    """Return the color subspace of a job; None if colors are free, or if there are several styles."""
+    if len(styles) != 1 or not settings.bounded or settings.preserve_colors != "no":
+        return None
+    return ColorSubspace.of(styles[0])
