@@ -31,7 +31,6 @@ from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.loss.feature_scale import with_scales
-from sgsst_core.quality.dists import may_judge
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
@@ -50,7 +49,6 @@ COLUMNS = (
     "sliced",
     "content",
     "region_content",
-    "dists",
     "background_sensitivity",
     "seconds",
 )
@@ -90,13 +88,10 @@ def main() -> None:
 
     def run(row: str, seed: int) -> tuple[torch.Tensor, dict[str, float]]:
         values = base | rows[row] | {"seed": seed}
-        own, content_weight = values.pop("region_content_weight", None), values.get("content_weight", 1.0)
+        own = values.pop("region_content_weight", None)
         regions = region.regions(own) if region and own is not None else None
         colors, seconds = _run(scene, cameras, style, values, regions)
-        figures = {**_judged(judge, colors, wanted, region), "seconds": seconds}
-        if not may_judge("vgg16", max(content_weight, own or 0.0)):
-            figures.pop("dists", None)
-        return colors, figures
+        return colors, {**_judged(judge, colors, wanted, region), "seconds": seconds}
 
     unstylized = scene.sh_dc, _judged(judge, scene.sh_dc, wanted, region)
     colors = compare_rows(

@@ -27,7 +27,6 @@ JUDGES = {
     "color_distance": "color distance",
     "content": "content",
     "features": "features",
-    "dists": "DISTS",
 }
 #: Result files with judged runs, by pair.
 FILES = ("quality", "equal_steps", "training_background", "cross_validation")

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from benchmarks.machine import add_pair
-from sgsst_core.quality.dists import load_dists_or_none
 from sgsst_core.quality.judge import Judge
 from sgsst_core.report.contact_sheet import write_rows
 
@@ -22,11 +21,10 @@ UNSTYLIZED = "unstylized"
 
 
 def judged(judge: Judge, sh_dc: Tensor) -> dict[str, float]:
-    """Return the judgment of colors [N, 3], with DISTS if installed, and without measures that have no value."""
-    judgment, dists = judge.judge(sh_dc), load_dists_or_none()
+    """Return the judgment of colors [N, 3], without measures that have no value."""
+    judgment = judge.judge(sh_dc)
     assert judgment is not None, "no view can be judged: give more cameras, or larger views"
-    measures = {**asdict(judgment), "dists": judge.dists(dists, sh_dc) if dists else None}
-    return {name: value for name, value in measures.items() if value is not None}
+    return {name: value for name, value in asdict(judgment).items() if value is not None}
 
 
 def compare_rows(

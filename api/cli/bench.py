@@ -154,7 +154,6 @@ def quality_table(quality: Quality) -> Table:
     figures = ("style", "interior_style", "sliced_features", "color_distance", "content", "features")
     columns = (
         *figures,
-        "DISTS",
         "background_sensitivity",
         "saturated",
         "short RMSE",
@@ -174,7 +173,7 @@ def quality_table(quality: Quality) -> Table:
             outcome.name + (" *" if outcome in front else ""),
             *(_number(value) for value in (one.style, one.interior_style, one.sliced_features)),
             f"{one.color_distance:.0f}",
-            *(_number(value) for value in (one.content, one.features, outcome.dists, one.background_sensitivity)),
+            *(_number(value) for value in (one.content, one.features, one.background_sensitivity)),
             f"{one.saturated:.1%}",
             *(_number(drift.rmse if drift else None) for drift in (outcome.short, outcome.long)),
             _number(outcome.loss),

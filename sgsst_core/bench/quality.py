@@ -21,7 +21,6 @@ from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.consistency import Consistency
-from sgsst_core.quality.dists import load_dists_or_none, may_judge
 from sgsst_core.quality.judge import Judge, Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViewMoment
@@ -51,7 +50,6 @@ class Outcome:
         sh_dc: Colors [N, 3].
         judgment: Judgment on the novel views.
         short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
-        dists: DISTS against the unstylized scene; None if it is not installed, or if the job optimizes its features.
         loss: Remaining loss, relative to the unstylized scene; None if it was not measured.
         steps: Number of steps.
         seconds: Seconds of optimization.
@@ -63,7 +61,6 @@ class Outcome:
     judgment: Judgment
     short: Consistency | None
     long: Consistency | None
-    dists: float | None = None
     loss: float | None = None
     steps: int = 0
     seconds: float = 0.0
@@ -78,7 +75,6 @@ class Outcome:
             "steps": self.steps,
             "seconds": self.seconds,
             **asdict(self.judgment),
-            "dists": self.dists,
             "consistency": {
                 name: {"rmse": values.rmse, "lpips": values.lpips, "pairs": len(values.pairs)} if values else None
                 for name, values in ranges.items()
@@ -160,15 +156,12 @@ def compare_quality(
             f"than {lpips.minimum_side} pixels. Give more cameras, or larger views."
         )
     novel_views.lpips = lpips
-    independent = may_judge(stylizer.job.network.name, stylizer.job.settings.content_weight)
-    dists = load_dists_or_none() if independent else None
 
     def outcome(name: str, what: str, sh_dc: Tensor) -> Outcome:
         moment: NovelViewMoment = novel_views.measure(sh_dc)
         judgment = judge.judge(sh_dc)
         assert judgment is not None
-        distance = judge.dists(dists, sh_dc) if dists else None
-        return Outcome(name, what, sh_dc, judgment, moment.short, moment.long, distance)
+        return Outcome(name, what, sh_dc, judgment, moment.short, moment.long)
 
     blend_weights = stylizer.job.plan.survey.total_blend_weights
     transferred = warm_start(scene.sh_dc, blend_weights, Style.of(style))

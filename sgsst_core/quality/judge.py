@@ -22,7 +22,6 @@ from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.quality.consistency import shown
-from sgsst_core.quality.dists import Dists
 from sgsst_core.quality.lpips import Lpips, unit_features
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
@@ -138,21 +137,6 @@ class Judge:
         background_sensitivity = fmean(abs(view[0][0] - view[1][0]) for view in views)
         interior = (_mean_of_known([one[index] for view in views for one in view]) for index in (4, 5))
         return Judgment(style, color_distance, content, features, background_sensitivity, saturated(sh_dc), *interior)
-
-    @torch.no_grad()
-    def dists(self, network: Dists, sh_dc: Tensor) -> float | None:
-        """Return the mean DISTS of colors `sh_dc` [N, 3] against the unstylized scene; None if there are no views.
-
-        It is 0 for identical images. Only covered pixels count. Use it only for jobs that `dists.may_judge` accepts.
-        """
-        sh_dc, distances = sh_dc.detach().to(self._rasterizer.device), []
-        for camera in self.cameras:
-            image, coverage = self._render(sh_dc, camera)
-            before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
-            for level in _BACKGROUNDS:
-                own, theirs = (network.features(self._on(each, coverage, camera, level)) for each in (image, before))
-                distances.append(network.between(own, theirs, coverage))
-        return fmean(distances) if distances else None
 
     @torch.no_grad()
     def renders(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:

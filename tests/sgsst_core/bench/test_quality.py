@@ -34,9 +34,6 @@ def test_variants_are_compared_with_scene_and_color_transfer(quality: Quality) -
     assert [curve.variant.name for curve in quality.curves if curve.left_out] == ["tf32"]  # needs a GPU
     assert before.judgment.content == 0
     assert transfer.judgment.color_distance < before.judgment.color_distance
-    assert before.dists == pytest.approx(0, abs=1e-6)
-    assert transfer.dists is not None
-    assert transfer.dists > 0.01
     for outcome in variants:
         assert outcome.loss is not None
         assert outcome.loss < 1
