@@ -26,13 +26,13 @@ import torch
 from benchmarks.inputs import input_parser, read_inputs, read_views
 from benchmarks.judged import compare_rows, judged, write_sheet
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.loss.feature_scale import with_scales
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
+from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.regions.maps import RegionMaps

@@ -16,9 +16,9 @@ from sgsst_core.files.json_files import write_json
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.files.stylized_ply import write_colors, write_stylized
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
-from sgsst_core.quality.compression import CompressionLoss, measure_compression
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
+from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
 from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, sent_json
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions

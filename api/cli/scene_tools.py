@@ -30,9 +30,8 @@ from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
 from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
-from sgsst_core.quality.compression import CompressionLoss, measure_compression
-from sgsst_core.quality.findings import Finding, findings_of
-from sgsst_core.quality.render_mode import render_mode_findings
+from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
+from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json

@@ -16,11 +16,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.features.vgg import Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera

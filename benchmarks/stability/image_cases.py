@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, flat, texture, vgg16
+from benchmarks.stability.sos_reference import style_loss_reference
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.sos_reference import style_loss_reference
 from sgsst_core.loss.statistics_terms import style_loss
 from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.style import Style

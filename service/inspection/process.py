@@ -58,7 +58,7 @@ from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import PlanningProgress, ShowPlanning
-from sgsst_core.quality.compression import measure_compression
+from sgsst_core.quality.scene_difference import measure_compression
 from sgsst_core.regions.definition import Regions
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_confine`

@@ -66,7 +66,6 @@ class CheckSizes:
     """Sizes of the checks.
 
     Attributes:
-        gaussians: Number of Gaussians.
         width, height: Size of their view in pixels.
         repeats: Number of repetitions that must be bit-identical.
         channels: Channels of the network's blocks; VGG's own if None.
@@ -89,8 +88,6 @@ def check_device(name: str, device: torch.device, sizes: CheckSizes) -> Iterator
 
     Args:
         name: Rasterizer that jobs on this device use.
-        device: Device to check.
-        sizes: Sizes of the checks.
     """
     use_whole_float32()
     scene, camera = surface_scene(sizes.gaussians, degree=1), views(1, sizes.width, sizes.height)[0]
@@ -149,9 +146,6 @@ class Step:
     """Render of a view, its loss, and the color gradient, whose results are compared bit by bit.
 
     Attributes:
-        rasterizer: Rasterizer of the scene.
-        camera: Camera of the view.
-        loss: Loss of the view.
         style: Style targets of the view's size.
         colors: [N, 3], colors of the Gaussians.
     """

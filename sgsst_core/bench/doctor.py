@@ -8,6 +8,7 @@ prints one finding per line as JSON, as soon as it is known.
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import json
 import os
 import subprocess
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 State = Literal["works", "warning", "problem"]
 #: Seconds after which an examination is cut off.
 LIMIT = 27.0
+#: Seconds after which a query of `nvidia-smi` counts as failed.
+_TIMEOUT = 10
 #: Gigabytes of memory budget below which only small scenes fit.
 _LITTLE_MEMORY = 2.0
 
@@ -34,7 +37,6 @@ class Finding:
     """Finding about one topic.
 
     Attributes:
-        topic: Examined part of the machine.
         state: "works"; "warning" if jobs run, but slower than they could; "problem" if they fail or are wrong.
         text: Description, and for other states than "works", what to do.
     """
@@ -78,8 +80,6 @@ def findings() -> Iterator[Finding]:
     yield _weights()
     yield from _caches()
     import torch
-
-    from sgsst_core.bench.device_identity import package_version
 
     versions = f"Python {sys.version.split()[0]}, PyTorch {torch.__version__}, Triton {package_version('triton')}"
     yield Finding("program", "works", versions)
@@ -141,12 +141,10 @@ def _caches() -> Iterator[Finding]:
 def _gpu() -> Finding:
     import torch
 
-    from sgsst_core.bench.device_identity import nvidia_smi
-
     if torch.cuda.is_available():
         device = torch.device("cuda", torch.cuda.current_device())
         capability = ".".join(map(str, torch.cuda.get_device_capability(device)))
-        driver = nvidia_smi(device).get("driver", "unknown")
+        driver = (*nvidia_smi(device, "driver_version"), "unknown")[0]
         name, library = torch.cuda.get_device_name(device), torch.version.cuda or torch.version.hip
         text = f"{torch.cuda.device_count()} x {name}, compute capability {capability}, CUDA {library}, driver {driver}"
         return Finding("GPU", "works", text)
@@ -160,6 +158,34 @@ def _gpu() -> Finding:
     except Exception as error:  # whatever the exception, it says why
         return Finding("GPU", "warning", f"PyTorch cannot use it: {str(error).splitlines()[0]} Update its driver.")
     return Finding("GPU", "warning", "PyTorch sees none. Check CUDA_VISIBLE_DEVICES and the driver.")
+
+
+def nvidia_smi(device: torch.device, *fields: str) -> list[str]:
+    """Return the values of fields of `nvidia-smi --query-gpu`; empty if `nvidia-smi` is missing or fails."""
+    import torch
+
+    uuid = getattr(torch.cuda.get_device_properties(device), "uuid", None)
+    chosen = [f"--id=GPU-{uuid}"] if uuid else []
+    answer = output_of("nvidia-smi", *chosen, f"--query-gpu={','.join(fields)}", "--format=csv,noheader") or ""
+    values = [value.strip() for value in answer.split("\n")[0].split(",")]
+    return values if len(values) == len(fields) and answer else []
+
+
+def output_of(program: str, *arguments: str) -> str | None:
+    """Return what a program prints; None if it is missing, fails or takes too long."""
+    try:
+        done = subprocess.run([program, *arguments], capture_output=True, text=True, timeout=_TIMEOUT)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout if done.returncode == 0 else None
+
+
+def package_version(name: str) -> str | None:
+    """Return the version of an installed distribution; None if it is missing."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def _memory(device: torch.device) -> Finding:

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
@@ -30,6 +29,7 @@ from sgsst_core.planning.measurement_choice import LOSS_VIEWS
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.judge import Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
+from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.report.charts import (
     RELATIVE_LOSS,
     draw_legend,
@@ -63,7 +63,6 @@ class Variant:
 
     Attributes:
         name: Name for `--variants`.
-        what: Human-readable description.
         settings: Settings that override the standard preset.
     """
 
@@ -123,7 +122,6 @@ class Point:
 
     Attributes:
         seconds: Seconds of optimization.
-        step: Number of steps.
         relative: Loss relative to the unstylized scene, mean over scales; None if the latter is 0.
         by_scale: Relative loss of each scale; None where that of the unstylized scene is 0.
         judgment: Judgment on the novel views; None if AlexNet is not installed, or if no view can be judged.
@@ -173,10 +171,6 @@ def error_time(
     """Run variants on one scene, each with the same time budget or until its last step.
 
     Args:
-        scene: Scene to stylize.
-        cameras: Cameras of the views.
-        style: Style image [H, W, 3].
-        variants: Variants to run.
         seconds: Seconds of optimization per variant.
         weights: Weights of the feature network; None loads the default ones.
         progress: Function called after each evaluation, with the curve so far.

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from sgsst_core.bench.error_time import Curve, Variant, error_time
 from sgsst_core.bench.error_time import as_dict as curves_as_dict
-from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.consistency import Consistency
 from sgsst_core.quality.judge import Judge, Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
+from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.quality.novel_views import NovelViewMoment
 from sgsst_core.report.charts import png_chart
 from sgsst_core.report.contact_sheet import write_rows
@@ -46,12 +46,9 @@ class Outcome:
 
     Attributes:
         name: Name of the variant, or `UNSTYLIZED`, or `TRANSFER`.
-        what: Human-readable description.
         sh_dc: Colors [N, 3].
-        judgment: Judgment on the novel views.
         short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
         loss: Remaining loss, relative to the unstylized scene; None if it was not measured.
-        steps: Number of steps.
         seconds: Seconds of optimization.
     """
 
@@ -90,7 +87,6 @@ class Quality:
         outcomes: Unstylized scene, color transfer, and the variants.
         curves: Losses of each variant against seconds, or the reason why it was skipped.
         judge: Judge of the scene's colors; it can judge further colors.
-        style: Style image [H, W, 3].
     """
 
     outcomes: list[Outcome]
@@ -131,10 +127,7 @@ def compare_quality(
     """Run variants on one scene, each with the same time budget, and judge the results.
 
     Args:
-        scene: Scene to stylize.
-        cameras: Cameras of the views.
         style: Style image [H, W, 3] in 0 to 1.
-        variants: Variants to run.
         seconds: Seconds of optimization per variant.
         weights: Weights of the feature network; None loads the default ones.
         progress: Function called after each evaluation of the loss, with the curve so far.

@@ -104,7 +104,6 @@ def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
 
     Args:
         name: Set of weights, as in `expected_shapes`.
-        tensors: Tensors by name.
         where: Path for messages.
 
     Raises:

@@ -97,8 +97,6 @@ def partition(
     """Split a view, or a region of it, into partition tiles, row by row.
 
     Args:
-        height: Height of the view in pixels.
-        width: Width of the view in pixels.
         tile_size: Side of the inner rectangles, a multiple of 16; None for one tile that covers the whole region.
         halo: Width in pixels of the halo: a multiple of 16, at least the radius of the receptive field.
         region: Result of `covered_region`; None for the whole view.
@@ -213,8 +211,6 @@ def choose_tile_size(
     less memory for caching.
 
     Args:
-        height: Height of the view in pixels.
-        width: Width of the view in pixels.
         halo: Width in pixels of the halo, a multiple of 16.
         held: Number of pixels whose activations fit in the memory budget.
         working: Additional memory of a tile during back-propagation, as a fraction of the memory of its activations.

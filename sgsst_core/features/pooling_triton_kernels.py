@@ -23,9 +23,7 @@ def max_pool(source, out, width, across, entries, CHANNELS: tl.constexpr, MASK: 
     Args:
         source: [height, width, CHANNELS], ReLU output.
         out: [height // 2, across, CHANNELS].
-        width: Columns of the ReLU output.
         across: Columns of the output, width // 2.
-        entries: Number of values of the output.
         CHANNELS, MASK, BLOCK: As in `max_pool_backward`.
     """
     entry = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -50,10 +48,7 @@ def max_pool_backward(
         gradient: [height // 2, width // 2, CHANNELS], gradient of the maxima.
         source: [height, width, CHANNELS], ReLU output.
         out: [height, width, CHANNELS].
-        height: Rows of the ReLU output.
-        width: Columns of the ReLU output.
         entries: Number of windows times channels, including windows that the border cuts, whose gradient is 0.
-        CHANNELS: Number of channels.
         MASK: All bits of the type except the sign bit. ReLU outputs are compared by their bits: NaN is the largest.
         BLOCK: Entries per program.
     """

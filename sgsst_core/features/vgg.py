@@ -145,7 +145,6 @@ def convolutions(device: torch.device, *, tf32: bool = False) -> Iterator[None]:
     the device is not a GPU.
 
     Args:
-        device: Device of the convolutions.
         tf32: Whether to use TF32 instead of full float32.
     """
     if device.type != "cuda":
@@ -208,7 +207,6 @@ class FeatureNetwork:
         layers: Layers to report (for instance `STYLE_LAYERS` and `CONTENT_LAYER`), at least one of them a convolution.
             The network ends at the deepest of them.
         dtype: torch.float32, torch.float64 (reference) or torch.bfloat16.
-        device: Device the network runs on.
         tf32: Whether convolutions of a float32 network round their factors to the 10-bit mantissa of TF32. Only NVIDIA
             GPUs do this.
 

@@ -81,7 +81,6 @@ def verify(stream: BinaryIO, name: str, where: str) -> dict[str, str]:
     also be the one in `PACKAGE_FILES`.
 
     Args:
-        stream: Contents of the file.
         name: Set of weights that the file must contain.
         where: Path for messages.
 

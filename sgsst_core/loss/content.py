@@ -22,7 +22,6 @@ from sgsst_core.loss.position_term import (
     Objective,
     PositionTerm,
     PositionWeights,
-    ReferenceInputs,
     ScaledView,
     TermInputs,
 )
@@ -34,7 +33,6 @@ def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
 
     Args:
         count: n, float64 scalar: number of positions or sum of their weights. If it is 0, the factor is 0.
-        channels: c.
         weight: lambda_c.
     """
     return weight / (torch.where(count > 0, count, torch.inf) * channels)
@@ -86,8 +84,6 @@ class ContentTerm(PositionTerm):
     """Content term of one scale of a view.
 
     Attributes:
-        view: Scale of the view.
-        content: Content features.
         position_weights: Coverage, or v.
         factor: Result of `content_factor`.
     """
@@ -129,15 +125,3 @@ class ContentTerm(PositionTerm):
         in_view, in_tile = tile.owned_cells(CONTENT_LAYER, self.view.size)
         weights = self.view.weights(CONTENT_LAYER, in_view, self.position_weights)
         return ContentDifference.of(features[in_tile.slices], self.content[tile], self.factor, weights)
-
-    @staticmethod
-    def reference(inputs: ReferenceInputs) -> Tensor | None:
-        """Compute the term from its definition; None if the loss does not have it."""
-        if inputs.content is None or not inputs.objective.content_weight:
-            return None
-        difference = inputs.features[CONTENT_LAYER] - inputs.content[CONTENT_LAYER]
-        coverage, own = inputs.coverage(CONTENT_LAYER), inputs.content_weights(CONTENT_LAYER)
-        a = torch.ones(difference.shape[:2], dtype=torch.float64) if coverage is None else coverage
-        v = a if own is None else own
-        mean = (v[:, :, None] * difference**2).sum() / (a.sum() * difference.shape[-1])
-        return inputs.objective.content_weight * mean

@@ -47,7 +47,6 @@ def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
     an evaluation in eager mode.
 
     Args:
-        tiling: Partitioning rules of the loss.
         areas: Pixel count of the single partition tile of each scale.
     """
     return tiling.cache_activations and 2 * max(areas, default=0) * (1 + tiling.working) <= tiling.held
@@ -71,7 +70,6 @@ class _Graph:
     """Captured evaluation with its input and output tensors.
 
     Attributes:
-        graph: The `torch.cuda.CUDAGraph`.
         image, view: Static inputs; values are copied to them before a replay.
         result: Output; a replay overwrites its tensors.
     """

@@ -25,12 +25,10 @@ from torch import Tensor
 
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.partition import PartitionTile, Rectangle
-from sgsst_core.features.vgg import CONTENT_LAYER
 from sgsst_core.loss.position_term import (
     Objective,
     PositionTerm,
     PositionWeights,
-    ReferenceInputs,
     ScaledView,
     TermInputs,
 )
@@ -71,12 +69,7 @@ def nearest_weight(style_loss: StyleLossName, unit: float = 1.0) -> float:
 
 
 def nearest_layers(style_loss: StyleLossName, network: str) -> tuple[str, ...]:
-    """Return the layers whose features are matched: all of the third block, as in ARF, or none.
-
-    Args:
-        style_loss: Style loss.
-        network: "vgg16" or "vgg19".
-    """
+    """Return the layers whose features are matched: all of the third block, as in ARF, or none."""
     count = BLOCKS[network][2] if NEAREST_WEIGHTS[style_loss] else 0
     return tuple(f"relu3_{index}" for index in range(1, count + 1))
 
@@ -125,7 +118,6 @@ class Matches:
 
         Args:
             features: Features [h, w, c_l] by layer.
-            style: Style vectors to search.
             rounding: Relative rounding error of the features (`FeatureNetwork.rounding`).
             position_weights: [h, w]; None for equal weights. On a CPU, positions of weight 0 are skipped.
         """
@@ -169,9 +161,7 @@ class Matches:
         Args:
             gradient: [h, w, c_l].
             features: Features of the layer that were passed to `of`, [h, w, c_l].
-            layer: Name of the layer.
             style: Style vectors that were passed to `of`.
-            factor: Scalar.
             position_weights: [h, w]; None for equal weights.
         """
         units = style.units[:, style.parts[layer]]
@@ -212,29 +202,9 @@ def working_bytes(channels: int, value: int, device: str) -> int:
 
     Args:
         channels: Length of a style vector.
-        value: Bytes per value.
-        device: "cpu" or "cuda".
     """
     rows, columns = _BLOCK[device]
     return rows * (2 * columns + 3 * channels) * value
-
-
-def nearest_reference(features: Sequence[Tensor], style: Sequence[Tensor], weights: Tensor | None = None) -> Tensor:
-    """Compute the mean distance to the nearest style vector from its definition.
-
-    The computation is in float64, unblocked and differentiable.
-
-    Args:
-        features: Features of each layer, [h, w, c_l]. The feature vector of a position must not be 0.
-        style: Style features of each layer, [h', w', c_l]. The feature vector of a position must not be 0.
-        weights: [h, w]; None for equal weights.
-    """
-    own, other = (torch.cat([part.double() for part in parts], dim=2).flatten(0, 1) for parts in (features, style))
-    cosine = (own / own.norm(dim=1, keepdim=True)) @ (other / other.norm(dim=1, keepdim=True)).T
-    distance = 1 - cosine.max(dim=1).values
-    a = torch.ones_like(distance) if weights is None else weights.double().flatten()
-    result: Tensor = (a * distance).sum() / a.sum()
-    return result
 
 
 class _MatchedRegion(NamedTuple):
@@ -252,10 +222,8 @@ class NearestTerm(PositionTerm):
     The matches of each tile are stored for the second pass: they take a few bytes per cell, while the search is slow.
 
     Attributes:
-        view: Scale of the view.
         layer: First of the matched layers, which all have the same cells.
         rounding: Relative rounding error of the features.
-        timer: Timer of the search.
         regions: Regions whose features are matched.
         matches: Matches of each tile, by region.
     """
@@ -310,16 +278,3 @@ class NearestTerm(PositionTerm):
                 weights = self.view.weights(layer, in_view, pyramid)
                 owned = gradient[in_tile.slices], features[in_tile.slices]
                 matches.add_gradient(*owned, layer, vectors, factor, weights)
-
-    @staticmethod
-    def reference(inputs: ReferenceInputs) -> Tensor | None:
-        """Compute the term from its definition; None if the loss does not have it."""
-        layers = NearestTerm.layers(inputs.objective)
-        if not layers:
-            return None
-        weight = nearest_weight(inputs.objective.style_loss, inputs.weights.scales.get(CONTENT_LAYER, 1.0))
-        total = torch.zeros((), dtype=torch.float64)
-        for region in inputs.regions:
-            view, style = ([features[layer] for layer in layers] for features in (inputs.features, region.style))
-            total = total + region.factor * weight * nearest_reference(view, style, region.weights(layers[0]))
-        return total

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.vgg import FeatureNetwork, layer_stride
 from sgsst_core.loss.targets import ContentFeatures, StyleTarget
@@ -91,14 +90,10 @@ class TermInputs:
     """Inputs of the terms of one scale of a view.
 
     Attributes:
-        view: Scale of the view.
-        network: Feature network.
-        objective: Choice of terms.
         regions: Regions with their styles; a single one for the whole view if the scene has no regions.
         content: Content features; None without a content term.
         coverage: Position weights of terms that do not depend on the style.
         content_weights: Position weights of the content term, relative to its weight; None for `coverage`.
-        timer: Timer of this evaluation.
     """
 
     view: ScaledView
@@ -111,37 +106,6 @@ class TermInputs:
     timer: Timer
 
 
-class RegionReference(NamedTuple):
-    """Float64 features [h, w, c] of a region's style by layer, weights [h, w] by layer, and the loss's factor."""
-
-    style: Mapping[str, Tensor]
-    weights: Callable[[str], Tensor | None]
-    factor: float
-
-
-@dataclass(frozen=True)
-class ReferenceInputs:
-    """Inputs of the float64 reference of a term, for one scale of a view; features are [h, w, c] by layer.
-
-    Attributes:
-        weights: Weights of the feature network.
-        objective: Choice of terms.
-        features: Features of the view, differentiable.
-        regions: Regions with their styles.
-        content: Features of the content image; None without a content term.
-        coverage: Function that returns the position weights [h, w] of a layer; None for equal weights.
-        content_weights: The same for the position weights of the content term; None for `coverage`.
-    """
-
-    weights: BackboneWeights
-    objective: Objective
-    features: Mapping[str, Tensor]
-    regions: Sequence[RegionReference]
-    content: Mapping[str, Tensor] | None
-    coverage: Callable[[str], Tensor | None]
-    content_weights: Callable[[str], Tensor | None]
-
-
 class PositionTerm(ABC):
     """Term that is a sum over the positions of one scale of a view.
 
@@ -149,7 +113,6 @@ class PositionTerm(ABC):
 
     Attributes:
         name: Name in files and reports.
-        label: Display name.
     """
 
     name: ClassVar[str]
@@ -170,7 +133,6 @@ class PositionTerm(ABC):
         """Return the contribution of the cells that a tile owns, float64 scalar.
 
         Args:
-            tile: Partition tile.
             features: Features [h, w, c] of the whole tile by layer.
         """
 
@@ -182,12 +144,6 @@ class PositionTerm(ABC):
 
         Args:
             tile: Partition tile; `value` has been called for it.
-            layer: Layer.
             features: [h, w, c], features of the whole tile.
             gradient: [h, w, c], gradient of the whole tile.
         """
-
-    @staticmethod
-    @abstractmethod
-    def reference(inputs: ReferenceInputs) -> Tensor | None:
-        """Compute the term from its definition, float64 and differentiable; None if the loss does not have it."""

@@ -68,9 +68,7 @@ def check_stroke_depth(settings: Settings, cameras: Sequence[Camera], *, regions
     """Check that `stroke_depth` has scales to choose from, and no other weights to share positions with.
 
     Args:
-        settings: Settings of the job.
         cameras: Cameras at the sizes used for stylization.
-        regions: Whether the scene has regions.
 
     Raises:
         SettingsError: If every view has one scale, or the job has regions or weights of scales.

@@ -39,7 +39,6 @@ class SosResult:
     """Result of one evaluation.
 
     Attributes:
-        scales: Evaluated scales.
         values: [scales, terms] float64, the loss of each scale split into `TERMS`, still on the device.
         image_gradient: This rank's summand of dE/dimage, [h, w, 3], with respect to the pixels that it was given; the
             sum over all ranks is the gradient. None if only the loss was requested.
@@ -84,9 +83,6 @@ class SosLoss:
             with the same arguments.
 
     Attributes:
-        weights: Weights of the scales.
-        tiling: Partitioning rules.
-        divider: Divider of the work among the ranks.
         targets: Builder of the targets of styles and views.
     """
 
@@ -161,7 +157,6 @@ class SosLoss:
             view: View targets, from `targets.of_view`.
             scales: Scales to evaluate, each with a positive weight; phase 1 passes only the coarsest. None for the full
                 SOS loss.
-            gradient: Whether to compute the gradient.
         """
         shares = view.division.shares if view.division else None
         height, width = shares.size if shares else (image.shape[0], image.shape[1])
@@ -294,9 +289,6 @@ class _ScalePass:
     """Evaluation of one scale.
 
     Attributes:
-        view: Scale of the view.
-        tiles: Partition tiles of this rank.
-        statistics: Terms that compare statistics.
         terms: Terms that are sums over positions.
         values: [terms] float64, value of each of `TERMS`; set after the first pass.
     """
@@ -320,8 +312,6 @@ def make_loss(
     """Create the loss of a job.
 
     Args:
-        network: Feature network.
-        settings: Settings of the job.
         memory: Memory budget for activations in bytes.
         content_weight: Largest content weight of a region; None for that of the settings.
         timer: Timer; see `SosLoss`.

@@ -175,10 +175,8 @@ def style_loss(
     positions, loss and gradient are 0.
 
     Args:
-        statistics: Statistics of the view's features.
         target: Target from the style.
         feature_eps: Relative rounding error of the features (2^-23 for float32, 2^-52 for float64).
-        weights: Weights of the terms.
 
     Returns:
         Contribution of the layer to each of `STATISTICS_TERMS`, [3] float64, and the gradient.
@@ -214,12 +212,7 @@ def compared_layers(style_loss: StyleLossName, network: FeatureNetwork) -> list[
 
 
 class StatisticsTerms:
-    """Style terms of one scale of a view, which need statistics of the whole scale before they have a gradient.
-
-    Args:
-        inputs: Inputs of the terms.
-        layers: Compared layers.
-    """
+    """Style terms of one scale of a view, which need statistics of the whole scale before they have a gradient."""
 
     def __init__(self, inputs: TermInputs, layers: Sequence[str]) -> None:
         self._view = inputs.view
@@ -299,7 +292,6 @@ def fused_style_loss(
     """Compute `style_loss` on a GPU.
 
     Args:
-        statistics: Statistics of the view's features.
         target: Gram matrix, mean and standard deviation of the style, float64.
         weights: c^2 w_G, w_m and w_s.
         feature_eps: Relative rounding error of the features, as in `style_loss`.

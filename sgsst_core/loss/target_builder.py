@@ -28,12 +28,8 @@ class TargetBuilder:
     """Builder of the targets of styles and views for one loss.
 
     Args:
-        network: Feature network.
-        divider: Divider of the work among the ranks.
         timer: Timer for `vgg_forward`, `statistics` and `communication`.
         collectives: Collectives of the ranks that build each style target together.
-        style_loss: Style loss.
-        has_content: Whether the loss has a content term.
         style_scale: Magnification of style images relative to their default size.
     """
 
@@ -62,10 +58,6 @@ class TargetBuilder:
 
         If a style image is so small that a layer's feature map is empty at some scale, the layer is not compared at
         that scale. With several images, the layer's target is computed from those with a feature map.
-
-        Args:
-            style: Style.
-            view_size: (height, width) of the views.
 
         Raises:
             ImageError: If the loss matches features, and the style image is too small to have any.

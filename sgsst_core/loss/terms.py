@@ -28,13 +28,7 @@ TERMS = STATISTICS_TERMS | {term.name: term.label for term in POSITION_TERMS}
 
 
 def layers_of(style_loss: StyleLossName, weights: BackboneWeights, *, content: bool) -> tuple[str, ...]:
-    """Return every layer that a loss reads from a network.
-
-    Args:
-        style_loss: Style loss.
-        weights: Weights of the network.
-        content: Whether the loss has a content term.
-    """
+    """Return every layer that a loss reads from a network."""
     objective = Objective(weights.name, style_loss, float(content))
     read = [term.layers(objective) for term in POSITION_TERMS]
     layers = (*statistics_layers(style_loss, weights), *(layer for every in read for layer in every))

@@ -39,7 +39,6 @@ class Tiling:
         tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
         cache_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
             twice.
-        weights: Weights of the scales.
         largest: Maximum pixels of a partition tile whose size is chosen; None for no limit.
         rendering: Cost of rendering a pixel, relative to that of a pixel in the network (`RENDERING`).
     """
@@ -109,13 +108,11 @@ class Divider:
     """Divider of the work on views among ranks.
 
     Args:
-        tiling: Partitioning rules.
         collectives: Collectives of the ranks that evaluate each view together.
         leave_out: Whether pixels of weight 0 are left out.
 
     Attributes:
         speeds: Relative speeds of the ranks; work is divided in proportion to them.
-        collectives: Collectives of the ranks.
     """
 
     def __init__(self, tiling: Tiling, collectives: Collectives = ALONE, *, leave_out: bool = True) -> None:
@@ -130,7 +127,6 @@ class Divider:
         """Divide the work on some scales of a view.
 
         Args:
-            sizes: (height, width) of each scale.
             coverage: Position weights in the format of `ViewTarget.coverage`; None for equal weights.
             region: Rectangle of the full-size view that contains every covered pixel. If it is given, `coverage` is not
                 read, which avoids synchronizing with the device. The pieces of coarser scales may then be a few cells
@@ -153,8 +149,6 @@ class Divider:
         the part that the rank renders.
 
         Args:
-            size: (height, width) of the view.
-            scales: Scales to divide.
             coverage: Position weights in the format of `ViewTarget.coverage`; None for equal weights.
             region: Rectangle of the view that contains every covered pixel; None for the whole view.
         """

@@ -28,9 +28,7 @@ class ViewImages:
 
     Args:
         image: [h, w, 3], image of the view, or of this rank's window of `division.shares`.
-        division: Division of the work on the scales of the evaluation.
         background: Color of the pixels that no rank renders.
-        collectives: Collectives of the ranks.
         timer: Timer for `communication`.
     """
 
@@ -81,7 +79,6 @@ class _Pixels:
 
     Attributes:
         image: [h, w, 3].
-        scale: Scale of the image.
         area: Rectangle of the scaled view.
         gradient: [h, w, 3]; None before the first `add_gradient`.
     """
@@ -111,7 +108,6 @@ class _Exchange:
     Attributes:
         own: This rank's part of the view, relative to its window.
         images: Rectangles of each exchanged image by scale.
-        collectives: Collectives of the ranks.
         timer: Timer for `communication`.
     """
 

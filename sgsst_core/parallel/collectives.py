@@ -27,7 +27,6 @@ class Collectives(Protocol):
 
     Attributes:
         rank: Index of this rank in the group.
-        size: Number of ranks.
         local_size: Number of ranks on this machine, including this one.
         gpu_sharing: Largest number of ranks on one GPU; 1 without GPUs.
     """

@@ -79,7 +79,6 @@ class Shares:
     """Rectangles of a view, at full size, that the ranks render. Those of a rank without pixels are empty.
 
     Attributes:
-        size: (height, width) of the view.
         scale: Finest computed scale; no rank needs pixels of its pieces of it from another rank.
         parts: Each rank's piece of the finest scale. They are disjoint and contain every covered pixel.
         windows: Each rank's part and its halo, which the rank renders.
@@ -162,7 +161,6 @@ def divide(
     Args:
         pieces: One piece per scale.
         halo: Width in pixels of the halo around a tile.
-        speeds: Relative speeds of the ranks.
         rendering: Cost of a rendered pixel, relative to that of a pixel in the network. A rank renders its piece of the
             finest scale; 0 if what it renders does not depend on this division.
 

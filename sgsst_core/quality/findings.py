@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,10 +20,13 @@ from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.planning.survey import Survey, sees_something
+from sgsst_core.quality.scene_difference import scene_psnr
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
-from sgsst_core.scene.camera import Camera
+from sgsst_core.rasterizer.projection import Column, Shapes, project
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import style_size
+from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.style import Style
 
@@ -57,6 +60,13 @@ FLAT_STYLE = 1.0 / 255.0
 _SAMPLE = 50_000
 #: Number of Gaussians processed at a time. Each takes a few tens of bytes in float64.
 _PART = 1 << 17
+#: Number of views that are compared between render modes.
+_VIEWS = 8
+#: Opacity above which a Gaussian counts as opaque, and factor of compensation below which it is small: at 0.5, its area
+#: is about a third of that of the blur.
+_OPAQUE, _SMALL = 0.5, 0.5
+#: Fraction of small ones among the opaque Gaussians of a view, above which a scene that states no mode is reported.
+_MANY = 0.2
 
 Subject = Literal["scene", "views", "style"]
 
@@ -67,10 +77,8 @@ class Finding:
 
     Attributes:
         subject: Part of the input.
-        what: Description of the property.
         count, total: Number of affected items, and of all items.
         worst: Worst item and its value as text; may be empty.
-        done: Consequence for the job.
     """
 
     subject: Subject
@@ -92,10 +100,7 @@ def findings_of(
     """Return the findings about a scene read with `drop_invalid`, its views, and its style if given.
 
     Args:
-        file: Scene file.
-        cameras: Cameras of the views.
         style: Style image [H, W, 3] or mixture; None skips the style.
-        near: Distance of the near plane in world units.
         survey: Existing survey of the cameras; None renders the views.
     """
     rasterizer = make_rasterizer("cpu", file.scene, near=near)  # lazy: nothing is allocated yet
@@ -292,10 +297,6 @@ def view_findings(
     """Return the findings about the views, and about Gaussians that the views hardly or never show.
 
     Args:
-        file: Scene file.
-        cameras: Cameras of the views.
-        rasterizer: Rasterizer of the scene.
-        near: Distance of the near plane in world units.
         survey: Existing survey of the cameras; None renders each view, forward and backward.
     """
     if survey is not None and survey.uncovered is not None:
@@ -493,3 +494,47 @@ def _large_coefficients(values: Tensor | StoredHarmonics) -> _Check:
 def _parts(count: int) -> list[slice]:
     """Split `count` rows into slices."""
     return [slice(start, min(start + _PART, count)) for start in range(0, count, _PART)]
+
+
+def render_mode_findings(file: SceneFile, cameras: Sequence[Camera], *, near: float) -> list[Finding]:
+    """Return what an antialiased mode changes in views, and whether a scene that states no mode may need it."""
+    scene, views = file.scene, spread(list(cameras), min(_VIEWS, len(cameras)))
+    if scene.rendering.antialiased:
+        difference = _difference(scene, CLASSIC, views, near)
+        why = "as the file states" if scene.rendering == file.tag.rendering else "as requested"
+        return [Finding("scene", f"drawn {scene.rendering.text}", len(scene), len(scene), difference, why)]
+    if file.tag.reason or not views:
+        return []
+    small, opaque = small_gaussians(scene, views, near)
+    if small <= _MANY * opaque:
+        return []
+    difference = _difference(scene, Rendering("antialiased", scene.rendering.eps2d), views, near)
+    done = "drawn classic; if the scene was trained with antialiasing, add --render-mode antialiased"
+    what = "opaque but smaller than a pixel, as in antialiased scenes; the file states no mode"
+    return [Finding("scene", what, small, opaque, difference, done)]
+
+
+def small_gaussians(scene: Scene, cameras: Sequence[Camera], near: float) -> tuple[int, int]:
+    """Return the numbers of small opaque Gaussians, and of opaque ones, as means over views."""
+    scene = replace(scene, rendering=replace(scene.rendering, mode="classic"))
+    compensated = replace(scene, rendering=replace(scene.rendering, mode="antialiased"))
+    shapes, counts = Shapes.of(scene), []
+    for camera in cameras:
+        opacity, after = np.zeros(len(scene)), np.zeros(len(scene))
+        for each, values in ((scene, opacity), (compensated, after)):
+            projection = project(each, camera, near=near, shapes=shapes)
+            values[projection.gaussians] = np.exp2(projection.values[:, Column.LOG2_OPACITY])
+        opaque = opacity > _OPAQUE
+        counts.append((int((opaque & (after < _SMALL * opacity)).sum()), int(opaque.sum())))
+    small, total = np.mean(counts, axis=0).round().astype(int)
+    return int(small), int(total)
+
+
+def _difference(scene: Scene, rendering: Rendering, views: Sequence[Camera], near: float) -> str:
+    """Return how much renders in another mode differ, as text."""
+    try:
+        psnr = scene_psnr(scene, replace(scene, rendering=rendering), views, near=near)
+    except TooManyIntersectionsError:  # reported as a finding of the views
+        return ""
+    differ = "the same renders as" if psnr is None else f"{psnr:.1f} dB PSNR against"
+    return f"{differ} {rendering.text}, in {len(views)} views"

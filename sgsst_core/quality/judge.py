@@ -82,13 +82,11 @@ class Judge:
     """Judge that compares colors of one scene with one style.
 
     Args:
-        lpips: LPIPS with AlexNet.
         style: Style image [H, W, 3] in 0 to 1; or a weighted mixture of images, whose Gram matrices and color
             statistics are averaged; or the styles of the scene's regions. For regions, `Judgment.style` and
             `Judgment.color_distance` are averaged over regions, weighted by their fraction of a view, and frozen
             regions are ignored.
         scene: Unstylized scene.
-        rasterizer: Rasterizer of the scene.
         cameras: Cameras of the views. Views larger than `JUDGED_SIDE` are judged at that size. Views that see almost
             nothing, or are too small for AlexNet (a side below 31 pixels), are skipped.
         background: Background color [3] of the rasterizer.

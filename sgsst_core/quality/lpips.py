@@ -60,7 +60,6 @@ class Lpips:
     Args:
         network: "alex", which the authors recommend as a metric, or "vgg16".
         dtype: torch.float32, or torch.float64 for the reference.
-        device: Device that features are computed on.
         folder: Folder of the weights; None for the cache folder.
 
     Raises:

@@ -45,7 +45,6 @@ class Measurements:
     with the fields "before" and "after".
 
     Args:
-        stylizer: Job, at any step.
         show: Callback before each view of a measurement, with the number of completed and of all views.
     """
 
@@ -134,11 +133,7 @@ class Measurements:
         stylizer, novel_views = self._stylizer, self._novel_views_of_job()
         if novel_views.lpips is None or stylizer.job.collectives.rank:
             return
-        views = [novel_views.cameras[index] for index in novel_views.views]
-        background = stylizer.job.settings.background
-        judge = Judge(
-            novel_views.lpips, stylizer.job.styles, novel_views.scene, novel_views.rasterizer, views, background
-        )
+        judge = make_judge(stylizer, novel_views, novel_views.lpips)
         colors = {"before": stylizer.job.scene.sh_dc, "after": stylizer.stylized()}
         judgments = {name: judge.judge(sh_dc) for name, sh_dc in colors.items()}
         stylizer.measured[-1]["judged"] = {name: asdict(one) for name, one in judgments.items() if one} or None
@@ -273,3 +268,25 @@ class Measurements:
             rasterizer_of=partial(rasterizer_beside, stylizer),
             maps=stylizer.job.styles.maps(rasterizer),
         )
+
+
+def make_novel_views(stylizer: Stylizer) -> NovelViews:
+    """Create the novel views of a job, with all Gaussians of its scene."""
+    exact = ExactLoss(stylizer, "sos")
+    return NovelViews(
+        stylizer.job.views.cameras,
+        stylizer.job.views.covered,
+        stylizer.job.scene,
+        rasterizer_beside(stylizer, stylizer.job.scene),
+        exact.loss,
+        exact.style_targets,
+        weighted=stylizer.job.plan.weighted,
+        memory=measuring_memory(stylizer.job.memory),
+    )
+
+
+def make_judge(stylizer: Stylizer, novel_views: NovelViews, lpips: Lpips) -> Judge:
+    """Create the judge of a job's colors on its novel views."""
+    cameras = [novel_views.cameras[index] for index in novel_views.views]
+    background = stylizer.job.settings.background
+    return Judge(lpips, stylizer.job.styles, novel_views.scene, novel_views.rasterizer, cameras, background)

@@ -87,8 +87,6 @@ def choose_novel_cameras(
 
     Args:
         cameras: Cameras of the job that see at least one Gaussian.
-        scene: Scene that they show.
-        rasterizer: Rasterizer of the scene.
         most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
         rasterizer_of: Function that creates a rasterizer for a sample of the Gaussians, used to check depth and
             coverage in large scenes; None uses the whole scene.

@@ -72,7 +72,6 @@ class NovelViews:
     """Measurements on the novel views of one job.
 
     Args:
-        cameras: Cameras of the job.
         covered: Indices of the cameras that see at least one Gaussian.
         scene: Scene to stylize. Gaussians missing from it are missing in the novel views too.
         rasterizer: Rasterizer of the scene, preferably not shared with the job: in a shared `cached` rasterizer, blend

@@ -98,7 +98,6 @@ class Share:
     """Share of the votes that one variant received.
 
     Attributes:
-        variant: Name of the variant.
         votes: Number of its votes.
         total: Number of all votes.
         low: Lower end of the 95 % Wilson interval of the fraction.
@@ -135,11 +134,7 @@ def write_study(
     """Write the page of a study and its key.
 
     Args:
-        page: HTML file to write.
-        key: JSON file to write.
-        names: Names of the variants.
         style: Style image [H, W, 3] in 0..1.
-        views: Number of views.
         render: Function that returns the images [H, W, 3] of a variant at all views, by the variant's index.
 
     Raises:
@@ -206,7 +201,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
     Args:
         successes: Number of successes, 0 to `trials`.
-        trials: Number of trials, at least 1.
     """
     share, square = successes / trials, _NORMAL_95**2
     center = (share + square / (2 * trials)) / (1 + square / trials)

@@ -2,7 +2,7 @@
 
 Geometry is frozen, so the blend weights W of a view never change: an image is W c + T_final background, the color
 gradient is W^T dL/dimage, and rasterization is reduced to reading W from memory. Weights are stored on the device that
-applies them, in a layout for this device: `cpu_cached` on the CPU, `triton_cached` on GPUs.
+applies them, in a layout for this device.
 """
 
 from __future__ import annotations

@@ -79,8 +79,6 @@ def build_tile_intersections(
     """Project a scene, sort its Gaussians by depth, and compute the tile intersections.
 
     Args:
-        scene: Scene to project.
-        camera: Camera of the view.
         near: Near plane in world units.
         shapes: Shapes of the scene from an earlier view; None to compute them.
 
@@ -116,7 +114,6 @@ def intersections_of_subset(isects: TileIntersections, indices: NDArray[np.int32
     The arrays are the same as those of `build_tile_intersections` for the subset.
 
     Args:
-        isects: Intersections of the whole scene.
         indices: [N] int32, each Gaussian's index in the subset, in unchanged order; -1 if it is not in the subset.
     """
     projection = isects.projection

@@ -63,10 +63,7 @@ def draw_loss(figure: Figure, against: Against, history: History, moments: Seque
     Lines are running means over one round of views, with the range of the values shaded behind.
 
     Args:
-        figure: Figure to draw on.
         against: Quantity of the x axis.
-        history: History of the job.
-        moments: Measurements of novel views.
     """
     axes = figure.subplots()
     mark_phases(axes, history, against)
@@ -89,7 +86,6 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
     """Write the chart of the loss against seconds as a PNG.
 
     Args:
-        path: Path of the PNG.
         report: Report from `build_report`; its history may be empty.
 
     Raises:

@@ -62,11 +62,7 @@ def write_views(
     Large scenes are rendered from a sample of their Gaussians (see `sampled`).
 
     Args:
-        path: Path of the JPEG.
-        scene: Scene to render.
         cameras: Cameras to choose from, at least one.
-        background: Background color.
-        near: Distance of the near plane in world units.
 
     Raises:
         OutputError: If the file cannot be written.

@@ -35,12 +35,9 @@ class Sources:
     """Origin of a job's inputs, for the report.
 
     Attributes:
-        scene: Scene file.
         dropped: Number of Gaussians dropped from the file because of invalid values.
-        styles: Style images.
         cameras: Camera file or folder; None for an orbit.
         photos: Folder of the content images; None for unstylized renders.
-        backbone: Weights of the feature network.
     """
 
     scene: Path
@@ -62,12 +59,9 @@ def build_report(
     """Build the report as JSON-serializable values. See docs/report-format.md for its fields.
 
     Args:
-        stylizer: Job after its last step.
-        sources: Origin of the job's inputs.
         stopped: Reason why the job stopped, as returned by `loop.run`.
         before: Loss of the unstylized scene on the stylizer's `evaluation_views`.
         after: Loss of the last round of views (`round_evaluation`).
-        findings: Findings about scene, views and style.
     """
     return {
         **_outcome_json(stylizer, stopped, before, after),

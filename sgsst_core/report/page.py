@@ -74,7 +74,6 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
     """Render the page as HTML, without external references and without scripts.
 
     Args:
-        report: Report from `build_report` or report.json.
         sheet: Contact sheet as JPEG; None omits it.
         views: Sheet of all views as JPEG; None omits it.
     """
@@ -122,8 +121,6 @@ def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None, view
     """Write the page atomically.
 
     Args:
-        path: Path of the page.
-        report: Report from `build_report` or report.json.
         sheet_path: Contact sheet, JPEG; None omits it.
         views_path: Sheet of all views, JPEG; None omits it.
 

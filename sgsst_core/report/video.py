@@ -61,8 +61,6 @@ def write_frames(
         layer: Scene to show.
         cameras: Cameras of one size, one per frame.
         unstylized: Scene at the start of the transition; None for no transition.
-        transition: Kind of the transition.
-        alpha: Whether to write an alpha channel.
         progress: Callback that receives the numbers of completed and of all frames.
     """
     for done, frame in enumerate(_frames(layer, cameras, unstylized, transition, alpha), start=1):

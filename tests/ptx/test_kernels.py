@@ -18,8 +18,7 @@ from sgsst_core.loss.statistics_terms import StyleGradient, fused_add_style_grad
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.rasterizer.triton import TritonRasterizer
-from sgsst_core.rasterizer.triton_cached import CountedPieces
+from sgsst_core.rasterizer.triton import CountedPieces, TritonRasterizer
 from sgsst_core.rasterizer.triton_kernels import PAIRS
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import CLASSIC, Rendering

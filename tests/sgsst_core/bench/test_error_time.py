@@ -22,11 +22,11 @@ from sgsst_core.bench.error_time import (
     pareto_front,
     write_plot,
 )
-from sgsst_core.bench.judging import make_judge, make_novel_views
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.lpips import Lpips
+from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
+from benchmarks.stability.sos_reference import StyledWeights, sos_reference
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.statistics import layer_statistics, merge
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.sos_reference import StyledWeights, sos_reference
 from sgsst_core.loss.targets import combined
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.regions.definition import Region, Regions, check_regions

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.stability.sos_reference import nearest_reference, sos_reference
 from sgsst_core.errors import ImageError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
@@ -15,12 +16,10 @@ from sgsst_core.loss.nearest import (
     NEAREST_WEIGHTS,
     Matches,
     nearest_layers,
-    nearest_reference,
     search,
 )
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.loss.targets import StyleVectors
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.settings import StyleLossName

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights, check_scales
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, Activations, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.loss.targets import StyleTarget
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.scene import pyramid

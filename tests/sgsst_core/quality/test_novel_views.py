@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.stability.sos_reference import box_average_reference, features_reference
 from sgsst_core import Stylizer, make_settings, run
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
@@ -20,7 +21,6 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.sos_reference import box_average_reference, features_reference
 from sgsst_core.loss.statistics_terms import GRAM_WEIGHT
 from sgsst_core.planning.measurement_choice import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth

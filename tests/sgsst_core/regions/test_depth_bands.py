@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.stability.sos_reference import StyledWeights, sos_reference
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.scale_weights import band_count, check_stroke_depth
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.sos_reference import StyledWeights, sos_reference
 from sgsst_core.loss.targets import by_band
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer

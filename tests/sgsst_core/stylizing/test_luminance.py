@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.sos_reference import sos_reference
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.colors import luminance
 from sgsst_core.scene.gaussians import Scene

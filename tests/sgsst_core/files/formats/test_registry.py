@@ -20,7 +20,7 @@ from sgsst_core.files.formats.splat import SPLAT
 from sgsst_core.files.formats.spz import SPZ, SPZ_3
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
-from sgsst_core.quality.compression import measure_compression
+from sgsst_core.quality.scene_difference import measure_compression
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.scene.stored_harmonics import held

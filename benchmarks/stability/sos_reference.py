@@ -1,8 +1,8 @@
-"""Float64 reference of `sos.SosLoss` for tests: the SOS loss as defined in the paper, untiled, with autograd."""
+"""Float64 reference of `loss.sos.SosLoss`: the loss and all its terms by their definition, untiled, with autograd."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,11 +11,10 @@ from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import PIXEL_UNIT, PIXELS, layer_stride
-from sgsst_core.loss.position_term import Objective, ReferenceInputs, RegionReference
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXEL_UNIT, PIXELS, layer_stride
+from sgsst_core.loss.nearest import nearest_layers, nearest_weight
 from sgsst_core.loss.statistics_terms import PAPERS_WEIGHTS, TermWeights, statistics_layers, term_weights
 from sgsst_core.loss.targets import LayerTarget
-from sgsst_core.loss.terms import POSITION_TERMS
 from sgsst_core.scene.colors import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import StyleLossName
@@ -97,6 +96,24 @@ def _statistics(features: Tensor, position_weights: Tensor | None = None) -> Lay
     return LayerTarget(gram, mean, torch.where(alive, variance, 1.0).sqrt() * alive)
 
 
+def nearest_reference(features: Sequence[Tensor], style: Sequence[Tensor], weights: Tensor | None = None) -> Tensor:
+    """Compute the mean distance to the nearest style vector from its definition.
+
+    The computation is in float64, unblocked and differentiable.
+
+    Args:
+        features: Features of each layer, [h, w, c_l]. The feature vector of a position must not be 0.
+        style: Style features of each layer, [h', w', c_l]. The feature vector of a position must not be 0.
+        weights: [h, w]; None for equal weights.
+    """
+    own, other = (torch.cat([part.double() for part in parts], dim=2).flatten(0, 1) for parts in (features, style))
+    cosine = (own / own.norm(dim=1, keepdim=True)) @ (other / other.norm(dim=1, keepdim=True)).T
+    distance = 1 - cosine.max(dim=1).values
+    a = torch.ones_like(distance) if weights is None else weights.double().flatten()
+    result: Tensor = (a * distance).sum() / a.sum()
+    return result
+
+
 def sos_reference(
     network_weights: BackboneWeights,
     image: Tensor,
@@ -132,38 +149,39 @@ def sos_reference(
     factors = [1.0] * count if not scales else [*scales, *[0.0] * count][:count]
     for scale, factor in enumerate(factors):
         side = 1 << scale
-        inputs = ReferenceInputs(
-            network_weights,
-            Objective(network_weights.name, style_loss, content_weight),
-            features_reference(network_weights, box_average_reference(x, side)),
-            [
-                RegionReference(
-                    _scaled(network_weights, region.style, side), _cells(region.weights, side), region.factor
-                )
-                for region in regions
-            ],
-            None if content is None else _scaled(network_weights, content, side),
-            _cells(coverage, side),
-            _cells(content_weights, side),
-        )
-        values = [_statistics_terms(inputs), *(term.reference(inputs) for term in POSITION_TERMS)]
-        total = total + factor * sum(value for value in values if value is not None)
+        features = features_reference(network_weights, box_average_reference(x, side))
+        value = torch.zeros((), dtype=torch.float64)
+        for region in regions:
+            own, weights = _scaled(network_weights, region.style, side), _cells(region.weights, side)
+            value = value + region.factor * _style_terms(network_weights, style_loss, features, own, weights)
+        if content is not None and content_weight:
+            difference = (features[CONTENT_LAYER] - _scaled(network_weights, content, side)[CONTENT_LAYER]).square()
+            covered, counted = _cells(coverage, side)(CONTENT_LAYER), _cells(content_weights, side)(CONTENT_LAYER)
+            a = torch.ones(difference.shape[:2], dtype=torch.float64) if covered is None else covered
+            v = a if counted is None else counted
+            value = value + content_weight * (v[:, :, None] * difference).sum() / (a.sum() * difference.shape[-1])
+        total = total + factor * value
     loss = total / sum(factors)
     (gradient,) = torch.autograd.grad(loss, x)
     return loss.item(), gradient
 
 
-def _statistics_terms(inputs: ReferenceInputs) -> Tensor:
-    """Return the style terms of all regions at one scale."""
+def _style_terms(
+    network_weights: BackboneWeights,
+    style_loss: StyleLossName,
+    features: Mapping[str, Tensor],
+    style: Mapping[str, Tensor],
+    weights: Callable[[str], Tensor | None],
+) -> Tensor:
+    """Return the style terms of one region at one scale, from the features of view and style by layer."""
     loss = torch.zeros((), dtype=torch.float64)
-    for region in inputs.regions:
-        for layer in statistics_layers(inputs.objective.style_loss, inputs.weights):
-            loss = loss + region.factor * style_loss_reference(
-                inputs.features[layer],
-                _statistics(region.style[layer]),
-                region.weights(layer),
-                weights=term_weights(layer, inputs.weights.scales.get(PIXELS, 1.0) ** 2),
-            )
+    for layer in statistics_layers(style_loss, network_weights):
+        own = term_weights(layer, network_weights.scales.get(PIXELS, 1.0) ** 2)
+        loss = loss + style_loss_reference(features[layer], _statistics(style[layer]), weights(layer), weights=own)
+    if layers := nearest_layers(style_loss, network_weights.name):
+        factor = nearest_weight(style_loss, network_weights.scales.get(CONTENT_LAYER, 1.0))
+        view, vectors = ([each[layer] for layer in layers] for each in (features, style))
+        loss = loss + factor * nearest_reference(view, vectors, weights(layers[0]))
     return loss
 
 
