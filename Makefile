@@ -16,7 +16,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 \
 
 SPELLED := api benchmarks deploy docs service sgsst_core tests worker *.md Makefile mkdocs.yml pyproject.toml
 
-.PHONY: demo test test-all test-slow test-ptx stability lint lint-page docs clean
+.PHONY: demo test test-all test-slow test-ptx stability coverage lint lint-page docs clean
 
 # Stylize the built-in scene and print where the results are.
 demo: $(VENV)/installed
@@ -41,6 +41,14 @@ test-ptx: $(VENV)/installed-dev
 stability: $(VENV)/installed
 	$(BIN)/sgsst weights fetch vgg16
 	$(BIN)/python -m benchmarks.stability
+
+# Run the fast tests, and list the lines that none of them executes, in any process.
+coverage: $(VENV)/installed-dev
+	$(BIN)/sgsst weights fetch vgg16
+	$(BIN)/coverage erase
+	-OMP_NUM_THREADS=1 $(BIN)/coverage run -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile -m "not slow"
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report --show-missing --skip-covered
 
 test-all: test
 	$(MAKE) test-slow
@@ -68,7 +76,7 @@ $(TYPESCRIPT)/$(TYPESCRIPT_VERSION): $(VENV)/created
 
 # Build the documentation as a website in site/. Broken links are errors.
 docs: $(VENV)/installed-docs
-	$(BIN)/mkdocs build --strict
+	$(BIN)/zensical build --clean --strict
 
 clean:
 	rm -rf $(VENV) build site *.egg-info .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .hypothesis
