@@ -14,18 +14,35 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from benchmarks.inputs import read_views
 from benchmarks.machine import write_result
 from sgsst_core import Stylizer, make_settings
+from sgsst_core.budget import Cache
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
+from sgsst_core.loss.tiling import Divider, Division, Tiling
+from sgsst_core.parallel.division import Size
+from sgsst_core.planning.planner import make_plan
 from sgsst_core.report.machine import peak_memory
-from sgsst_core.settings import EVERYTHING
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.job import prepare_job
+
+#: Components that can be left out without changing the result.
+EVERYTHING = ("unseen", "uncovered", "activations", "content", "blend-weights")
 
 
 def main() -> None:
@@ -50,6 +67,49 @@ def main() -> None:
     write_result("left_out", {"style": arguments.style.name, "resolution": arguments.resolution, "scenes": results})
 
 
+def with_components(
+    added: Sequence[str],
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Style,
+    settings: Settings,
+    weights: BackboneWeights | None = None,
+) -> Stylizer:
+    """Return the stylizer of a job that computes some of `EVERYTHING` although it does not need to."""
+    if "blend-weights" in added:
+        settings = settings.model_copy(update={"cached_weights": "none"})
+    plan, context = make_plan(scene, cameras, settings, weights=weights, style=style)
+    if "unseen" in added:
+        plan = replace(plan, seen=torch.ones_like(plan.seen))
+    if "uncovered" in added and plan.weighted:
+        whole = [Rectangle(0, 0, camera.height, camera.width) for camera in context.cameras]
+        plan = replace(plan, survey=replace(plan.survey, regions=whole))
+    job = prepare_job(plan, scene, cameras, style, settings, weights=context.weights)
+    if "uncovered" in added:
+        job.loss.divider = _Whole(job.loss.tiling)
+    if "activations" in added:
+        job.loss.tiling = job.loss.divider.tiling = _Uncached(**vars(job.loss.tiling))
+    if "content" in added:
+        job.view_targets._content = Cache(0)
+    return Stylizer(job)
+
+
+class _Uncached(Tiling):
+    """Partitioning rules that compute every tile twice."""
+
+    def cached(self, areas: Sequence[int]) -> list[bool]:
+        return [False] * len(areas)
+
+
+class _Whole(Divider):
+    """Divider that leaves no pixel out."""
+
+    def divide(
+        self, sizes: Mapping[int, Size], coverage: Sequence[Tensor] | None = None, region: Rectangle | None = None
+    ) -> Division:
+        return super().divide(sizes)
+
+
 def _configurations() -> list[tuple[str, Sequence[str]]]:
     return [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
 
@@ -67,8 +127,8 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     scene = read_scene(Path(ply)).scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)
     cached = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
-    settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, early_stop=False, keep=cached)
-    stylizer = Stylizer.planned(scene, views, load_image(arguments.style), settings)
+    settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, early_stop=False)
+    stylizer = with_components(cached, scene, views, Style.of(load_image(arguments.style)), settings)
     for _ in range(arguments.rounds * len(stylizer.job.views.covered)):
         stylizer.run_step()
     steps = [sum(record.parts.values()) for record in stylizer.history[len(stylizer.job.views.covered) :]]

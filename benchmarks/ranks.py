@@ -86,7 +86,6 @@ def make(collectives: Collectives, scene: Any, view: Camera, style: Any, argumen
         steps_sos=10_000,
         memory_limit=int(arguments.memory * 1e9),
         rebalance=False,
-        keep=("ranks",),
     )
     return Stylizer.planned(scene, [view], style, settings, collectives=collectives)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
 from annotated_types import Ge, Le
 from pydantic import (
@@ -46,9 +46,6 @@ StyleLossName = Literal["sos", "nnfm", "mixed"]
 #: Background of the Gaussians in a step: `Settings.background`, a uniform random color, or the color of a style pixel.
 PlannedBackground = Literal["background", "random", "palette"]
 TrainingBackground = Literal["auto", "background", "random", "palette"]
-#: Values of `Settings.keep`: computations that can be skipped without changing the result.
-Item = Literal["unseen", "sh", "uncovered", "activations", "content", "blend-weights", "ranks", "launches"]
-EVERYTHING: tuple[Item, ...] = get_args(Item)
 #: Prefix of the description of a default that depends on the preset.
 BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
@@ -303,11 +300,8 @@ class Settings(BaseModel):
     )
     rebalance: bool = Field(
         True,
-        description="Give slower workers less work, once. Without it, runs on the same number of workers are "
-        "bit-identical even if the workers differ in speed.",
-    )
-    keep: Annotated[tuple[Item, ...], Option(instead="compute_everything")] = Field(
-        (), description="Items to compute although the scene does not need them; the result is the same."
+        description="Leave out workers that save hardly any time, and give slower workers less work, once. Without it, "
+        "all workers take part, and runs on the same number of workers are bit-identical.",
     )
     measure: Annotated[Fraction, Option(unit="fraction of the steps' time", metavar="S")] = Field(
         0.1,

@@ -18,7 +18,6 @@ from sgsst_core.options import COLOR_SYNTAX, Option, declared, parse_color
 from sgsst_core.scene.rendering import MAX_EPS2D, RenderMode
 from sgsst_core.settings import (
     BY_PRESET,
-    EVERYTHING,
     Color,
     Near,
     PresetName,
@@ -113,9 +112,6 @@ class StylizeOptions(_Chosen):
         Option(unit="RGB, 0 to 1", metavar="COLOR", default="white", parse=parse_color, syntax=COLOR_SYNTAX),
     ] = Field((1.0, 1.0, 1.0), description="Color behind transparent parts of style images.")
     backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 if it is installed, else VGG16.")
-    compute_everything: bool = Field(
-        False, description="Compute even what cannot change the result; slower, with the same result."
-    )
     workers: Annotated[
         int | None, Option(unit="ranks", metavar="N", default="this process only; in a service, chosen by the service")
     ] = Field(
@@ -130,7 +126,6 @@ class StylizeOptions(_Chosen):
         """Return the explicitly given settings, except the preset, by their names in `Settings`."""
         known = declared(Settings)
         given = {known[name].field: getattr(self, name) for name in self.model_fields_set & known.keys() - {"preset"}}
-        given["keep"] = EVERYTHING if self.compute_everything else None
         return {name: value for name, value in given.items() if value is not None}
 
     def settings(self) -> Settings:

@@ -92,7 +92,7 @@ def run(sizes: Sizes, findings: Findings) -> None:
     width, height = sizes.view
     scene = surface_scene(sizes.gaussians[0], degree=3)
     settings = make_settings(
-        "standard", steps_coarse=0, steps_sos=10, early_stop=False, cached_weights="none", keep=("launches",),
+        "standard", steps_coarse=0, steps_sos=10, early_stop=False, cached_weights="none",
         coarsest_side=24 if quick else None, position_weights="on",
     )  # fmt: skip
     with launches.recorded():

@@ -51,8 +51,8 @@ def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor]:
     """Return the gradient of a view before the first step, and the colors [N, 3] after the last step."""
     quick = sizes == QUICK
     settings = make_settings(
-        "standard", steps_coarse=0, steps_sos=sizes.rank_steps, early_stop=False, keep=("ranks", "unseen"),
-        rebalance=False, cached_weights="none", coarsest_side=24 if quick else None,
+        "standard", steps_coarse=0, steps_sos=sizes.rank_steps, early_stop=False, rebalance=False,
+        cached_weights="none", coarsest_side=24 if quick else None,
     )  # fmt: skip
     width, height = sizes.view
     stylizer = Stylizer.planned(

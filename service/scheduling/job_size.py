@@ -105,7 +105,7 @@ def estimated_seconds(parameters: Mapping[str, Any], inputs: Sequence[Mapping[st
 
 def settings_of(parameters: Mapping[str, Any]) -> Settings:
     """Return the settings of a job from its stored parameters; the defaults if another version has stored them."""
-    known = Settings.model_fields.keys() - {"preset", "keep"}
+    known = Settings.model_fields.keys() - {"preset"}
     given = {name: value for name, value in parameters.items() if name in known}
     preset = parameters.get("preset", "standard")
     try:

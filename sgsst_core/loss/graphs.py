@@ -49,7 +49,7 @@ def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
     Args:
         areas: Pixel count of the single partition tile of each scale.
     """
-    return tiling.cache_activations and 2 * max(areas, default=0) * (1 + tiling.working) <= tiling.held
+    return 2 * max(areas, default=0) * (1 + tiling.working) <= tiling.held
 
 
 @dataclass(frozen=True)

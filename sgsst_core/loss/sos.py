@@ -75,9 +75,6 @@ class SosLoss:
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         style_scale: Magnification of the style image relative to its default size.
         scales: Weights of the pyramid's scales; those of weight 0 are not computed.
-        leave_out: Whether the network skips pixels of weight 0. False is meant for comparisons.
-        cache_activations: Whether to cache as many activations as fit between the two passes. False computes each tile
-            twice; it is meant for comparisons.
         timer: Timer for `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
         collectives: Collectives of the ranks that evaluate each view together. All ranks must call the same methods
             with the same arguments.
@@ -97,8 +94,6 @@ class SosLoss:
         coarsest: int = COARSEST_SHORTER_SIDE,
         style_scale: float = 1.0,
         scales: ScaleWeights = EVEN,
-        leave_out: bool = True,
-        cache_activations: bool = True,
         timer: Timer | None = None,
         collectives: Collectives = ALONE,
     ) -> None:
@@ -117,12 +112,11 @@ class SosLoss:
             working,
             coarsest,
             tile_size,
-            cache_activations,
             scales,
             network.largest_tile,
             RENDERING[network.device.type],
         )
-        self.divider = Divider(self.tiling, collectives, leave_out=leave_out)
+        self.divider = Divider(self.tiling, collectives)
         self.targets = TargetBuilder(
             network,
             self.divider,
@@ -325,8 +319,6 @@ def make_loss(
         coarsest=settings.coarsest_side,
         style_scale=settings.style_scale,
         scales=ScaleWeights(settings.scales),
-        leave_out="uncovered" not in settings.keep,
-        cache_activations="activations" not in settings.keep,
         timer=timer,
         collectives=collectives,
     )

@@ -37,8 +37,6 @@ class Tiling:
         working: Additional memory that a tile needs during a pass, as a fraction of the memory of its activations.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
-        cache_activations: Whether to cache as many activations as fit between the two passes; False computes each tile
-            twice.
         largest: Maximum pixels of a partition tile whose size is chosen; None for no limit.
         rendering: Cost of rendering a pixel, relative to that of a pixel in the network (`RENDERING`).
     """
@@ -48,7 +46,6 @@ class Tiling:
     working: float
     coarsest: int
     tile_size: int | None = None
-    cache_activations: bool = True
     weights: ScaleWeights = EVEN
     largest: int | None = None
     rendering: float = 0.0
@@ -78,8 +75,6 @@ class Tiling:
 
         The memory budget applies to the sum over all given tiles.
         """
-        if not self.cache_activations:
-            return [False] * len(areas)
         return cached_tiles(areas, self.held, self.working)
 
 
@@ -109,15 +104,13 @@ class Divider:
 
     Args:
         collectives: Collectives of the ranks that evaluate each view together.
-        leave_out: Whether pixels of weight 0 are left out.
 
     Attributes:
         speeds: Relative speeds of the ranks; work is divided in proportion to them.
     """
 
-    def __init__(self, tiling: Tiling, collectives: Collectives = ALONE, *, leave_out: bool = True) -> None:
+    def __init__(self, tiling: Tiling, collectives: Collectives = ALONE) -> None:
         self.tiling = tiling
-        self.leave_out = leave_out
         self.speeds = (1.0,) * collectives.size
         self.collectives = collectives
 
@@ -134,7 +127,7 @@ class Divider:
         """
         read = coverage if region is None else None
         weights = {scale: read[scale] if read else None for scale in sizes}
-        if region is None or not self.leave_out:
+        if region is None:
             pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
         else:
             pieces = tuple(Piece(scale, size, scaled_region(region, scale, size)) for scale, size in sizes.items())
@@ -167,7 +160,7 @@ class Divider:
     def _divided(
         self, size: Size, scales: Sequence[int], region: Rectangle | None, *, rendered: bool = True
     ) -> tuple[tuple[Piece, ...], ...]:
-        whole = region if region is not None and self.leave_out else Rectangle(0, 0, *size)
+        whole = Rectangle(0, 0, *size) if region is None else region
         sizes = [(size[0] >> scale, size[1] >> scale) for scale in scales]
         pieces = [
             Piece(scale, each, scaled_region(whole, scale, each)) for scale, each in zip(scales, sizes, strict=True)
@@ -199,13 +192,13 @@ class Divider:
 
     def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
         """Return the piece of one scale that contains all pixels that the network has to process."""
-        if coverage is None or not self.leave_out:
+        if coverage is None:
             return Piece(scale, size, Rectangle(0, 0, *size))
         return Piece(scale, size, covered_region(coverage))
 
     def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
         """Return the covered partition tiles of a piece, as large as the memory budget allows."""
         tiles = self.tiling.tiles(piece.size, piece.region)
-        if coverage is None or not self.leave_out:
+        if coverage is None:
             return tiles
         return [tile for tile in tiles if coverage[tile.inner.slices].any()]

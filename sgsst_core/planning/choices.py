@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from sgsst_core.budget import memory_for
@@ -50,10 +49,9 @@ ANOTHER_LOSS = "differs from the paper's loss"
 # --- scene and views -----------------------------------------------------------------------------------------------
 
 
-def rendered_gaussians(survey: Survey, settings: Settings) -> Tensor:
-    """Return the mask [N] bool of rendered Gaussians: those that any view shows, or all of them if requested."""
-    visible = survey.total_blend_weights > 0
-    return torch.ones_like(visible) if "unseen" in settings.keep else visible
+def rendered_gaussians(survey: Survey) -> Tensor:
+    """Return the mask [N] bool of rendered Gaussians: those that any view shows."""
+    return survey.total_blend_weights > 0
 
 
 def about_gaussians(probe: Probe, rendered: Tensor, settings: Settings) -> list[Decision]:
@@ -104,7 +102,7 @@ def _about_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
         reason = f"{scene.harmonics_energy:.0%} of the color variance depends on the view direction"
         lines = [Decision("view-dependent color", advice, reason)]
     degree = scene.used_degree
-    if "sh" in settings.keep or degree == scene.sh_degree:
+    if degree == scene.sh_degree:
         return lines
     return [
         *lines,
@@ -379,9 +377,7 @@ def launches(probe: Probe, settings: Settings, visits: Visits, phases: int) -> t
     if probe.machine.device != "cuda":
         return False, []
     visited = f"views of one size are visited about {visits.of_a_size:,} times"
-    if "launches" in settings.keep:
-        reason = "requested"
-    elif probe.machine.ranks > math.gcd(settings.views_per_step, probe.machine.ranks):  # several ranks share a view
+    if probe.machine.ranks > math.gcd(settings.views_per_step, probe.machine.ranks):  # several ranks share a view
         reason = "a graph cannot contain communication between workers"
     elif cost is None:
         reason = visited
@@ -434,7 +430,7 @@ def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[Cac
 def _why_not_cached(probe: Probe, settings: Settings, visits: Visits) -> str | None:
     """Return the reason why blend weights are not cached; None if they are."""
     raster, visited = probe.raster, f"a view is visited {visits.of_a_view:.1f} times"
-    if settings.cached_weights == "none" or "blend-weights" in settings.keep:
+    if settings.cached_weights == "none":
         return "requested"
     if raster.bytes is None or raster.half_bytes is None:
         return f"{RASTERIZERS[probe.rasterizer].title} cannot cache them"

@@ -73,8 +73,7 @@ class CostModel:
         self._plan, self._probe, self._settings = plan, probe, settings
         self.tiling = tiling_of(probe, settings)
         self.sizes = [probe.sizes[index] for index in plan.covered]
-        skip = plan.weighted and "uncovered" not in settings.keep
-        self._regions = [probe.survey.regions[index] if skip else None for index in plan.covered]
+        self._regions = [probe.survey.regions[index] if plan.weighted else None for index in plan.covered]
         fraction = _WORKING_FRACTION if probe.machine.device == "cpu" else 1.0
         everything = range(len(self.sizes))
         self.work = Work.of(self._pieces(everything), self.tiling, working_fraction=fraction)
@@ -118,7 +117,7 @@ class CostModel:
         coarse, sos = self._sampled(coarsest=True), self._sampled(coarsest=False)
         phases = [(self._plan.steps_coarse, coarse), (self._settings.steps_sos, sos)]
         choice = choose_ranks(phases, self._settings.views_per_step, available, link)
-        if "ranks" in self._settings.keep:
+        if not self._settings.rebalance:
             choice = replace(choice, ranks=available)
         return choice, *self._on_ranks(choice.ranks, coarse, sos)
 
@@ -288,7 +287,6 @@ def tiling_of(probe: Probe, settings: Settings) -> Tiling:
         memory_for("activations", probe.machine.memory) / network.held_bytes,
         network.working_bytes / network.held_bytes,
         settings.coarsest_side,
-        cache_activations="activations" not in settings.keep,
         weights=ScaleWeights(settings.scales),
         largest=network.largest_tile,
         rendering=RENDERING[probe.machine.device],

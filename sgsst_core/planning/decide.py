@@ -27,7 +27,7 @@ def decide(probe: Probe, settings: Settings, *, measured: bool = False) -> Plan:
         measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
     """
     survey, machine, tiling = probe.survey, probe.machine, tiling_of(probe, settings)
-    rendered = choices.rendered_gaussians(survey, settings)
+    rendered = choices.rendered_gaussians(survey)
     optimized = survey.total_blend_weights > 0
     weighted, weighted_lines = choices.position_weights(survey, settings)
     scan = choices.is_scan(survey, weighted=weighted)

@@ -59,7 +59,7 @@ class Plan:
     Attributes:
         survey: Survey of the views.
         optimized: [N] bool, Gaussians whose colors are determined by the views.
-        seen: [N] bool, Gaussians that are rendered: the optimized ones, or all if the settings ask for it.
+        seen: [N] bool, Gaussians that are rendered: those with a blend weight in a view.
         covered: Indices of the views that are stylized.
         weighted: Whether statistics are weighted by coverage.
         training_background: Background of the Gaussians in a step.

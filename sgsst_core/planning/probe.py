@@ -91,7 +91,7 @@ def measure(context: PlanningContext, survey: Survey, link: Link, maps: int = 0)
         SceneFacts(
             len(scene),
             context.sh_degree,
-            used_degree=scene.used_degree(rendered_gaussians(survey, context.settings)),
+            used_degree=scene.used_degree(rendered_gaussians(survey)),
             held_degree=0 if isinstance(scene.sh_rest, StoredHarmonics) else scene.sh_degree,
             harmonics_energy=harmonics_energy(scene, survey.total_blend_weights),
         ),
@@ -229,7 +229,7 @@ def _launch_cost(context: PlanningContext, views: Sequence[Camera]) -> LaunchCos
     """Measure the first view on a GPU, if views of one size are visited often enough to consider graphs."""
     settings, sizes = context.settings, {(camera.height, camera.width) for camera in views}
     visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
-    if context.machine.device == "cpu" or "launches" in settings.keep or visits < LEAST_GRAPH_VISITS:
+    if context.machine.device == "cpu" or visits < LEAST_GRAPH_VISITS:
         return None
     try:
         return launch_cost(_loss(context, settings.scales), (views[0].height, views[0].width))

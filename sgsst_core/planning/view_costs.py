@@ -251,7 +251,7 @@ def _content(
     render = RENDER * probe.raster.seconds if settings.content_weight else 0.0
     seconds = [each.features(probe.network) if settings.content_weight else 0.0 for each in works]
     fraction = content_fraction(probe.machine.device, weighted=plan.weighted, has_maps=bool(probe.maps))
-    budget = 0 if "content" in settings.keep else budget * fraction
+    budget *= fraction
     images = ViewData(0.0)
     if plan.training_background != "background" and settings.content_weight:
         # Features depend on the step's background color, so images are cached in their place.

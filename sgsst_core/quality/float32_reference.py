@@ -102,13 +102,10 @@ class Float32Reference(ExactLoss):
     def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
         super().__init__(stylizer, style_loss)
         settings = stylizer.job.settings
-        self.shown = stylizer.job.plan.survey.total_blend_weights > 0
-        scene, rasterizer = stylizer.job.views.scene, stylizer.job.views.rasterizer.uncached
-        if not torch.equal(self.shown, stylizer.job.plan.seen):
-            scene = stylizer.job.scene.subset(self.shown).without_zero_bands()
-            rasterizer = rasterizer_beside(stylizer, scene)
+        rasterizer = stylizer.job.views.rasterizer.uncached
+        self.seen = stylizer.job.plan.seen
         self.views = Views(
-            scene,
+            stylizer.job.views.scene,
             stylizer.job.views.cameras,
             rasterizer,
             covered=stylizer.job.plan.survey.covered,
@@ -121,13 +118,13 @@ class Float32Reference(ExactLoss):
             weighted=stylizer.job.plan.weighted,
             photos=stylizer.job.view_targets.photos,
             memory=memory,
-            maps=stylizer.job.styles.maps(rasterizer, self.shown),
-            content_maps=stylizer.job.styles.content_maps(rasterizer, self.shown),
+            maps=stylizer.job.styles.maps(rasterizer, self.seen),
+            content_maps=stylizer.job.styles.content_maps(rasterizer, self.seen),
         )
 
     def evaluate(self, indices: list[int], sh_dc: Tensor, show: ShowViews = show_nothing) -> Evaluation:
         """Return the mean SOS loss over views, by scale, for colors [N, 3] of the whole scene."""
-        values = sh_dc[self.shown].to(self.views.rasterizer.device)
+        values = sh_dc[self.seen].to(self.views.rasterizer.device)
         return evaluate(self.view_targets, self.style_targets, indices, values, show)
 
     def gradient(self, index: int, sh_dc: Tensor, scales: list[int]) -> tuple[Tensor, float]:
@@ -138,13 +135,13 @@ class Float32Reference(ExactLoss):
         """
         target, style = self.view_targets.target(index, scales), self.style_targets(self.views.cameras[index])
         gradient = torch.zeros_like(sh_dc)
-        values = sh_dc[self.shown].to(self.views.rasterizer.device)
+        values = sh_dc[self.seen].to(self.views.rasterizer.device)
         started = time.perf_counter()
         colors = self.views.colors(index, values)
         image = self.views.render(index, colors)
         pixels = self.loss.evaluate(image, style, target, scales).image_gradient
         assert pixels is not None
-        gradient[self.shown] = self.views.gradient(index, pixels.to(image.device), colors).cpu()
+        gradient[self.seen] = self.views.gradient(index, pixels.to(image.device), colors).cpu()
         return gradient, time.perf_counter() - started
 
     def gradient_error(self, *, start: bool = False) -> GradientError:
@@ -163,8 +160,7 @@ class Float32Reference(ExactLoss):
         with stylizer.with_colors(colors) if start or stylizer.job.transfers_last else nullcontext():
             approximate, seconds = stylizer.gradient(index, scales)
         exact, seconds_exact = self.gradient(index, colors, scales)
-        seen = stylizer.job.plan.seen
-        difference = Difference.of(approximate, exact[seen])
+        difference = Difference.of(approximate, exact[self.seen])
         return GradientError(
             0 if start else stylizer.step,
             stylizer.job.views.cameras[index].name,

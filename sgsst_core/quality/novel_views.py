@@ -126,7 +126,6 @@ class NovelViews:
             tile_size=loss.tiling.tile_size,
             coarsest=loss.tiling.coarsest,
             scales=loss.weights,
-            leave_out=loss.divider.leave_out,
         )
         chosen = choose_novel_cameras(
             [cameras[index] for index in covered], scene, rasterizer, most=most, rasterizer_of=rasterizer_of

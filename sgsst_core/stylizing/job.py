@@ -301,7 +301,7 @@ def prepare_job(
         collectives=team.group,
     )
     rendered = attenuated if plan.seen.all() else attenuated.subset(plan.seen)
-    rendered = rendered if "sh" in settings.keep else rendered.without_zero_bands()
+    rendered = rendered.without_zero_bands()
     rasterizer = _make_rasterizer(plan, settings, rendered, memory, planning_context)
     if team.group.size > 1:  # the survey's tile intersections are those of whole views
         rasterizer.forget_views()
@@ -383,7 +383,6 @@ def _make_view_targets(
         weighted=plan.weighted,
         photos=photos,
         memory=view_memory(plan, memory),
-        cache_content="content" not in settings.keep,
         regions=plan.survey.regions if plan.weighted else None,
         background=settings.background,
         drawn=plan.training_background != "background",

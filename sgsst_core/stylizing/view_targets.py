@@ -37,7 +37,6 @@ class ViewTargets:
             With a GPU it is also called in a thread, see `prefetch`.
         memory: Memory budget in bytes for everything that is cached about views, see `content_fraction`. A quarter of
             it is for colors (`Views`).
-        cache_content: Whether to cache content features that fit; False recomputes them at each visit, for comparison.
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
         background: Background color of the rasterizer.
         drawn: Whether the background color changes from step to step; content images are then cached instead of
@@ -54,7 +53,6 @@ class ViewTargets:
         weighted: bool,
         photos: PhotoLoader | None = None,
         memory: int = 1 << 30,
-        cache_content: bool = True,
         regions: Sequence[Rectangle] | None = None,
         background: Color = (0.0, 0.0, 0.0),
         drawn: bool = False,
@@ -74,11 +72,10 @@ class ViewTargets:
         self._content_maps = content_maps
         self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
         has_maps = maps is not None or content_maps is not None
-        content = int(memory * content_fraction(device.type, weighted=weighted, has_maps=has_maps))
+        cached = int(memory * content_fraction(device.type, weighted=weighted, has_maps=has_maps))
         self._region_weights: Cache[tuple[int, bool], list[list[Tensor]]] = Cache(
             memory // 4 if has_maps else 0, lambda every: sum(map(_pyramid_bytes, every))
         )
-        cached = content if cache_content else 0
         images = cached // 2 if drawn else 0
         self._images: Cache[_ContentKey, ScaledView] = Cache(images, _image_bytes)
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)

@@ -31,7 +31,6 @@ PARAMETERS = {
     "early_stop": False,
     "steps_coarse": 0,
     "backbone": "vgg16",
-    "compute_everything": True,
     "seed": 3,
 }
 

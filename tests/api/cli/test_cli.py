@@ -297,17 +297,6 @@ def test_plan_never_overwrites_inputs(files: Files, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.slow
-def test_compute_everything_gives_same_scene(files: Files) -> None:
-    results = []
-    for options in ([], ["--compute-everything"]):
-        assert main(files.stylize("--steps-sos", "2", *options)) == 0
-        report = json.loads(files.out.with_name("stylized.report.json").read_text())
-        assert report["plan"]["measured"]["seconds"] > 0
-        results.append(read_scene(files.out).scene.sh_dc)
-    torch.testing.assert_close(results[0], results[1], rtol=0, atol=1e-3)
-
-
-@pytest.mark.slow
 def test_photos_are_content_images(files: Files, tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()

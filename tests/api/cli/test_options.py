@@ -18,7 +18,7 @@ from api.cli.options_table import reference
 from service.parameters import JobParameters
 from sgsst_core.errors import SettingsError
 from sgsst_core.options import Declared, declared, parse_strength
-from sgsst_core.settings import EVERYTHING, Settings, checked, make_settings
+from sgsst_core.settings import Settings, checked, make_settings
 from worker.options import GROUPS, RunOptions, StylizeOptions, ViewOptions
 from worker.request import SceneRequest
 
@@ -42,7 +42,7 @@ def test_every_setting_has_an_option() -> None:
     standing = {
         info.metadata[-1].instead for name, info in Settings.model_fields.items() if name not in fields(options)
     }
-    assert standing == {"learning_rate", "compute_everything"}
+    assert standing == {"learning_rate"}
     assert options.keys() | standing <= OPTIONS.keys()
 
 
@@ -170,10 +170,8 @@ def test_options_reference_is_up_to_date() -> None:
 
 
 def test_options_become_settings() -> None:
-    options = StylizeOptions.model_validate(
-        {"preset": "preview", "steps_sos": "7", "near": 0.5, "compute_everything": True}
-    )
-    assert options.settings() == make_settings("preview", steps_sos=7, near=0.5, keep=EVERYTHING)
+    options = StylizeOptions.model_validate({"preset": "preview", "steps_sos": "7", "near": 0.5})
+    assert options.settings() == make_settings("preview", steps_sos=7, near=0.5)
     assert StylizeOptions().settings() == make_settings()
     assert StylizeOptions().given_settings() == {}
     assert StylizeOptions(resolution=80).settings().max_resolution == 80

@@ -82,7 +82,7 @@ def test_this_version_runs_on_tables_of_the_next_one(tmp_path: Path, tiny_instal
 
     def submit(client: Any) -> str:
         body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-        parameters = {"steps_sos": 300, "steps_coarse": 0, "backbone": "vgg16", "compute_everything": True}
+        parameters = {"steps_sos": 300, "steps_coarse": 0, "backbone": "vgg16"}
         answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
         assert answer.status_code == 202, answer.text
         return str(answer.json()["id"])

@@ -207,9 +207,7 @@ def test_graphs_require_pytorch_2_13(counts: Counts, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.usefixtures("without_triton")
-@pytest.mark.parametrize(
-    ("options", "fits"), [({"tile_size": 32}, 9.0), ({"cache_activations": False}, 9.0), ({}, 1.9), ({}, 2.1)]
-)
+@pytest.mark.parametrize(("options", "fits"), [({"tile_size": 32}, 9.0), ({}, 1.9), ({}, 2.1)])
 def test_only_scales_of_one_tile_that_fit_twice_are_captured(
     tiny_weights: BackboneWeights, options: dict[str, Any], fits: float
 ) -> None:

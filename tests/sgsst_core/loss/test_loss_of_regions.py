@@ -67,7 +67,7 @@ def test_float64_agrees_with_autograd(tiny_weights, case, tile_size, style_loss,
 
 def test_float32_tiles_agree_with_untiled_float64(tiny_weights, case):
     whole = evaluate(FeatureNetwork(tiny_weights, dtype=torch.float64), *case)
-    tiled = evaluate(FeatureNetwork(tiny_weights), *case, tile_size=64, cache_activations=False)
+    tiled = evaluate(FeatureNetwork(tiny_weights), *case, tile_size=64, memory=1)
     assert tiled.loss == pytest.approx(whole.loss, rel=1e-5)
     assert relative_error(tiled.image_gradient, whole.image_gradient) < 1e-5
 

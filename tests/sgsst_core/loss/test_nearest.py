@@ -144,7 +144,7 @@ def test_recomputed_tiles_are_matched_once(
 
     cached = evaluate(loss_of(tiny_weights, style_loss, tile_size=48), case)
     monkeypatch.setattr(nearest, "search", counted)
-    twice = evaluate(loss_of(tiny_weights, style_loss, tile_size=48, cache_activations=False), case)
+    twice = evaluate(loss_of(tiny_weights, style_loss, tile_size=48, memory=1), case)
     assert torch.equal(gradient_of(twice), gradient_of(cached))
     assert sum(searched) == 24 * 32
 
@@ -221,7 +221,7 @@ def test_nan_features_give_nan_gradients() -> None:
 def test_uncovered_positions_are_ignored(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
     image, style, content, _ = setting(96, 64)
     coverage = torch.zeros((96, 64), dtype=torch.float64)
-    loss = loss_of(tiny_weights, style_loss, leave_out=False)
+    loss = loss_of(tiny_weights, style_loss)
     nothing = evaluate(loss, (image, style, content, coverage))
     assert nothing.loss == 0
     assert gradient_of(nothing).abs().max() == 0

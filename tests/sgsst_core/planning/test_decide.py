@@ -13,7 +13,6 @@ import torch
 from sgsst_core.decision import Decision
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.gradient_error import Difference
-from sgsst_core.loss.nearest import MOST_VECTORS
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.facts import LaunchCost, Link, Machine, NetworkFacts, Probe, RasterCost, Rate, SceneFacts
 from sgsst_core.planning.memory import (
@@ -77,7 +76,7 @@ def text_of(plan: Plan, item: str) -> str:
 # --- the scene -----------------------------------------------------------------------------------------------------
 
 
-def test_unseen_gaussians_are_left_out_unless_requested() -> None:
+def test_unseen_gaussians_are_left_out() -> None:
     plan = plan_of(probe())
     assert plan.seen.tolist() == plan.optimized.tolist() == [False, True, True, True, True, True]
     assert text_of(plan, "unseen Gaussians").startswith(
@@ -85,25 +84,18 @@ def test_unseen_gaussians_are_left_out_unless_requested() -> None:
     )
     assert line(plan, "unseen Gaussians").bytes == OPTIMIZER_BYTES  # type: ignore[union-attr]
     assert "they keep their colors" in text_of(plan_of(probe(), unseen="freeze"), "unseen Gaussians")
-    everything = plan_of(probe(), keep=("unseen",))
-    assert everything.seen.all()
-    assert not everything.optimized.all()
-    assert line(everything, "unseen Gaussians") is None
 
 
 @pytest.mark.parametrize(
-    ("degree", "used", "keep", "expected"),
+    ("degree", "used", "expected"),
     [
-        (3, 3, (), None),
-        (3, 1, (), "evaluated up to degree 1: all coefficients of degrees 2 to 3 are 0"),
-        (3, 1, ("sh",), None),
-        (0, 0, (), "no view directions are computed: the scene has degree 0"),
+        (3, 3, None),
+        (3, 1, "evaluated up to degree 1: all coefficients of degrees 2 to 3 are 0"),
+        (0, 0, "no view directions are computed: the scene has degree 0"),
     ],
 )
-def test_unused_spherical_harmonics_are_skipped(
-    degree: int, used: int, keep: tuple[Any, ...], expected: str | None
-) -> None:
-    plan = plan_of(probe(sh_degree=degree, used_degree=used), keep=keep)
+def test_unused_spherical_harmonics_are_skipped(degree: int, used: int, expected: str | None) -> None:
+    plan = plan_of(probe(sh_degree=degree, used_degree=used))
     assert (text_of(plan, "spherical harmonics") if expected else line(plan, "spherical harmonics")) == expected
 
 
@@ -169,55 +161,7 @@ def test_training_background_and_start_follow_coverage_and_settings(
             assert ("50.0% of the views' pixels are uncovered" in value.reason) is (setting not in values and scan)
 
 
-def test_random_background_costs_a_content_pass_and_disables_early_stop() -> None:
-    """Content features are recomputed for the new background at every visit, from cached images if they fit."""
-    drawn, fixed = (
-        plan_of(probe(uncovered_fraction=0.5), training_background=kind, early_stop=True)
-        for kind in ("random", "background")
-    )
-    assert drawn.prediction is not None
-    assert fixed.prediction is not None
-    pixels = HEIGHT * WIDTH * (1 + 1 / 4)
-    assert drawn.prediction.seconds - fixed.prediction.seconds == pytest.approx(pixels * 0.5e-6, rel=0.01)
-    assert drawn.prediction.first_visit < fixed.prediction.first_visit
-    assert "0.3 s per step" in text_of(drawn, "training background")
-    assert text_of(drawn, "early stop").startswith("none: all steps are run: losses on different backgrounds")
-    without = plan_of(probe(uncovered_fraction=0.5), training_background="random", content_weight=0.0)
-    assert "per step" not in text_of(without, "training background")
-    uncached = plan_of(probe(uncovered_fraction=0.5), training_background="random", keep=("content",))
-    assert uncached.prediction is not None
-    assert uncached.prediction.seconds - drawn.prediction.seconds == pytest.approx(0.15)  # also a render of the content
-    assert drawn.prediction.first_visit - uncached.prediction.first_visit == pytest.approx(0.15)
-
-
-def test_uncovered_pixels_skip_the_network() -> None:
-    scan = probe(uncovered_fraction=0.5, regions=[Rectangle(160, 160, 320, 320)] * VIEWS)
-    plan, everything = plan_of(scan), plan_of(scan, keep=("uncovered",))
-    assert "of the pixels skip the network: 50.0% of" in text_of(plan, "uncovered pixels")
-    assert line(everything, "uncovered pixels") is None
-    assert plan.prediction is not None
-    assert everything.prediction is not None
-    assert plan.prediction.seconds < everything.prediction.seconds
-
-
 # --- the network ---------------------------------------------------------------------------------------------------
-
-
-def test_partition_and_second_forward_follow_from_the_memory() -> None:
-    roomy = plan_of(probe())
-    assert (
-        text_of(roomy, "partition")
-        == "none: the network takes each view as a whole: it fits in the 5.0 GB for activations"
-    )
-    assert text_of(roomy, "second forward").startswith("none: activations are cached")
-    tight = plan_of(probe(memory_limit=GIGABYTE))
-    assert text_of(tight, "partition").startswith("up to ")
-    assert "of the pixels fit in the 0.5 GB for activations" in text_of(tight, "second forward")
-    again = plan_of(probe(), keep=("activations",))
-    assert text_of(again, "second forward").startswith("for 100% of the pixels")
-    assert roomy.prediction is not None
-    assert again.prediction is not None
-    assert roomy.prediction.seconds < again.prediction.seconds
 
 
 def test_memory_is_shared_by_the_ranks_of_a_machine() -> None:
@@ -225,30 +169,6 @@ def test_memory_is_shared_by_the_ranks_of_a_machine() -> None:
         plan_of(probe(memory_limit=2 * GIGABYTE)), "partition"
     )
     assert plan_of(probe(sharing=5)).memory_limit == 10 * GIGABYTE
-
-
-def test_prediction_includes_time_and_memory_of_feature_matching() -> None:
-    """Matching adds to the network's passes; without it, the plan does not mention or count it."""
-    search, rate, channels = 1e-9, probe().network.rate, 48
-    positions = [(600 >> scale) // 4 * ((800 >> scale) // 4) for scale in (0, 1)]
-    pairs = sum(count * min(count, MOST_VECTORS) for count in positions)
-    matching = probe(rate=replace(rate, search=search), vector_channels=channels, deepest="relu4_2")
-    for ranks in (1, 2):
-        plain, matched = (
-            plan_of(replace(each, machine=replace(each.machine, ranks=ranks)), keep=("ranks",), style_loss=style_loss)
-            for each, style_loss in ((probe(), "sos"), (matching, "nnfm"))
-        )
-        assert plain.prediction is not None
-        assert matched.prediction is not None
-        assert matched.prediction.seconds - plain.prediction.seconds == pytest.approx(search * pairs / ranks)
-        vectors = 4 * channels * sum(min(count, MOST_VECTORS) for count in positions)
-        more = matched.prediction.peak_bytes - plain.prediction.peak_bytes
-        assert vectors + 16 * sum(positions) < more < vectors + 16 * sum(positions) + (16 << 20)
-        assert line(plain, "style loss") is None
-        assert text_of(matched, "style loss").startswith(
-            "the distance of relu3 features to the nearest of at most 8,192 style"
-        )
-        assert text_of(matched, "network layers").startswith("up to relu4_2")
 
 
 def test_content_is_left_out_without_weight() -> None:
@@ -334,7 +254,6 @@ CAPTURED = LaunchCost(seconds=0.010, replayed=0.006, capture=0.040)
             "visited about 3 times",
         ),  # views are cropped to different sizes
         ({}, {"steps_sos": 12 * VIEWS, "position_weights": "on"}, None),
-        ({}, {"steps_sos": 400, "keep": ("launches",)}, "requested"),
         ({"ranks": 2}, {"steps_sos": 400}, "a graph cannot contain communication between workers"),
         ({"ranks": 2}, {"steps_sos": 6, "views_per_step": 2}, None),  # every worker has a view of its own
         ({"launches": None}, {"steps_sos": 400}, "views of one size are visited about 400 times"),
@@ -368,35 +287,6 @@ def test_no_graph_is_captured_or_mentioned_on_a_cpu() -> None:
     plan = plan_of(probe(launches=CAPTURED), steps_sos=400)
     assert not plan.graphs
     assert line(plan, "launches") is None
-
-
-def test_graph_needs_memory_in_addition() -> None:
-    """Its activations add to those of the same work without a graph."""
-    measurements = probe(device="cuda", raster=RasterCost(0.01), launches=CAPTURED)
-    plans = [plan_of(measurements, steps_coarse=0, steps_sos=400, keep=keep) for keep in ((), ("launches",))]
-    assert [plan.graphs for plan in plans] == [True, False]
-    peaks = [plan.prediction.device_bytes for plan in plans if plan.prediction]
-    assert peaks[0] is not None
-    assert peaks[1] is not None
-    assert peaks[0] - peaks[1] == int(HEIGHT * WIDTH * 3500.0)  # pixels of one scale: 3000 bytes held, 500 for work
-
-
-def test_launches_limit_steps_on_a_gpu_unless_they_are_captured() -> None:
-    """Views have two scales, each of which takes seconds to launch."""
-    values: dict[str, Any] = {"device": "cuda", "raster": RasterCost(0.01), "launches": CAPTURED}
-    measurements = probe(fixed=Rate(0.5, 1.0, 4.0), **values)
-    eager, captured = (
-        plan_of(measurements, steps_coarse=0, steps_sos=400, keep=keep).prediction for keep in (("launches",), ())
-    )
-    pixels = HEIGHT * WIDTH * (1 + 1 / 4)
-    assert eager is not None
-    assert captured is not None
-    assert eager.seconds == pytest.approx(2 * 4.0 + 0.01)
-    assert captured.seconds == pytest.approx(pixels * 3e-6 + 0.01)
-    assert eager.first_visit == pytest.approx(2 * 0.5 + 0.005)  # content features, and a render
-    large = plan_of(probe(fixed=Rate(0.0, 0.0, 0.1), **values), steps_coarse=0, steps_sos=400, keep=("launches",))
-    assert large.prediction is not None
-    assert large.prediction.seconds == captured.seconds
 
 
 def test_precision_line_states_the_measured_error() -> None:
@@ -433,7 +323,6 @@ def test_weights_are_cached_on_a_cpu_if_that_pays_off() -> None:
         ({"cached_weights": "float32"}, "float32"),
         ({"cached_weights": "half"}, "half"),
         ({"cached_weights": "none"}, "none"),
-        ({"keep": ("blend-weights",)}, "none"),
     ],
 )
 def test_weights_that_do_not_fit_are_cached_in_half_precision(values: dict[str, Any], form: str) -> None:
@@ -530,7 +419,7 @@ def test_weights_are_cached_on_the_cpu_if_no_gpu_rasterizer_works() -> None:
 
 
 def test_reason_for_uncached_weights_may_be_the_request() -> None:
-    for values in ({"cached_weights": "none"}, {"keep": ("blend-weights",)}):
+    for values in ({"cached_weights": "none"},):
         assert text_of(plan_of(probe(), **values), "blend weights").endswith("in every step: requested")
         assert text_of(plan_of(on_a_gpu(FASTER), **values), "blend weights").endswith("in every step: requested")
 
@@ -555,29 +444,6 @@ def test_plan_mentions_early_stop_only_if_it_is_on() -> None:
 
 
 # --- ranks ---------------------------------------------------------------------------------------------------------
-
-
-def test_gradients_of_shown_gaussians_alone_are_communicated() -> None:
-    def communication(**values: Any) -> float:
-        prediction = plan_of(probe(ranks=2, link=Link(1e3, 1e-3), **values), keep=("ranks",)).prediction
-        assert prediction is not None
-        return prediction.communication
-
-    assert communication() - communication(shown=2.5) == pytest.approx(12 * (5 - 2.5) / 1e3)
-
-
-def test_ranks_take_part_as_the_link_allows() -> None:
-    fast = plan_of(probe(ranks=4, link=Link(1e12, 1e-9)))
-    assert fast.ranks == 4
-    assert text_of(fast, "ranks").startswith("all 4 take part, ")
-    slow = plan_of(probe(ranks=4, link=Link(1e5, 1.0)))
-    assert slow.ranks == 1
-    assert "would only add communication" in text_of(slow, "ranks")
-    assert plan_of(probe(ranks=4, link=Link(1e5, 1.0)), keep=("ranks",)).ranks == 4
-    assert line(plan_of(probe()), "ranks") is None
-    assert fast.prediction is not None
-    assert fast.prediction.seconds_one_rank is not None
-    assert fast.prediction.seconds < fast.prediction.seconds_one_rank
 
 
 # --- the plan ------------------------------------------------------------------------------------------------------

@@ -135,12 +135,12 @@ def test_bfloat16_is_not_used_if_it_is_emulated(
 
 
 def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_weights: BackboneWeights) -> None:
-    for steps, keep in ((LEAST_GRAPH_VISITS, ()), (LEAST_GRAPH_VISITS, ("launches",)), (LEAST_GRAPH_VISITS - 1, ())):
-        settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16, keep=keep)
+    for steps in (LEAST_GRAPH_VISITS, LEAST_GRAPH_VISITS - 1):
+        settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16)
         stylizer = Stylizer.planned(
             wall(10, 8), cameras(2, 48, 32), style(), settings, weights=tiny_weights, rasterizer="cpu"
         )
         decision = next(line for line in stylizer.job.plan.decisions if line.item == "launches")
         measured = "measured per view" in decision.reason
-        assert measured is (steps == LEAST_GRAPH_VISITS and not keep)
+        assert measured is (steps == LEAST_GRAPH_VISITS)
         assert (stylizer.job.graphs is not None) is stylizer.job.plan.graphs

@@ -14,32 +14,17 @@ from sgsst_core.planning.measurement_choice import LEVELS
 from sgsst_core.planning.memory import (
     BUILDING_BYTES,
     MEASURING_BYTES,
-    OPTIMIZER_BYTES,
     SEARCH_BYTES,
     SHAPE_BYTES,
-    gaussian_bytes,
 )
 from sgsst_core.planning.view_costs import view_memory
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.test_decide import GIGABYTE, HEIGHT, VIEWS, WIDTH, plan_of, probe
-from tests.sgsst_core.planning.test_view_costs import HUGE, LARGE, expected
+from tests.sgsst_core.planning.test_view_costs import LARGE, expected
 from tests.sgsst_core.planning.test_view_costs import plan_of as plan_of_raster
 
 #: Budget in bytes for tile intersections and weights.
 BUDGET = 10 * GIGABYTE // 4
-
-
-def test_memory_grows_with_gaussians_and_cached_data_of_views() -> None:
-    """Five of six Gaussians are rendered, from a copy of the scene of degree 3.
-
-    Its intersections replace those of the survey.
-    """
-    plain = expected(LARGE).peak_bytes
-    complete = expected(LARGE, keep=("unseen",)).peak_bytes
-    own = OPTIMIZER_BYTES + 12 + 12 * VIEWS
-    assert plain - complete == 5 * (own + gaussian_bytes(3)) - 6 * (own + SHAPE_BYTES)
-    assert gaussian_bytes(3) == 4 * 59
-    assert expected(HUGE).peak_bytes - plain == 5 * SHAPE_BYTES, "uncached data are recomputed"
 
 
 def test_intersections_of_novel_views_get_the_remaining_budget() -> None:
@@ -54,16 +39,6 @@ def test_intersections_of_novel_views_get_the_remaining_budget() -> None:
             built = 5 * SHAPE_BYTES if VIEWS * size > BUDGET else 0
             assert plan.prediction is not None
             assert plan.prediction.peak_bytes - plain == MEASURING_BYTES + isects + gaussians + warps + built
-
-
-def test_unvisited_views_take_no_memory() -> None:
-    """A single step visits one of four views, so it needs a quarter of the memory for content and for colors."""
-    every, one = expected(LARGE, keep=("unseen",)), expected(LARGE, steps_sos=1, keep=("unseen",))
-    without = [expected(LARGE, steps_sos=steps, keep=("unseen", "content")) for steps in (40, 1)]
-    colors = 6 * 12 * VIEWS * 3 // 4
-    assert without[0].peak_bytes - without[1].peak_bytes == colors
-    content = expected(LARGE, keep=("unseen",)).peak_bytes - without[0].peak_bytes
-    assert every.peak_bytes - one.peak_bytes == colors + content * 3 // 4
 
 
 def test_weights_replace_the_tile_intersections_of_the_survey() -> None:
@@ -126,28 +101,6 @@ def test_content_on_a_gpu_uses_the_memory_of_unneeded_coverage(device: str, weig
         assert plan.prediction is not None
         taken.append(plan.prediction.peak_bytes if device == "cpu" else plan.prediction.device_bytes)
     assert taken[1] - taken[0] == int(fraction * view_memory(plan, 10 * GIGABYTE))  # type: ignore[operator]
-
-
-def test_coverage_that_weights_statistics_takes_memory_and_a_render() -> None:
-    """It is cached at all scales, in a quarter of the memory for views at most."""
-    measurements = probe(raster=replace(LARGE, seconds=2.0))
-    off, on = (
-        plan_of(measurements, position_weights=weights, steps_coarse=0, keep=("uncovered",))
-        for weights in ("off", "on")
-    )
-    assert off.prediction is not None
-    assert on.prediction is not None
-    taken = sum(height * width for height, width in measurements.sizes) * 16 / 3
-    assert on.prediction.peak_bytes - off.prediction.peak_bytes == pytest.approx(taken, abs=2)
-    assert on.prediction.first_visit - off.prediction.first_visit == pytest.approx(0.5 * 2.0)
-    huge = replace(measurements, sizes=tuple((height * 10, width * 10) for height, width in measurements.sizes))
-    off, on = (
-        plan_of(huge, position_weights=weights, steps_coarse=0, keep=("uncovered",)) for weights in ("off", "on")
-    )
-    assert off.prediction is not None
-    assert on.prediction is not None
-    assert on.prediction.peak_bytes - off.prediction.peak_bytes <= view_memory(on, 10 * GIGABYTE) // 4
-    assert on.prediction.seconds > off.prediction.seconds
 
 
 def test_gpu_memory_includes_rasterizer_and_measurements() -> None:

@@ -8,12 +8,15 @@ from typing import Any
 import pytest
 import torch
 
+from benchmarks.left_out import EVERYTHING, with_components
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import EVERYTHING, Item, PresetName, make_settings
+from sgsst_core.scene.spherical_harmonics import scene_colors
+from sgsst_core.settings import PresetName, make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.result_colors import neighbors_change
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -44,33 +47,19 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_skipped_work_does_not_change_results(tiny_weights: BackboneWeights, name: str) -> None:
-    scene, views = SCENES[name], [resized(camera, 120) for camera in cameras(2)]
-    lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
-    first = [stylizer.run_step() for stylizer in (lean, full)]
-    # The first step's loss comes from equal colors, so it may differ only by rounding.
-    assert first[0].loss == pytest.approx(first[1].loss, rel=1e-5)
-    for stylizer in (lean, full):
-        run(stylizer)
-    # Later steps differ by more: Adam moves a color by the learning rate even if its gradient is only rounding error.
-    assert lean.history[-1].loss == pytest.approx(full.history[-1].loss, rel=1e-3)
-    assert relative_error(lean.stylized() - scene.sh_dc, full.stylized() - scene.sh_dc) < 0.02
-
-
-@pytest.mark.parametrize("item", EVERYTHING)
-def test_skipping_a_single_item_does_not_change_results(tiny_weights: BackboneWeights, item: Item) -> None:
-    """There are enough steps to cache blend weights, and every item has something to leave out."""
-    scene, views = higher_bands_of_zeros(behind(ball())), cameras(1)
-    lean, other = (make(scene, views, tiny_weights, steps_sos=5, keep=keep) for keep in ((), (item,)))
-    losses = [stylizer.run_step().loss for stylizer in (lean, other)]
+@pytest.mark.parametrize("added", [*((item,) for item in EVERYTHING), EVERYTHING])
+def test_left_out_components_do_not_change_results(tiny_weights: BackboneWeights, added: tuple[str, ...]) -> None:
+    """There are enough steps to cache blend weights, and every component has something to leave out."""
+    scene, views, style = higher_bands_of_zeros(behind(ball())), cameras(1), Style.of(synthetic_image(60, 70, seed=9))
+    settings = make_settings(steps_coarse=0, steps_sos=5, learning_rate=0.05)
+    lean, full = (with_components(each, scene, views, style, settings, tiny_weights) for each in ((), added))
+    losses = [stylizer.run_step().loss for stylizer in (lean, full)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
-    gradients = [stylizer.gradient(0, [0])[0] for stylizer in (lean, other)]
-    if item == "unseen":
+    gradients = [stylizer.gradient(0, [0])[0] for stylizer in (lean, full)]
+    if "unseen" in added:
         gradients[1] = gradients[1][lean.job.plan.seen]
-    assert relative_error(gradients[0], gradients[1]) < 1e-4
+    assert relative_error(*gradients) < 1e-4
     assert lean.job.plan.cached_weights == "float32"
-    assert (other.job.plan.cached_weights == "none") == (item == "blend-weights")
 
 
 def test_blend_weights_are_cached_as_memory_and_visits_allow(tiny_weights: BackboneWeights) -> None:
@@ -90,11 +79,13 @@ def test_blend_weights_are_cached_as_memory_and_visits_allow(tiny_weights: Backb
 
 def test_rendering_without_unseen_gaussians_is_bit_identical(tiny_weights: BackboneWeights) -> None:
     scene, views = behind(wall(sh_degree=2), 100), cameras(3)
-    lean, full = (make(scene, views, tiny_weights, keep=keep) for keep in ((), EVERYTHING))
-    assert len(lean.sh_dc) < len(full.sh_dc) == len(scene)
+    lean, whole = make(scene, views, tiny_weights), make_rasterizer("cpu", scene)
+    assert len(lean.sh_dc) < len(scene)
+    warm = replace(scene, sh_dc=scene.sh_dc.clone())
+    warm.sh_dc[lean.job.plan.seen] = lean.sh_dc.detach()
     for index in range(3):
-        images = [s.job.views.render(index, s.job.views.colors(index, s.sh_dc.detach())) for s in (lean, full)]
-        assert torch.equal(*images)
+        image = lean.job.views.render(index, lean.job.views.colors(index, lean.sh_dc.detach()))
+        assert torch.equal(image, whole.render(scene_colors(warm, views[index]), views[index]))
 
 
 def test_decisions_name_skipped_work(tiny_weights: BackboneWeights) -> None:

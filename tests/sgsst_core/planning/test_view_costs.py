@@ -79,15 +79,9 @@ def test_tile_intersections_that_do_not_fit_add_to_every_visit() -> None:
     assert huge.job > large.job
 
 
-def test_survey_intersections_are_reused_if_every_gaussian_is_rendered() -> None:
-    """If only some Gaussians are rendered, the intersections must be reduced first."""
-    restricted, reused = expected(LARGE), expected(LARGE, keep=("unseen",))
-    assert restricted.first_visit - reused.first_visit == pytest.approx(0.25 * 5.0)
-
-
 def on_two_ranks(raster: RasterCost, *, sharing: int = 1) -> tuple[Prediction, RankPart]:
     """Return the prediction for two ranks that divide every view, and the larger part."""
-    settings = make_settings(steps_coarse=0, steps_sos=40, position_weights="off", keep=("ranks",))
+    settings = make_settings(steps_coarse=0, steps_sos=40, position_weights="off", rebalance=False)
     measurements = probe(raster=raster, ranks=2, sharing=sharing)
     plan = decide(measurements, settings)
     assert plan.prediction is not None
@@ -122,12 +116,6 @@ def test_phase_1_prepares_views_for_phase_2() -> None:
     alone, both = expected(LARGE), expected(LARGE, steps_coarse=40)
     assert alone.first_visit - both.first_visit == pytest.approx(0.25 * 5 + 0.5)
     assert both.first_visit_coarse > 0.25 * 5 + 0.5
-
-
-def test_uncached_content_adds_to_every_visit() -> None:
-    cached, uncached = expected(LARGE), expected(LARGE, keep=("content",))
-    assert uncached.seconds - cached.seconds == pytest.approx(cached.first_visit - uncached.first_visit)
-    assert uncached.first_visit == pytest.approx(0.25 * 5 + 0.5)
 
 
 def test_uncached_weights_save_no_time() -> None:

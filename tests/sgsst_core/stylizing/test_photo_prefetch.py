@@ -14,6 +14,7 @@ from torch import Tensor
 if torch.cuda.is_available():
     pytest.skip("there is a GPU: the pretend one would stand in its way", allow_module_level=True)
 
+from sgsst_core.budget import Cache
 from sgsst_core.errors import ImageError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.images import save_png
@@ -88,12 +89,15 @@ def counts() -> Iterator[Counts]:
         yield counts
 
 
-def make(weights: BackboneWeights, photos: Photos, **values: Any) -> Stylizer:
-    """Make a job with two scales per step. Content features are not cached unless `values` overrides `keep`."""
+def make(weights: BackboneWeights, photos: Photos, *, cached: bool = False, **values: Any) -> Stylizer:
+    """Make a job with two scales per step. Content features are cached only if requested."""
     options = {"steps_coarse": 0, "steps_sos": STEPS, "coarsest_side": 16, "position_weights": "off", "seed": SEED}
-    settings = make_settings("paper", **{**options, "keep": ("content",), **values})
+    settings = make_settings("paper", **{**options, **values})
     views = cameras(VIEWS, SIDE, SIDE)
-    return Stylizer.planned(wall(6, 5), views, style(), settings, weights=weights, photos=photos)
+    stylizer = Stylizer.planned(wall(6, 5), views, style(), settings, weights=weights, photos=photos)
+    if not cached:
+        stylizer.job.view_targets._content = Cache(0)
+    return stylizer
 
 
 def drawn() -> list[int]:
@@ -166,7 +170,7 @@ def test_photos_with_cached_features_are_read_once(
     tiny_weights: BackboneWeights, counts: Counts, tmp_path: Path
 ) -> None:
     photos = Photos(tmp_path)
-    run(make(tiny_weights, photos, keep=()))
+    run(make(tiny_weights, photos, cached=True))
     assert sorted(photos.asked) == list(range(VIEWS))
 
 

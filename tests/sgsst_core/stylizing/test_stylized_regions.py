@@ -84,7 +84,7 @@ def test_maps_are_exactly_0_outside_of_the_region() -> None:
     [
         {"warm_start": True, "clamp_aware_gradient": True},
         {"unseen": "neighbors", "views_per_step": 2, "background": (1.0, 0.5, 0.0)},
-        {"keep": ("unseen",), "training_background": "random"},
+        {"training_background": "random"},
         {"cached_weights": "half", "preserve_colors": "match", "style_loss": "mixed"},
     ],
 )

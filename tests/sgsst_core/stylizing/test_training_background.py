@@ -8,6 +8,7 @@ from typing import Any, Literal
 import pytest
 import torch
 
+from sgsst_core.budget import Cache
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.gaussians import Scene
@@ -94,9 +95,10 @@ def test_step_gradient_matches_a_job_with_its_background(
     tiny_weights: BackboneWeights, scales: list[int], content: Literal["cached", "uncached"]
 ) -> None:
     """The content also gets the step's background, whether or not its images are cached."""
-    keep = () if content == "cached" else ("content",)
-    drawn = make(tiny_weights, ball(), training_background="random", background=(0.1, 0.1, 0.5), keep=keep)
+    drawn = make(tiny_weights, ball(), training_background="random", background=(0.1, 0.1, 0.5))
     fixed = make(tiny_weights, ball(), training_background="background", background=COLOR)
+    if content == "uncached":
+        drawn.job.view_targets._images = Cache(0, lambda _: 1)
     with torch.no_grad():
         drawn.sh_dc += 0.3
         fixed.sh_dc.copy_(drawn.sh_dc)

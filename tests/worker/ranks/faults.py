@@ -113,7 +113,7 @@ def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
     inputs = folder / "inputs"
     inputs.mkdir(parents=True, exist_ok=True)
     ply, cameras, style = write_files(inputs, wall())
-    options = {"steps_sos": steps, "early_stop": False, "keep": ("ranks",), "rebalance": False, **settings}
+    options = {"steps_sos": steps, "early_stop": False, "rebalance": False, **settings}
     source = SceneRequest(scene=ply, cameras=cameras)
     return StylizeRequest(
         source, (StyleFile(style),), None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options)

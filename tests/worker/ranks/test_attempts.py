@@ -235,7 +235,7 @@ def command(request: StylizeRequest, *options: str) -> list[str]:
     """Return the arguments of `sgsst stylize` for the same job."""
     source = request.source
     files = [str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
-    settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop", "--compute-everything"]
+    settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop", "--no-rebalance"]
     return ["stylize", *files, "--out", str(request.out), *settings, "--workers", "2", *options]
 
 

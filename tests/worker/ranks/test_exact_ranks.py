@@ -15,6 +15,7 @@ from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
@@ -22,6 +23,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName, make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -198,7 +200,7 @@ def stylize(
     collectives: Collectives, scene: Scene, views: int, values: dict[str, Any], image: Tensor | None = None
 ) -> dict[str, Any]:
     """Run a whole job, by default in `style()`."""
-    settings = make_settings("standard", keep=("ranks",), coarsest_side=40, **values)
+    settings = make_settings("standard", **{"coarsest_side": 40, "rebalance": False, **values})
     image = style() if image is None else image
     stylizer = Stylizer.planned(scene, cameras(views), image, settings, weights=tiny_weights(), collectives=collectives)
     stopped = run(stylizer)
@@ -293,10 +295,12 @@ def test_gradients_of_views_in_a_step_are_averaged() -> None:
 
 
 def run_with_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
-    settings = make_settings("standard", steps_coarse=0, steps_sos=20, keep=("ranks",), rebalance=rebalance)
-    stylizer = Stylizer.planned(
-        wall(), cameras(2, 192, 144), style(), settings, weights=tiny_weights(), collectives=collectives
-    )
+    inputs: Any = wall(), cameras(2, 192, 144)
+    settings, weights = make_settings("standard", steps_coarse=0, steps_sos=20, rebalance=False), tiny_weights()
+    plan, _ = make_plan(*inputs, settings, weights=weights, collectives=collectives)
+    settings = settings.model_copy(update={"rebalance": rebalance})
+    job = prepare_job(plan, *inputs, style(), settings, weights=weights, collectives=collectives)
+    stylizer = Stylizer(job)
     forward = stylizer.job.network.forward
 
     def slowly(rgb: Tensor, **options: Any) -> Any:

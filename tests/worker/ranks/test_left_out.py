@@ -38,7 +38,7 @@ def running_ranks() -> int:
 
 @pytest.mark.slow
 def test_unneeded_worker_exits_before_the_steps(tmp_path: Path) -> None:
-    request = small_request(tmp_path, STEPS, keep=())  # views are too small to be divided between ranks
+    request = small_request(tmp_path, STEPS, rebalance=True)  # views are too small to be divided between ranks
     ranks_alive: list[int] = []
     listener = Listener(progress=lambda now: ranks_alive.append(running_ranks()))
     ended = stylize_on_ranks(request, 2, listener, options=WorkerOptions(actor=FaultyRank))
@@ -63,7 +63,7 @@ def test_gpus_of_unneeded_ranks_are_released_once(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    request = small_request(tmp_path, STEPS, keep=())  # views are too small to be divided between ranks
+    request = small_request(tmp_path, STEPS, rebalance=True)  # views are too small to be divided between ranks
     Fault(0, "optimizer", 10, "SIGKILL").write(request)
     given_back: list[str] = []
     happened: list[str] = []
@@ -94,7 +94,7 @@ def test_gpus_of_unneeded_ranks_are_released_once(tmp_path: Path, monkeypatch: p
 def test_unneeded_gpus_return_to_cluster_during_the_job(tmp_path: Path) -> None:
     import ray
 
-    request = small_request(tmp_path, STEPS, keep=())
+    request = small_request(tmp_path, STEPS, rebalance=True)
     free: list[float] = []
     given_back: list[str] = []
 
