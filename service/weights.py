@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from functools import lru_cache
 
-from service.errors import DamagedWeightsError
+from service import problems
 from sgsst_core.features.weight_files import damaged_weights
 
 _log = logging.getLogger(__name__)
@@ -20,7 +20,7 @@ def check_weights() -> None:
     if damages := damaged_weights():
         for damage in damages:
             _log_once(damage)
-        raise DamagedWeightsError
+        raise problems.WEIGHTS_DAMAGED()
 
 
 @lru_cache

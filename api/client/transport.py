@@ -56,7 +56,7 @@ class Transport:
         if not _is_address(url):
             raise RequestError(f"{url}: not an address of a service. Give one such as {DEFAULT_URL}.")
         if not (key.isascii() and key.isprintable()):
-            raise RequestError("The API key contains characters that no key has. Copy it again.")
+            raise RequestError("The API key contains invalid characters. Copy it again.")
         self.http = _http_client(url, {"Authorization": f"Bearer {key}"} if key else {})
         self.url = str(self.http.base_url).rstrip("/")
         self.reached = False

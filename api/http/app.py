@@ -115,7 +115,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         redoc_url=None,
     )
     app.settings = settings
-    for module in (jobs, events, inputs, blends, artifacts, videos, shares, uploads, session, operations):
+    modules = (jobs, events, inputs, blends, artifacts, videos, shares, uploads, session, operations)
+    for module in modules:
         app.include_router(module.router)
     add_static(app)
     add_handlers(app)
@@ -125,7 +126,8 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     def openapi() -> dict[str, Any]:
         if not app.openapi_schema:
-            complete(plain(), (Problem, JobFromUploads, *ANSWERS))
+            routes = [*app.routes, *(route for module in modules for route in module.router.routes)]
+            complete(plain(), routes, (Problem, JobFromUploads, *ANSWERS))
         return app.openapi_schema or {}
 
     app.openapi = openapi  # type: ignore[method-assign]

@@ -12,8 +12,9 @@ from typing import Any
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from api.http.context import SESSION_COOKIE
-from api.http.problems import HeadTooLargeError, MalformedRequestError, TooManyConnectionsError, from_service
+from api.http.problems import from_service
 from api.http.request_memory import memory
+from service import problems
 from service.errors import ServiceError
 
 #: Maximum bytes of a request line and headers. The limit is lower while many connections are open; see
@@ -103,7 +104,7 @@ class Connection(HttpToolsProtocol):
         memory.connections += 1
         if len(self.connections) > self.most:
             error = f"There are {self.most:,} connections already. Try again later."
-            self._refuse(TooManyConnectionsError(error))
+            self._refuse(problems.TOO_MANY_CONNECTIONS(error))
             return
         self._start_timer()
 
@@ -143,7 +144,7 @@ class Connection(HttpToolsProtocol):
         self._unused_bytes = self._unused_bytes + len(data) if self._steps == steps else 0
         if self._unused_bytes > memory.share():
             error = f"The request's line and headers, or its trailers, have more than {memory.share():,} bytes."
-            self._refuse(HeadTooLargeError(error))
+            self._refuse(problems.HEAD_TOO_LARGE(error))
         elif self._stage is _Stage.HEAD and self._timer is None:
             self._start_timer()
 
@@ -159,15 +160,17 @@ class Connection(HttpToolsProtocol):
         if name.lower() == b"cookie":
             value = _session_cookie(value)
         if len(self.headers) == MAX_HEADERS:
-            self._abort(HeadTooLargeError(f"The request has more than {MAX_HEADERS} headers."))
+            self._abort(problems.HEAD_TOO_LARGE(f"The request has more than {MAX_HEADERS} headers."))
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
         """Check the head and start the request."""
         if sum(name == b"host" for name, _ in self.headers) > 1:
-            self._abort(MalformedRequestError("The request has several Host headers. Send one."))
+            self._abort(problems.MALFORMED_REQUEST("The request has several Host headers. Send one."))
         if len(self.pipeline) == MAX_WAITING:
-            self._abort(MalformedRequestError(f"More than {MAX_WAITING} requests were sent before an answer was read."))
+            self._abort(
+                problems.MALFORMED_REQUEST(f"More than {MAX_WAITING} requests were sent before an answer was read.")
+            )
         self._stage = _Stage.BODY
         self._steps += 1
         self._stop_timer()
@@ -230,7 +233,7 @@ class Connection(HttpToolsProtocol):
 
     def send_400_response(self, msg: str) -> None:
         """Respond to malformed HTTP with a problem document; uvicorn's own response is plain text."""
-        wrong = MalformedRequestError(f"{msg} Its first line, a header or a chunk is not as HTTP has it.")
+        wrong = problems.MALFORMED_REQUEST(f"{msg} Its first line, a header or a chunk violates HTTP.")
         self._refuse(self._error or wrong)
 
     def _refuse(self, error: ServiceError) -> None:

@@ -13,13 +13,13 @@ from __future__ import annotations
 import asyncio
 import re
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Annotated
 from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
+from api.http.documentation import raises
 from api.http.event_hub import Hub
 from api.http.fetching import Fetcher
 from api.http.metrics import Metrics
@@ -28,7 +28,7 @@ from api.http.readiness import Readiness
 from api.http.receipts import Receipts
 from api.http.sign_ins import SignIns
 from api.http.threads import OwnerThreads
-from service.errors import ServiceError
+from service import problems
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.threads import FileThreads
@@ -48,34 +48,6 @@ SESSION_COOKIE = "sgsst_session"
 _READING = ("GET", "HEAD", "OPTIONS")
 #: A Host header: an IPv6 address in brackets, or a name or IPv4 address, then optionally a port.
 _HOST = re.compile(r"(?:\[([^\]]*)\]|([^:/?#@\[\]\\]*))(?::[0-9]*)?")
-
-
-class NoKeyError(ServiceError):
-    """A missing, unknown or revoked API key."""
-
-    code, status = "unauthorized", 401
-    message = "An API key is needed: send it as 'Authorization: Bearer KEY'."
-    headers = MappingProxyType({"WWW-Authenticate": "Bearer"})
-
-
-class UnknownKeyError(NoKeyError):
-    """An API key that does not exist or was revoked."""
-
-    message = "The API key is unknown or was revoked. `sgsst keys create NAME` makes one."
-
-
-class ForeignSiteError(ServiceError):
-    """A request from another site's web page to a service that requires no key."""
-
-    code, status = "foreign-site", 403
-    example = ("Pages of 'https://example.com' may not use this service without an API key.",)
-
-
-class CrossOriginError(ServiceError):
-    """Request that would change something by a session cookie, but was not sent by a page of this service."""
-
-    code, status = "cross-origin", 403
-    example = ("Pages of 'https://example.com' may not use the sessions of this service.",)
 
 
 @dataclass(frozen=True)
@@ -128,6 +100,7 @@ session_cookie = APIKeyCookie(
 )
 
 
+@raises(problems.RATE_LIMITED, problems.UNAUTHORIZED, problems.FOREIGN_SITE, problems.CROSS_ORIGIN)
 async def get_caller(
     request: Request,
     context: ContextDep,
@@ -139,18 +112,18 @@ async def get_caller(
     If the service requires no keys, all requests have the same owner.
 
     Raises:
-        NoKeyError: If a key is required and missing, or the key is not valid.
-        CrossOriginError: If the session is valid, but the page that requests a change is not one of this service.
-        ForeignSiteError: If there is no key, and the request comes from a web page that this service did not serve.
-        RateLimitError: If requests with this key arrive too fast.
+        UNAUTHORIZED: If a key is required and missing, or the key is not valid.
+        CROSS_ORIGIN: If the session is valid, but the page that requests a change is not one of this service.
+        FOREIGN_SITE: If there is no key, and the request comes from a web page that this service did not serve.
+        RATE_LIMITED: If requests with this key arrive too fast.
     """
     if given is not None:
         key = await asyncio.to_thread(context.store.keys.find, given.credentials)
         if key is None:
-            raise UnknownKeyError
+            raise problems.UNKNOWN_KEY()
         return _caller(context, key)
     if request.headers.get("authorization") is not None:
-        raise NoKeyError("The Authorization header must have the form 'Bearer KEY'.")
+        raise problems.UNAUTHORIZED("The Authorization header must have the form 'Bearer KEY'.")
     key = await asyncio.to_thread(context.store.sessions.find, cookie) if cookie else None
     if key is not None:
         if request.method not in _READING:
@@ -158,8 +131,8 @@ async def get_caller(
         return _caller(context, key)
     if context.settings.keys_required:
         if cookie:
-            raise NoKeyError("The session has ended. Sign in again with an API key.")
-        raise NoKeyError
+            raise problems.UNAUTHORIZED("The session has ended. Sign in again with an API key.")
+        raise problems.UNAUTHORIZED()
     check_site(request, context.settings)
     return Caller(LOCAL_OWNER, 0)
 
@@ -181,15 +154,15 @@ def check_origin(request: Request, *, required: bool = True) -> None:
         required: Whether to refuse requests without such headers, which only browsers send.
 
     Raises:
-        CrossOriginError: If the request comes from another origin, or lacks required headers.
+        CROSS_ORIGIN: If the request comes from another origin, or lacks required headers.
     """
     origin, site = request.headers.get("origin"), request.headers.get("sec-fetch-site")
     if origin is not None and _netloc(origin) != request.headers.get("host"):
-        raise CrossOriginError(f"Pages of {origin[:100]!r} may not use the sessions of this service.")
+        raise problems.CROSS_ORIGIN(f"Pages of {origin[:100]!r} may not use the sessions of this service.")
     if site is not None and site != "same-origin":
-        raise CrossOriginError("Pages of other sites may not use the sessions of this service.")
+        raise problems.CROSS_ORIGIN("Pages of other sites may not use the sessions of this service.")
     if required and origin is None and site is None:
-        raise CrossOriginError(
+        raise problems.CROSS_ORIGIN(
             "A request with a session cookie that changes something must state its page (Origin). "
             "Programs send an API key instead: 'Authorization: Bearer KEY'."
         )
@@ -202,16 +175,16 @@ def check_site(request: Request, settings: ServiceSettings) -> None:
     name that resolves to this machine (DNS rebinding). Both are refused.
 
     Raises:
-        ForeignSiteError: If the Host or Origin header is not this service's.
+        FOREIGN_SITE: If the Host or Origin header is not this service's.
     """
     host = _host_name(request.headers.get("host", ""))
     if settings.on_loopback and not is_loopback(host):
-        raise ForeignSiteError(
+        raise problems.FOREIGN_SITE(
             f"The service accepts requests from this machine only, and {host[:100]!r} is not one of its names."
         )
     origin = request.headers.get("origin")
     if origin is not None and _netloc(origin) != request.headers.get("host"):
-        raise ForeignSiteError(f"Pages of {origin!r} may not use this service without an API key.")
+        raise problems.FOREIGN_SITE(f"Pages of {origin!r} may not use this service without an API key.")
 
 
 def _netloc(origin: str) -> str:

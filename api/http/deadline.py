@@ -9,8 +9,8 @@ import anyio
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.http.problems import from_service, logged_path
+from service import problems
 from service.deadlines import Deadline
-from service.errors import DeadlineError
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +71,9 @@ class _Exchange:
         method, path = self._scope["method"], logged_path(self._scope)
         _log.warning("no progress for %g s, request given up: %s %s", self._seconds, method, path)
         if not self._started:
-            await from_service(DeadlineError(self._seconds))(self._scope, self._from_client, self._to_client)
+            await from_service(problems.DEADLINE_EXCEEDED(seconds=self._seconds))(
+                self._scope, self._from_client, self._to_client
+            )
 
     async def _receive(self) -> Message:
         if self._complete:  # the app waits for the client to leave

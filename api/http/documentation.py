@@ -8,30 +8,29 @@ from __future__ import annotations
 import copy
 import json
 import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
+from fastapi.dependencies.models import Dependant
+from fastapi.routing import APIRoute
 from pydantic import BaseModel
+from starlette.routing import BaseRoute
 
-from api.http.context import CrossOriginError, ForeignSiteError, NoKeyError
-from api.http.problems import (
-    MEDIA_TYPE,
-    HeadTooLargeError,
-    InternalError,
-    MalformedRequestError,
-    TooManyConnectionsError,
-    from_service,
-)
-from service.errors import (
-    ChangedMeanwhileError,
-    DatabaseBusyError,
-    DatabaseUnavailableError,
-    DeadlineError,
-    RateLimitError,
-    RefusedInputError,
-    ServiceError,
-)
+from api.http.problems import MEDIA_TYPE, from_service
+from service import problems
+from service.errors import ProblemType, ServiceError
 from service.examples import JOB_ID, SHA256
+from sgsst_core.errors import (
+    CameraError,
+    ImageError,
+    MaskError,
+    OutputError,
+    SceneError,
+    SettingsError,
+    TooManyIntersectionsError,
+    WeightsError,
+)
+from sgsst_core.files.formats import listed
 
 Responses = dict[int | str, dict[str, Any]]
 
@@ -90,52 +89,223 @@ def headers(*names: str, maybe: tuple[str, ...] = ()) -> dict[str, Any]:
     return documented
 
 
-#: Errors of every operation, and errors of operations that may require a key.
+#: Problems of every operation.
 _ANYWHERE = (
-    MalformedRequestError,
-    HeadTooLargeError,
-    InternalError,
-    TooManyConnectionsError,
-    DatabaseUnavailableError,
-    DatabaseBusyError,
-    ChangedMeanwhileError,
-    DeadlineError,
+    problems.MALFORMED_REQUEST,
+    problems.HEAD_TOO_LARGE,
+    problems.INTERNAL,
+    problems.TOO_MANY_CONNECTIONS,
+    problems.DATABASE_UNAVAILABLE,
+    problems.DATABASE_BUSY,
+    problems.CHANGED_MEANWHILE,
+    problems.DEADLINE_EXCEEDED,
 )
-_WITH_KEY = (RateLimitError, NoKeyError, ForeignSiteError, CrossOriginError)
+#: Problems of operations on the resources that paths name.
+_OF_PATHS = {"{job_id}": problems.NO_JOB, "{upload_id}": problems.NO_UPLOAD, "{share_id}": problems.NO_SHARE}
+
+#: Problems of operations that read stored files, and of those that make files of results.
+_READING = (problems.STORE_UNAVAILABLE, problems.FILE_LOST, problems.FILE_DAMAGED)
+_MAKING = (
+    *_READING,
+    problems.NO_ARTIFACT,
+    problems.INSPECTION_LIMIT,
+    problems.STORED_BYTES_EXCEEDED,
+    problems.BUSY,
+    problems.NO_SPACE,
+)
+_UNWRITABLE = problems.INVALID_INPUT(
+    "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",
+    code=OutputError.code,
+)
+#: Errors of the core that the inspection of a job's files reports: code, part of the request and example.
+_UNUSABLE = (
+    (SceneError.code, "scene", "scene.ply: holds no Gaussians (element vertex 0). Export the scene again."),
+    (ImageError.code, "style", "style.jpg: is not an image that can be read. Give a PNG or JPEG."),
+    (CameraError.code, "cameras", "cameras.json: holds no cameras. Export them again."),
+    (
+        MaskError.code,
+        "mask",
+        "head.bin: has 100 bytes, but scene.ply has 616 Gaussians. One bit for each makes 77 bytes.",
+    ),
+    (SettingsError.code, None, "Both numbers of steps are 0, so that nothing would change. Give some."),
+    (WeightsError.code, None, "The service has no weights of vgg19: its operator has to fetch them."),
+    (
+        TooManyIntersectionsError.code,
+        None,
+        "view 'view_0' (5187x3361): its 9,000,000 visible Gaussians touch raster tiles 3,000,000,000 times, more than "
+        "can be addressed. Render at a lower resolution.",
+    ),
+)
+#: Problems of single operations, beyond those that follow from their paths and dependencies (`raises`).
+_OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
+    "create_job": (
+        *(problems.INVALID_INPUT(message, code=code, input=role) for code, role, message in _UNUSABLE),
+        *_READING,
+        problems.MALFORMED_BODY,
+        problems.TOO_SLOW,
+        problems.TOO_LARGE,
+        problems.UNSUPPORTED_TYPE,
+        problems.LOST_UPLOAD,
+        problems.INVALID_INPUT,
+        problems.TOO_MANY_GAUSSIANS,
+        problems.TOO_MANY_VIEWS,
+        problems.TOO_MANY_PIXELS,
+        problems.IMAGE_TOO_LARGE,
+        problems.TOO_MANY_FILES,
+        problems.INSPECTION_LIMIT,
+        problems.UNKNOWN_UPLOAD,
+        problems.UNKNOWN_INPUT,
+        problems.UNFINISHED_UPLOAD,
+        problems.URLS_OFF,
+        problems.INVALID_URL,
+        problems.URL_NOT_FETCHED,
+        problems.WEBHOOKS_OFF,
+        problems.INVALID_WEBHOOK,
+        problems.IDEMPOTENCY_KEY_REUSED,
+        problems.QUEUE_FULL,
+        problems.QUOTA_EXCEEDED,
+        problems.BUSY,
+        problems.NO_SPACE,
+        problems.WEIGHTS_DAMAGED,
+        problems.UPLOAD_LOCKED,
+    ),
+    "finish_job": (problems.NOT_RUNNING,),
+    "cancel_job": (problems.NOT_CANCELABLE,),
+    "retry_job": (
+        problems.NOT_RETRYABLE,
+        problems.QUEUE_FULL,
+        problems.QUOTA_EXCEEDED,
+        problems.WEIGHTS_DAMAGED,
+        problems.INVALID_INPUT(
+            "Setting sharpness = 3: Extra inputs are not permitted. The job was stored by an earlier version that "
+            "accepted this. Submit a new job without it.",
+            code=SettingsError.code,
+        ),
+    ),
+    "delete_job": (problems.NOT_ENDED,),
+    "get_artifact": (*_MAKING, _UNWRITABLE),
+    "head_artifact": (*_MAKING, _UNWRITABLE),
+    "get_input": (*_READING, problems.NO_INPUT),
+    "head_input": (*_READING, problems.NO_INPUT),
+    "create_blend": (
+        *_MAKING,
+        _UNWRITABLE,
+        problems.TOO_MANY_BLENDS,
+        problems.INVALID_INPUT(
+            "scene.ply: has 616 Gaussians, but stylized.ply has 800. Blend scenes with the same Gaussians; refining "
+            "splits some.",
+            code=SceneError.code,
+        ),
+    ),
+    "make_video": _MAKING,
+    "create_share": (problems.NO_RESULT, problems.TOO_MANY_SHARES),
+    "get_shared_file": (*_READING, problems.NO_SHARED_FILE),
+    "head_shared_file": (*_READING, problems.NO_SHARED_FILE),
+    "create_upload": (
+        problems.MALFORMED_BODY,
+        problems.TOO_LARGE,
+        problems.TOO_MANY_UPLOADS,
+        problems.IDEMPOTENCY_KEY_REUSED,
+        problems.STORED_BYTES_EXCEEDED,
+        problems.NO_SPACE,
+        problems.STORE_UNAVAILABLE,
+    ),
+    "append_upload": (
+        problems.MALFORMED_BODY,
+        problems.TOO_SLOW,
+        problems.TOO_LARGE,
+        problems.UNSUPPORTED_TYPE(supported="application/offset+octet-stream"),
+        problems.WRONG_OFFSET,
+        problems.UPLOAD_LOCKED,
+        problems.CHECKSUM_MISMATCH,
+        problems.NO_SPACE,
+        problems.STORE_UNAVAILABLE,
+    ),
+    "sign_in": (problems.UNKNOWN_KEY, problems.TOO_MANY_TRIES),
+    "sign_out": (problems.CROSS_ORIGIN,),
+}
+
+#: Problems that dependencies of routes raise, and models of the JSON bodies that they read.
+_RAISED: dict[Callable[..., Any], tuple[ProblemType, ...]] = {}
+_BODIES: dict[Callable[..., Any], type[BaseModel]] = {}
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def problems(*errors: type[ServiceError] | ServiceError, key: bool = True) -> Responses:
-    """Return the documentation of an operation's errors by status, with an example response for each.
+def raises(*raised: ProblemType, body: type[BaseModel] | None = None) -> Callable[[Function], Function]:
+    """Return a decorator that documents a dependency of routes.
 
     Args:
-        errors: Errors that are specific to this operation, one for each `code`; an instance is its own example. Errors
-            of all operations are added.
-        key: Whether the operation may require a key.
+        raised: Problems that it raises.
+        body: Model of the JSON body that it reads; None if it reads none.
     """
-    responses: Responses = {}
-    for error in (*_ANYWHERE, *(_WITH_KEY if key else ()), *errors):
-        example = error if isinstance(error, ServiceError) else error.of_example()
+
+    def record(function: Function) -> Function:
+        _RAISED[function] = raised
+        if body is not None:
+            _BODIES[function] = body
+        return function
+
+    return record
+
+
+def _dependencies(dependant: Dependant) -> Iterator[Callable[..., Any]]:
+    """Yield the functions of all dependencies, those of dependencies included."""
+    for each in dependant.dependencies:
+        if each.call is not None:
+            yield each.call
+        yield from _dependencies(each)
+
+
+def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any]) -> None:
+    """Add the JSON body and the problems of a route to its operation, with an example for each code."""
+    raised: list[ProblemType | ServiceError] = list(_ANYWHERE)
+    for function in _dependencies(route.dependant):
+        raised += _RAISED.get(function, ())
+        if model := _BODIES.get(function):
+            _add_schema(schemas, model)
+            body = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
+            operation["requestBody"] = {"required": True, "content": {"application/json": body}}
+    raised += [problem for part, problem in _OF_PATHS.items() if part in route.path]
+    invalid = [each for parameter in operation.get("parameters", []) if (each := _invalid(parameter))]
+    if "requestBody" in operation and operation["operationId"] != "append_upload":
+        invalid.append(_invalid_request("body", "is not JSON: Expecting value: line 1 column 1 (char 0)."))
+    raised += [*invalid[:1], *_OF_OPERATIONS.get(operation["operationId"], ())]
+    responses = operation["responses"]
+    responses.pop("422", None)  # FastAPI's own error schema
+    for problem in raised:
+        example = problem if isinstance(problem, ServiceError) else problem(**problem.example)
         answer = from_service(example)
-        body = json.loads(bytes(answer.body))
-        response = responses.setdefault(example.status, _no_problem_yet(example.status, body["title"]))
-        response["content"][MEDIA_TYPE]["examples"][example.code] = {"value": body}
+        document = json.loads(bytes(answer.body))
+        response = responses.setdefault(str(example.status), {"description": f"{document['title']}: see `code`."})
+        schema = {"$ref": f"#/components/schemas/{_problem_name(example.status)}"}  # see `complete`
+        content = response.setdefault("content", {}).setdefault(MEDIA_TYPE, {"schema": schema, "examples": {}})
+        content["examples"][example.code] = {"value": document}
         names = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
         response.setdefault("headers", {}).update(headers(*names))
-    return responses
-
-
-def _no_problem_yet(status: int, title: str) -> dict[str, Any]:
-    schema = {"$ref": f"#/components/schemas/{_problem_name(status)}"}  # see `complete`
-    return {"description": f"{title}: see `code`.", "content": {MEDIA_TYPE: {"schema": schema, "examples": {}}}}
 
 
 def _problem_name(status: int) -> str:
     return f"Problem{status}"
 
 
-def invalid(at: str, message: str) -> ServiceError:
-    """Return an example error for an invalid header or parameter."""
-    return RefusedInputError(f"{at}: {message}", "invalid-request", errors=[{"at": at, "message": message}])
+def _invalid(parameter: dict[str, Any]) -> ServiceError | None:
+    """Return an example error for a parameter; None if every value of it is valid."""
+    schema = parameter["schema"]
+    schema = schema | schema.get("anyOf", [{}])[0]
+    at = f"{parameter['in']}.{parameter['name']}"
+    if "le" in schema or "lt" in schema:
+        bound = "or equal to " if "le" in schema else ""
+        return _invalid_request(at, f"Input should be less than {bound}{schema.get('le', schema.get('lt'))}")
+    if "pattern" in schema and "const" not in schema:
+        return _invalid_request(at, f"String should match pattern '{schema['pattern']}'")
+    if "maxLength" in schema:
+        return _invalid_request(at, f"String should have at most {schema['maxLength']} characters")
+    return _invalid_request(at, f"Input should be {listed([*map(repr, schema['enum'])])}") if "enum" in schema else None
+
+
+def _invalid_request(at: str, message: str) -> ServiceError:
+    return problems.INVALID_REQUEST(f"{at}: {message}", errors=[{"at": at, "message": message}])
 
 
 def links(*operations: str, **parameters: str) -> dict[str, Any]:
@@ -143,7 +313,7 @@ def links(*operations: str, **parameters: str) -> dict[str, Any]:
     return {name: {"operationId": name, "parameters": parameters} for name in operations}
 
 
-def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> None:
+def complete(document: dict[str, Any], routes: Sequence[BaseRoute], models: Sequence[type[BaseModel]]) -> None:
     """Complete FastAPI's OpenAPI document in place.
 
     FastAPI omits models that no route takes as an argument, drops nulls from examples, and has its own error schemas.
@@ -152,12 +322,12 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
     """
     schemas = document["components"]["schemas"]
     for model in models:
-        schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
-        schemas |= schema.pop("$defs", {})
-        schemas[model.__name__] = schema
+        _add_schema(schemas, model)
+    by_operation = {route.operation_id: route for route in routes if isinstance(route, APIRoute)}
     for path in document["paths"].values():
         for method, operation in path.items():
             operation["summary"] = operation["description"].partition("\n")[0].partition(". ")[0].rstrip(".")
+            _describe(operation, by_operation[operation["operationId"]], schemas)
             for parameter in operation.get("parameters", []):
                 # The header is required. It has a default only because tus requires status 412, not 422, without it.
                 if parameter["name"] == "Tus-Resumable":
@@ -165,10 +335,7 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
                     version = parameter["schema"].pop("const")
                     parameter["schema"].pop("default", None)
                     parameter["schema"]["pattern"] = f"^{re.escape(version)}$"
-            answers = operation["responses"]
-            if "application/json" in answers.get("422", {}).get("content", {}):
-                del answers["422"]  # FastAPI's own error schema, on operations whose parameters cannot be invalid
-            for answer in answers.values():
+            for answer in operation["responses"].values():
                 if "application/json" in answer.get("content", {}):
                     answer["content"] = {"application/json": None, **answer["content"]}
                 if method == "head":
@@ -176,6 +343,12 @@ def complete(document: dict[str, Any], models: Sequence[type[BaseModel]]) -> Non
     _add_problem_schemas(document)
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
+
+
+def _add_schema(schemas: dict[str, Any], model: type[BaseModel]) -> None:
+    schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+    schemas |= schema.pop("$defs", {})
+    schemas[model.__name__] = schema
 
 
 def _add_problem_schemas(document: dict[str, Any]) -> None:

@@ -19,7 +19,8 @@ import httpx
 from api.http.multipart import check_file
 from api.http.receipts import Receipt
 from api.http.request_memory import memory
-from service.errors import BusyError, FetchError, InvalidUrlError, TooLargeError, UrlsOffError
+from service import problems
+from service.errors import ServiceError
 from service.files.blobs import Blobs, Receiver
 from service.files.staging import staged_name
 from service.files.threads import FileThreads, OwnerLimit
@@ -85,8 +86,8 @@ class Fetcher:
             references: Index, role and text of each reference, as in `Received.uploads`.
 
         Raises:
-            UrlsOffError: If the service fetches no inputs.
-            InvalidUrlError: If a URL may not be fetched.
+            URLS_OFF: If the service fetches no inputs.
+            INVALID_URL: If a URL may not be fetched.
         """
         urls = {text: role for _, role, text in references if is_url(text)}
         for url, role in urls.items():
@@ -97,16 +98,16 @@ class Fetcher:
         """Fetch files into the content store, and return their SHA-256 by URL. The receipt holds them.
 
         Raises:
-            BusyError: If the owner has several such requests.
-            InvalidUrlError: If a server redirects to a URL that may not be fetched.
-            FetchError: If a server does not deliver its file in time.
-            TooLargeError: If the files are too large.
-            QuotaError: If the owner's quota of bytes would be exceeded.
-            RefusedInputError: If a scene has no valid header.
+            BUSY: If the owner has several such requests.
+            INVALID_URL: If a server redirects to a URL that may not be fetched.
+            URL_NOT_FETCHED: If a server does not deliver its file in time.
+            TOO_LARGE: If the files are too large.
+            QUOTA_EXCEEDED: If the owner's quota of bytes would be exceeded.
+            INVALID_INPUT: If a scene has no valid header.
         """
         limit = self._limit.of(receipt.owner)
         if limit.locked():
-            raise BusyError("Too many inputs by URL are being fetched. Try again later.")
+            raise problems.BUSY("Too many inputs by URL are being fetched. Try again later.")
         async with limit:
             deadline = asyncio.get_running_loop().time() + self._settings.url_seconds
             state = _Fetch(receipt, deadline, self._settings.url_bytes)
@@ -116,15 +117,15 @@ class Fetcher:
     def _parse(self, url: str, source: _Input) -> httpx.URL:
         """Parse the URL of an input, or of a redirect from it, and check that its host is allowed."""
         if not self._allowed:
-            raise UrlsOffError(source.role)
+            raise problems.URLS_OFF(input=source.role)
         try:
             parsed = parse_url(url)
         except ValueError as error:
-            raise InvalidUrlError(source.url, error, source.role) from error
+            raise _invalid(source, error) from error
         if origin(parsed) not in self._allowed:
             scheme, host, port = origin(parsed)
             reason = f"'{scheme}://{host}:{port}' is not among the hosts that its operator allows"
-            raise InvalidUrlError(source.url, reason, source.role)
+            raise _invalid(source, reason)
         return parsed
 
     async def _fetch(self, source: _Input, state: _Fetch) -> str:
@@ -158,14 +159,14 @@ class Fetcher:
                 return await self._body(source, state, response)
             await stack.aclose()
             url = self._parse(_joined(url, location, source), source)
-        raise FetchError(source.url, f"the server redirects more than {_MAX_REDIRECTS} times", source.role)
+        raise _not_fetched(source, f"the server redirects more than {_MAX_REDIRECTS} times")
 
     async def _body(self, source: _Input, state: _Fetch, response: httpx.Response) -> AsyncIterator[bytes]:
         """Check the head of a response, and return the chunks of its body."""
         if response.status_code != httpx.codes.OK:
-            raise FetchError(source.url, f"the server answered {response.status_code}", source.role)
+            raise _not_fetched(source, f"the server answered {response.status_code}")
         if response.headers.get("content-encoding", "identity").strip().lower() != "identity":
-            raise FetchError(source.url, "the server compresses the file", source.role)
+            raise _not_fetched(source, "the server compresses the file")
         declared = int(response.headers.get("content-length", "0"))  # only digits: h11 refuses anything else
         self._check_size(declared, state)
         await asyncio.to_thread(state.receipt.charge, declared)
@@ -180,7 +181,9 @@ class Fetcher:
     def _check_size(self, more: int, state: _Fetch) -> None:
         if more > state.left:
             limit = self._settings.url_bytes
-            raise TooLargeError(f"The inputs by URL have more than {limit:,} bytes. Upload large files.", limit)
+            raise problems.TOO_LARGE(
+                f"The inputs by URL have more than {limit:,} bytes. Upload large files.", limit=limit
+            )
 
     def _keep(self, source: _Input, file: Receiver, receipt: Receipt) -> str:
         """Turn a complete file into a blob that the receipt holds, and return its SHA-256."""
@@ -191,19 +194,27 @@ class Fetcher:
 
     @contextmanager
     def _failures(self, source: _Input) -> Iterator[None]:
-        """Raise FetchError or InvalidUrlError in place of failures of the network."""
+        """Raise URL_NOT_FETCHED or INVALID_URL in place of failures of the network."""
         try:
             yield
         except TimeoutError as error:
             reason = f"it did not arrive within {self._settings.url_seconds:g} s"
-            raise FetchError(source.url, reason, source.role) from error
+            raise _not_fetched(source, reason) from error
         except PermissionError as error:  # its message has the address, which is none of the client's business
-            raise InvalidUrlError(source.url, "its host has an address that is not public", source.role) from error
+            raise _invalid(source, "its host has an address that is not public") from error
         except httpx.InvalidURL as error:  # httpx parses the target of a redirect even if it does not follow it
-            raise FetchError(source.url, _INVALID_REDIRECT, source.role) from error
+            raise _not_fetched(source, _INVALID_REDIRECT) from error
         except (httpx.HTTPError, OSError) as error:
             reason = (str(error) or type(error).__name__)[:_MAX_REASON].rstrip(".")
-            raise FetchError(source.url, reason, source.role) from error
+            raise _not_fetched(source, reason) from error
+
+
+def _invalid(source: _Input, reason: object) -> ServiceError:
+    return problems.INVALID_URL(url=source.url[:100], reason=reason, input=source.role)
+
+
+def _not_fetched(source: _Input, reason: str) -> ServiceError:
+    return problems.URL_NOT_FETCHED(url=source.url[:100], reason=reason, input=source.role)
 
 
 def _write(chunk: bytes, file: Receiver, receipt: Receipt) -> None:
@@ -216,4 +227,4 @@ def _joined(url: httpx.URL, location: str, source: _Input) -> str:
     try:
         return str(url.join(location))
     except (httpx.InvalidURL, ValueError) as error:
-        raise FetchError(source.url, _INVALID_REDIRECT, source.role) from error
+        raise _not_fetched(source, _INVALID_REDIRECT) from error

@@ -7,7 +7,7 @@ import re
 from typing import Any
 
 from api.http.addresses import subpath
-from api.http.multipart import BadRequestError
+from service import problems
 from service.store.jobs import Jobs
 from service.store.states import JobStatus
 from service.store.tables import JobRow
@@ -39,7 +39,7 @@ def uploaded_name(metadata: str) -> str:
     """Return the `filename` in an `Upload-Metadata` header, which has the format `key base64, key base64`.
 
     Raises:
-        BadRequestError: If it is not base64 of UTF-8.
+        MALFORMED_BODY: If it is not base64 of UTF-8.
     """
     for pair in metadata.split(","):
         key, _, value = pair.strip().partition(" ")
@@ -47,5 +47,5 @@ def uploaded_name(metadata: str) -> str:
             try:
                 return base64.b64decode(value, validate=True).decode()
             except ValueError as error:  # raised for non-ASCII characters too
-                raise BadRequestError(f"Upload-Metadata: {key!r} is not base64 of UTF-8.") from error
+                raise problems.MALFORMED_BODY(f"Upload-Metadata: {key!r} is not base64 of UTF-8.") from error
     return ""

@@ -7,26 +7,22 @@ import gc
 import json
 import os
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 from fastapi import Request
+from pydantic import BaseModel
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect
 
+from api.http.documentation import raises
 from api.http.receipts import Receipt
 from api.http.request_memory import memory
-from service.errors import (
-    RefusedInputError,
-    ServiceError,
-    TooLargeError,
-    TooManyFilesError,
-    TooManyGaussiansError,
-)
+from service import problems
+from service.errors import ServiceError
 from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, staged_name
 from service.files.threads import FileThreads
@@ -39,6 +35,8 @@ from worker.region_requests import MOST_REGIONS
 MAX_TEXT = 1 << 16
 #: Media types of the body of a new job.
 MEDIA_TYPES = "multipart/form-data or application/json"
+#: Maximum bytes of a small JSON body.
+_MAX_SMALL = 4096
 _TEXT_FIELDS = ("parameters", "webhook")
 #: Maximum number of headers of a part, and bytes of each. They hold the file's role and name.
 _MAX_HEADERS, _MAX_HEADER = 8, 4224
@@ -49,47 +47,7 @@ _LEAST_RATE = 1000
 _DRAIN_BYTES, _DRAIN_SECONDS = 64 << 20, 10.0
 
 
-class BadRequestError(ServiceError):
-    """A body that contradicts its headers."""
-
-    code, status = "malformed-body", 400
-    message = "The request was cut off."
-
-
-class NotUtf8Error(BadRequestError):
-    """A JSON body in another encoding than UTF-8."""
-
-    message = "The body is not UTF-8."
-
-
-class MediaTypeError(ServiceError):
-    """A body in a format that is not supported."""
-
-    code, status = "unsupported-media-type", 415
-
-
-class BodyTypeError(MediaTypeError):
-    """A body of a media type that the operation does not support."""
-
-    def __init__(self, supported: str) -> None:
-        super().__init__(f"The body must be {supported}.")
-
-
-class EncodedBodyError(MediaTypeError):
-    """A compressed body."""
-
-    message = "Encoded bodies are not accepted. Send the body without Content-Encoding."
-
-
-class TooSlowError(ServiceError):
-    """A body that has stopped arriving."""
-
-    code, status = "too-slow", 408
-    headers = MappingProxyType({"Connection": "close"})  # the rest of the body may never arrive
-    example = (60.0,)
-
-    def __init__(self, seconds: float) -> None:
-        super().__init__(f"Nothing has come for {seconds:g} s, or less than {_LEAST_RATE} bytes per second.")
+Model = TypeVar("Model", bound=BaseModel)
 
 
 @dataclass
@@ -116,10 +74,10 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
         advice: End of the error message for a body that is too long.
 
     Raises:
-        EncodedBodyError: If the body is compressed.
-        TooLargeError: If the body is too long. A declared length is checked before the body is read.
-        TooSlowError: If the body stalls or arrives too slowly.
-        BadRequestError: If the body is cut off.
+        UNSUPPORTED_TYPE: If the body is compressed.
+        TOO_LARGE: If the body is too long. A declared length is checked before the body is read.
+        TOO_SLOW: If the body stalls or arrives too slowly.
+        MALFORMED_BODY: If the body is cut off.
     """
     declared_bytes(request, limit, advice)
     total = 0
@@ -133,12 +91,12 @@ async def body_parts(request: Request, settings: ServiceSettings, limit: int, ad
         except StopAsyncIteration:
             return
         except TimeoutError as error:
-            raise TooSlowError(settings.receive_seconds) from error
+            raise problems.TOO_SLOW(seconds=settings.receive_seconds, rate=_LEAST_RATE) from error
         except ClientDisconnect as error:
-            raise BadRequestError from error
+            raise problems.MALFORMED_BODY() from error
         total += len(part)
         if total > limit:
-            raise TooLargeError(f"The request has more than {limit:,} bytes. {advice}", limit)
+            raise problems.TOO_LARGE(f"The request has more than {limit:,} bytes. {advice}", limit=limit)
         yield part
 
 
@@ -156,8 +114,8 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
                 full = bytes(block)
                 block.clear()
                 yield full
-    except (TooSlowError, BadRequestError):
-        if block:
+    except ServiceError as error:
+        if block and error.problem in (problems.TOO_SLOW, problems.MALFORMED_BODY):
             yield bytes(block)  # resumable uploads keep the bytes that have arrived
         raise
     if block:
@@ -165,9 +123,9 @@ async def body_blocks(request: Request, settings: ServiceSettings) -> AsyncItera
 
 
 def check_media_type(request: Request, supported: str) -> None:
-    """Raise BodyTypeError if the body has another media type; parameters such as `charset` are ignored."""
+    """Raise UNSUPPORTED_TYPE if the body has another media type; parameters such as `charset` are ignored."""
     if media_type(request) != supported:
-        raise BodyTypeError(supported)
+        raise problems.UNSUPPORTED_TYPE(supported=supported)
 
 
 def media_type(request: Request) -> str:
@@ -179,14 +137,16 @@ def declared_bytes(request: Request, limit: int, advice: str = "Use uploads.") -
     """Return the length of a body from its headers, or 0 if they do not declare it.
 
     Raises:
-        EncodedBodyError: If the body is compressed.
-        TooLargeError: If the body is too long.
+        UNSUPPORTED_TYPE: If the body is compressed.
+        TOO_LARGE: If the body is too long.
     """
     if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
-        raise EncodedBodyError
+        raise problems.UNSUPPORTED_TYPE("Encoded bodies are not accepted. Send the body without Content-Encoding.")
     total = int(request.headers.get("content-length", "0"))  # only digits: the HTTP parser refuses anything else
     if total > limit:
-        raise TooLargeError(f"The request has {total:,} bytes. At most {limit:,} are allowed. {advice}", limit)
+        raise problems.TOO_LARGE(
+            f"The request has {total:,} bytes. At most {limit:,} are allowed. {advice}", limit=limit
+        )
     return total
 
 
@@ -196,16 +156,16 @@ async def receive(
     """Read a multipart request to its end, and store its files as blobs, which the receipt protects from deletion.
 
     Raises:
-        QuotaError: If the owner's quota of bytes would be exceeded. A declared length is checked before the body is
+        QUOTA_EXCEEDED: If the owner's quota of bytes would be exceeded. A declared length is checked before the body is
             read.
         ServiceError: If the request is invalid. The files that have arrived are deleted at the end of the receipt.
     """
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data":
-        raise BodyTypeError(MEDIA_TYPES)
+        raise problems.UNSUPPORTED_TYPE(supported=MEDIA_TYPES)
     if not boundary:
-        raise BadRequestError("The Content-Type multipart/form-data must name a boundary.")
+        raise problems.MALFORMED_BODY("The Content-Type multipart/form-data must name a boundary.")
     await asyncio.to_thread(receipt.charge, declared_bytes(request, settings.max_request_bytes))
     form = _Form(boundary, blobs, settings, receipt)
     blocks = body_blocks(request, settings)
@@ -215,7 +175,7 @@ async def receive(
         form.finish()
     except BaseException as error:
         await threads.clean_up(threads.run(receipt.owner, form.discard))
-        if isinstance(error, ServiceError) and not isinstance(error, TooSlowError | TooLargeError):
+        if isinstance(error, ServiceError) and error.problem not in (problems.TOO_SLOW, problems.TOO_LARGE):
             await _drain(blocks)
         raise
     return form.received
@@ -270,7 +230,7 @@ class _Form:
                 max_header_size=_MAX_HEADER,
             )
         except FormParserError as error:
-            raise BadRequestError(f"The multipart boundary is invalid: {error}.") from error
+            raise problems.MALFORMED_BODY(f"The multipart boundary is invalid: {error}.") from error
 
     def feed(self, block: bytes) -> None:
         """Charge a block of the body to the receipt, then parse it."""
@@ -278,16 +238,16 @@ class _Form:
         try:
             self._parser.write(block)
         except FormParserError as error:
-            raise BadRequestError(f"The multipart body is invalid: {error}.") from error
+            raise problems.MALFORMED_BODY(f"The multipart body is invalid: {error}.") from error
 
     def finish(self) -> None:
         """Check that the body was complete.
 
         Raises:
-            BadRequestError: If its last boundary is missing.
+            MALFORMED_BODY: If its last boundary is missing.
         """
         if not self._done:
-            raise BadRequestError("The multipart body ends before its last boundary: it was cut off.")
+            raise problems.MALFORMED_BODY("The multipart body ends before its last boundary. Send it again.")
 
     @property
     def unsaved(self) -> int:
@@ -303,7 +263,7 @@ class _Form:
     def _begin(self) -> None:
         self._parts += 1
         if self._parts > self._most_files + len(_TEXT_FIELDS):
-            raise TooManyFilesError(self._parts - 1, "fields")
+            raise problems.TOO_MANY_FILES(limit=self._parts - 1, what="fields")
         self._headers = {}
         self._clear_header()
 
@@ -322,12 +282,12 @@ class _Form:
         self._text.clear()
         if self._role not in (*ROLES, *_TEXT_FIELDS):
             known = ", ".join((*ROLES, *_TEXT_FIELDS))
-            raise RefusedInputError(f"Unknown field {self._role[:60]!r}. Use {known}.", "invalid-request")
+            raise problems.INVALID_REQUEST(f"Unknown field {self._role[:60]!r}. Use {known}.")
         if filename is None or self._role in _TEXT_FIELDS:
             return
         count = len(self.received.files)
         if count >= self._most_files:
-            raise TooManyFilesError(count, "files")
+            raise problems.TOO_MANY_FILES(limit=count, what="files")
         self._name = staged_name(self._role, filename.decode("utf-8", "surrogateescape"), count)
         self._file = self._blobs.receive(self._settings.max_upload_bytes)
 
@@ -337,7 +297,7 @@ class _Form:
             return
         self._text += data[start:end]
         if len(self._text) > MAX_TEXT:
-            raise RefusedInputError(f"The field {self._role!r} has more than {MAX_TEXT} bytes.", "invalid-request")
+            raise problems.INVALID_REQUEST(f"The field {self._role!r} has more than {MAX_TEXT} bytes.")
 
     def _end(self) -> None:
         if self._file is not None:
@@ -357,7 +317,7 @@ class _Form:
             index = len(self.received.files) + len(self.received.uploads)
             self.received.uploads.append((index, self._role, text.strip()))
         elif self._role in self.received.texts:
-            raise RefusedInputError(f"The field {self._role!r} was sent twice. Send it once.", "invalid-request")
+            raise problems.INVALID_REQUEST(f"The field {self._role!r} was sent twice. Send it once.")
         else:
             self.received.texts[self._role] = text
 
@@ -374,22 +334,19 @@ def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSet
     """Check the size and header of a file; the inspection process reads the file and checks the rest.
 
     Raises:
-        RefusedInputError: If the file cannot be used.
+        INVALID_INPUT: If the file cannot be used.
     """
     if not size:
-        raise RefusedInputError(f"{name}: is empty. Send the file's content.", f"invalid-{_kind(role)}", input=role)
+        code = f"invalid-{'image' if role in ('style', 'photos') else role}"
+        raise problems.INVALID_INPUT(f"{name}: is empty. Send the file's content.", code=code, input=role)
     if role != "scene":
         return
     try:
         count = read_scene_header(path).count
     except SceneError as error:
-        raise RefusedInputError(str(error).replace(os.fspath(path), name), error.code, input=role) from error
+        raise problems.INVALID_INPUT(str(error).replace(os.fspath(path), name), code=error.code, input=role) from error
     if count > settings.max_gaussians:
-        raise TooManyGaussiansError(count, settings.max_gaussians)
-
-
-def _kind(role: str) -> str:
-    return {"style": "image", "photos": "image"}.get(role, role)
+        raise problems.TOO_MANY_GAUSSIANS(count=count, note="", limit=settings.max_gaussians, input="scene")
 
 
 async def read_json(request: Request, settings: ServiceSettings, most: int) -> Any:
@@ -399,33 +356,44 @@ async def read_json(request: Request, settings: ServiceSettings, most: int) -> A
         most: Maximum number of bytes.
 
     Raises:
-        BadRequestError: If the body is not UTF-8.
-        RefusedInputError: If the body is not JSON.
-        BusyError: If many large bodies are arriving.
+        MALFORMED_BODY: If the body is not UTF-8.
+        INVALID_REQUEST: If the body is not JSON.
+        BUSY: If many large bodies are arriving.
         ServiceError: Same errors as `body_parts`.
     """
     body = bytearray()
     try:
-        async for part in body_parts(request, settings, most, "JSON only names uploads, or a key."):
+        async for part in body_parts(request, settings, most, "JSON bodies hold no files."):
             memory.take(len(part), len(body))
             body += part
         return parse_json(body.decode(), "body")
     except UnicodeDecodeError as error:
-        raise NotUtf8Error from error
+        raise problems.MALFORMED_BODY("The body is not UTF-8.") from error
     finally:
         memory.give_back(len(body))
+
+
+def json_body(model: type[Model]) -> Callable[[Request], Awaitable[Model]]:
+    """Return a dependency that reads the small JSON body of a request."""
+
+    @raises(problems.MALFORMED_BODY, problems.TOO_SLOW, problems.TOO_LARGE, problems.UNSUPPORTED_TYPE, body=model)
+    async def read(request: Request) -> Model:
+        check_media_type(request, "application/json")
+        return model.model_validate(await read_json(request, request.app.state.context.settings, _MAX_SMALL))
+
+    return read
 
 
 def parse_json(text: str, what: str) -> Any:
     """Parse the JSON of a field or body.
 
     Raises:
-        RefusedInputError: If the text is not JSON.
+        INVALID_REQUEST: If the text is not JSON.
     """
     gc.disable()  # Garbage collections would slow the parsing of a megabyte of lists from 0.04 s to 0.2 s.
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise RefusedInputError(f"{what}: is not JSON: {error}.", "invalid-request", input=what) from error
+        raise problems.INVALID_REQUEST(f"{what}: is not JSON: {error}.", input=what) from error
     finally:
         gc.enable()

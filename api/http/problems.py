@@ -15,7 +15,8 @@ from starlette.routing import Match
 from starlette.types import Scope
 
 from api.http.addresses import address, path_of
-from service.errors import NoSpaceError, ServiceError
+from service import problems
+from service.errors import ServiceError
 from service.files.cache import is_full
 from service.parameters import JobParameters
 from sgsst_core.errors import InvalidInputError
@@ -58,35 +59,6 @@ class Problem(BaseModel):
     status: int
     code: str = Field(description="Stable identifier of the kind of error.")
     detail: str = Field(description="What was wrong and what to do, for people.")
-
-
-class MalformedRequestError(ServiceError):
-    """Bytes that are not an HTTP request. Raised by `api.http.connection`, below the app."""
-
-    code, status = "malformed-request", 400
-    example = ("The request is not HTTP as it should be: its first line, a header or a chunk is wrong.",)
-
-
-class HeadTooLargeError(ServiceError):
-    """A request line and headers that are too long. Raised by `api.http.connection`, below the app."""
-
-    code, status = "head-too-large", 431
-    example = ("The request's line and headers have more than 131,072 bytes.",)
-
-
-class TooManyConnectionsError(ServiceError):
-    """More connections than this process accepts. Raised by `api.http.connection`, below the app."""
-
-    code, status = "too-many-connections", 503
-    retry_after = 5
-    example = ("There are 10,000 connections already. Try again later.",)
-
-
-class InternalError(ServiceError):
-    """A fault of the service itself."""
-
-    code, status = "internal", 500
-    message = "Something went wrong on the service's side; its log says what."
 
 
 def problem(
@@ -137,7 +109,7 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
         for entry in merged(error.errors())[:20]
     ]
     first = errors[0] if errors else {"at": "", "message": "invalid"}
-    return problem(422, "invalid-request", f"{first['at'] or 'body'}: {first['message']}", errors=errors)
+    return from_service(problems.INVALID_REQUEST(f"{first['at'] or 'body'}: {first['message']}", errors=errors))
 
 
 def _unknown(at: str) -> str:
@@ -174,18 +146,18 @@ def routed_methods(scope: Scope) -> list[str]:
 async def _system_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, OSError)
     if is_full(error):
-        return from_service(NoSpaceError())
+        return from_service(problems.NO_SPACE())
     if error.errno not in (errno.EMFILE, errno.ENFILE):
         raise error
     detail = "The service has reached its limit of open files. Try again later."
-    return from_service(TooManyConnectionsError(detail))
+    return from_service(problems.TOO_MANY_CONNECTIONS(detail))
 
 
 async def _unexpected(request: Request, error: Exception) -> JSONResponse:
     scope, request_id = request.scope, request.scope["request_id"]
     extra = {"request_id": request_id}
     _log.exception("%s %s failed unexpectedly", request.method, logged_path(scope), exc_info=error, extra=extra)
-    return from_service(InternalError(request_id=request_id))
+    return from_service(problems.INTERNAL(request_id=request_id))
 
 
 def route_of(scope: Scope) -> str:

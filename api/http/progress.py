@@ -13,8 +13,9 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel
 
 from api.http.event_hub import HEARTBEAT_SECONDS
-from api.http.problems import InternalError, from_service
+from api.http.problems import from_service
 from api.http.schemas import ArtifactView, PlanView
+from service import problems
 from service.errors import ServiceError
 
 _EVENTS = "text/event-stream"
@@ -120,7 +121,7 @@ async def _events(
             yield _event("problem", json.loads(bytes(from_service(error).body)))
         except Exception as error:
             _log.exception("%s failed unexpectedly", progress, exc_info=error)
-            yield _event("problem", json.loads(bytes(from_service(InternalError()).body)))
+            yield _event("problem", json.loads(bytes(from_service(problems.INTERNAL()).body)))
     finally:
         task.cancel()
 

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
-from service.errors import RateLimitError
+from service import problems
 
 #: Capacity of the token bucket, as the number of seconds of requests at the average rate that may arrive at once.
 _BURST_SECONDS = 10.0
@@ -29,7 +29,7 @@ class Rates:
             rate: Requests per second that the owner may send on average; None for no limit.
 
         Raises:
-            RateLimitError: If the owner's bucket is empty.
+            RATE_LIMITED: If the owner's bucket is empty.
         """
         if rate is None:
             return
@@ -42,4 +42,4 @@ class Rates:
         if len(self._left) > _REMEMBERED:
             del self._left[next(iter(self._left))]  # the owner with the oldest last request
         if not allowed:
-            raise RateLimitError(rate, math.ceil((1 - left) / rate))
+            raise problems.RATE_LIMITED(limit=rate, retry_after=math.ceil((1 - left) / rate))

@@ -92,7 +92,7 @@ class Receipt:
         """Charge bytes that the request, or a server it names, declares; 0 if it declares none.
 
         Raises:
-            QuotaError: If the owner would exceed the quota.
+            QUOTA_EXCEEDED: If the owner would exceed the quota.
         """
         if self.id is None:
             self.id = self._receipts.inputs.open_receipt(self.owner, declared, self._quotas)
@@ -105,7 +105,7 @@ class Receipt:
         """Count received bytes, and charge those that were not declared.
 
         Raises:
-            QuotaError: If the owner would exceed the quota.
+            QUOTA_EXCEEDED: If the owner would exceed the quota.
         """
         self._received += size
         more = self._received - self._charged

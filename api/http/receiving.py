@@ -10,30 +10,15 @@ from functools import partial
 from fastapi import Request
 
 from api.http.context import Context
-from api.http.multipart import BadRequestError, body_blocks
-from service.errors import ServiceError, StoreError, TooLargeError
+from api.http.multipart import body_blocks
+from service import problems
+from service.errors import ServiceError, StoreError
 from service.store.tables import UploadRow
 
 #: Digest algorithms of `Upload-Checksum`.
 ALGORITHMS = ("sha256", "sha1", "md5")
 #: Number of bytes after which an upload's state is saved. A crash loses at most this many bytes.
 _SAVE_BYTES = 64 << 20
-
-
-class ChecksumError(ServiceError):
-    """Received bytes that differ from the bytes that were sent."""
-
-    code, status = "checksum-mismatch", 460
-    message = "The part's digest is not that of Upload-Checksum; it was thrown away. Send it again."
-
-
-class LongerThanDeclaredError(TooLargeError):
-    """Upload of more bytes than its `Upload-Length`."""
-
-    example = (42_301,)
-
-    def __init__(self, length: int) -> None:
-        super().__init__(f"More bytes come than the {length:,} of Upload-Length.", length)
 
 
 async def append_body(request: Request, context: Context, row: UploadRow, checksum: tuple[str, bytes] | None) -> float:
@@ -75,7 +60,7 @@ class _Writer:
 
     def write(self, block: bytes) -> None:
         if self._offset + len(block) > self._row.length:
-            raise LongerThanDeclaredError(self._row.length)
+            raise longer_than_declared(self._row.length)
         with self._lock:
             self._context.blobs.ensure_space(len(block))
             self._part.write(block)
@@ -100,7 +85,7 @@ class _Writer:
         """Verify and save the bytes of the request. Store the file as a blob if the upload is complete."""
         if self._digest is not None and self._checksum is not None and self._digest.digest() != self._checksum[1]:
             self._part.discard()
-            raise ChecksumError
+            raise problems.CHECKSUM_MISMATCH()
         expires = self.save()
         self.close()
         if self.complete:
@@ -112,16 +97,21 @@ class _Writer:
             self._part.close()
 
 
+def longer_than_declared(length: int) -> ServiceError:
+    """Return the error for a part with more bytes than the upload lacks."""
+    return problems.TOO_LARGE(f"The parts have more bytes than the {length:,} of Upload-Length.", limit=length)
+
+
 def parse_checksum(header: str) -> tuple[str, bytes]:
     """Return the algorithm and the digest of an `Upload-Checksum` header.
 
     Raises:
-        BadRequestError: If the header is malformed.
+        MALFORMED_BODY: If the header is malformed.
     """
     name, _, value = header.partition(" ")
     if name not in ALGORITHMS:
-        raise BadRequestError(f"Upload-Checksum: {name[:20]!r} is none of {', '.join(ALGORITHMS)}.")
+        raise problems.MALFORMED_BODY(f"Upload-Checksum: {name[:20]!r} is none of {', '.join(ALGORITHMS)}.")
     try:
         return name, base64.b64decode(value, validate=True)
     except ValueError as error:  # raised for non-ASCII characters too
-        raise BadRequestError("Upload-Checksum: the digest is not base64.") from error
+        raise problems.MALFORMED_BODY("Upload-Checksum: the digest is not base64.") from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.errors import BusyError
+from service import problems
 
 #: Bytes of all connections together, and maximum and minimum bytes of each.
 _TOTAL, _MOST, _LEAST = 8 << 20, 1 << 17, 1 << 13
@@ -35,10 +35,10 @@ class RequestMemory:
             held: Number of bytes of this body that were counted before.
 
         Raises:
-            BusyError: If all JSON bodies together exceed the total, and this one exceeds the limit of one connection.
+            BUSY: If all JSON bodies together exceed the total, and this one exceeds the limit of one connection.
         """
         if self._json_bytes + size > _TOTAL and held + size > self.share():
-            raise BusyError("Too many large requests are arriving. Try again later.", retry_after=5)
+            raise problems.BUSY("Too many large requests are arriving. Try again later.", retry_after=5)
         self._json_bytes += size
 
     def give_back(self, size: int) -> None:

@@ -13,10 +13,10 @@ from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
-from api.http.documentation import Responses, headers
+from api.http.documentation import Responses, headers, raises
 from api.http.request_memory import memory
 from api.http.threads import OwnerThreads
-from service.errors import NotFoundError, ServiceError
+from service import problems
 from service.examples import SHA256
 from service.files.threads import FileThreads
 
@@ -54,6 +54,7 @@ IfRange = Annotated[
 ]
 
 
+@raises(problems.RANGE_NOT_SATISFIABLE, problems.PRECONDITION_FAILED)
 @dataclass(frozen=True)
 class Conditions:
     """Headers of a request that ask for a range of a file, or for the file only if it has changed."""
@@ -65,30 +66,6 @@ class Conditions:
 
 
 ConditionsDep = Annotated[Conditions, Depends()]
-
-
-class RangeError(ServiceError):
-    """A requested range that starts after the end of the file."""
-
-    code, status = "range-not-satisfiable", 416
-    example = (42_301,)
-
-    def __init__(self, size: int) -> None:
-        super().__init__(f"The file has {size} bytes.")
-        self.headers = {"Content-Range": f"bytes */{size}"}
-
-
-class ChangedError(ServiceError):
-    """A file that is not the one that `If-Match` names."""
-
-    code, status = "precondition-failed", 412
-    message = "The file is not the one that If-Match names. Its current ETag is that of a HEAD request."
-
-
-class JustRemovedError(NotFoundError):
-    """A file that was deleted after the request had found it."""
-
-    message = "The file has just been removed."
 
 
 #: Headers of every response with a file.
@@ -230,15 +207,15 @@ async def send_file(request: Request, threads: FileThreads, file: SentFile, cond
     """Return the response with a file or a range of it.
 
     Raises:
-        ChangedError: If the file is not the one that If-Match names.
-        RangeError: If the range starts after the end of the file.
+        PRECONDITION_FAILED: If the file is not the one that If-Match names.
+        RANGE_NOT_SATISFIABLE: If the range starts after the end of the file.
         NotFoundError: If the file has just been deleted.
         LostFileError, DamagedFileError: If the stored file does not match its database row. No byte of it is sent.
     """
     tag = f'"{file.sha256}"'
     response_headers = _headers(file, tag)
     if conditions.if_match is not None and not names_etag(conditions.if_match, tag, strong=True):
-        raise ChangedError
+        raise problems.PRECONDITION_FAILED()
     if names_etag(conditions.if_none_match, tag):
         return Response(status_code=304, headers=response_headers)
     unchanged = conditions.if_range in (None, tag)
@@ -268,7 +245,7 @@ def _next(body: Iterator[bytes]) -> bytes | None:
     try:
         return next(body, None)
     except FileNotFoundError as error:
-        raise JustRemovedError from error
+        raise problems.FILE_REMOVED() from error
 
 
 def _headers(file: SentFile, tag: str) -> dict[str, str]:
@@ -303,7 +280,7 @@ def _parse_range(text: str, size: int) -> tuple[int, int] | None:
     """Return start and end (exclusive) of a byte range; None if the header is malformed or has several ranges.
 
     Raises:
-        RangeError: If the range starts after the end of the file.
+        RANGE_NOT_SATISFIABLE: If the range starts after the end of the file.
     """
     match = re.fullmatch(r"bytes=([0-9]{0,18})-([0-9]{0,18})", text.strip())
     if match is None or match[0] == "bytes=-":
@@ -316,5 +293,5 @@ def _parse_range(text: str, size: int) -> tuple[int, int] | None:
         if last and int(last) < start:
             return None
     if start >= stop:
-        raise RangeError(size)
+        raise problems.RANGE_NOT_SATISFIABLE(size=size)
     return start, stop

@@ -6,20 +6,12 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 
-from service.errors import ServiceError
+from service import problems
 
 #: Maximum number of failed attempts from one address, and the seconds within which they count.
 MOST_FAILURES, WITHIN_SECONDS = 10, 60.0
 #: Maximum number of remembered addresses. Beyond it, the address with the oldest last failure is forgotten.
 _MOST_ADDRESSES = 10_000
-
-
-class TooManyTriesError(ServiceError):
-    """Too many sign-ins with invalid keys."""
-
-    code, status = "too-many-tries", 429
-    message = "Too many invalid keys came from this address. Try again later."
-    retry_after = 30
 
 
 class SignIns:
@@ -37,13 +29,13 @@ class SignIns:
         """Count an attempt as failed until its outcome is known, so that parallel attempts cannot pass the limit.
 
         Raises:
-            TooManyTriesError: If the address has failed too often recently.
+            TOO_MANY_TRIES: If the address has failed too often recently.
         """
         failures = self._failures.setdefault(address, deque(maxlen=MOST_FAILURES))
         if len(failures) == MOST_FAILURES:
             left = failures[0] + WITHIN_SECONDS - self._clock()
             if left > 0:
-                raise TooManyTriesError(retry_after=int(left) + 1)
+                raise problems.TOO_MANY_TRIES(retry_after=int(left) + 1)
         failures.append(self._clock())
         self._failures.move_to_end(address)
         if len(self._failures) > _MOST_ADDRESSES:

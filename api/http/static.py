@@ -21,7 +21,7 @@ from fastapi import FastAPI, Request, Response
 
 from api.http.addresses import path_of
 from api.http.sending import names_etag
-from service.errors import NotFoundError
+from service import problems
 from service.optional import installed_extras
 from service.store.states import ACTIONS, TITLES, UNFINISHED
 from sgsst_core.files.formats import FORMATS, RESULT_FORMATS
@@ -144,7 +144,7 @@ def add_static(app: FastAPI) -> None:
     async def get_file(request: Request, digest: str, name: str) -> Response:
         file = static.files.get(name) if digest == static.digest else None
         if file is None:
-            raise NotFoundError("There is no such file in this version of the page. Load the page again.")
+            raise problems.NOT_FOUND("There is no such file in this version of the page. Load the page again.")
         return _answer(request, file, _IMMUTABLE, POLICY)
 
     options = {"methods": ["GET", "HEAD"], "include_in_schema": False}

@@ -1,4 +1,4 @@
-"""OpenAPI documentation of the body and errors of `POST /v1/jobs`, which FastAPI cannot derive from the route."""
+"""OpenAPI documentation of the body of `POST /v1/jobs`, which FastAPI cannot derive from the route."""
 
 from __future__ import annotations
 
@@ -6,51 +6,9 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from api.http.documentation import invalid
-from api.http.multipart import MEDIA_TYPES, BadRequestError, BodyTypeError, TooSlowError
-from service.errors import (
-    BusyError,
-    DamagedFileError,
-    DamagedWeightsError,
-    FetchError,
-    IdempotencyError,
-    ImageTooLargeError,
-    InspectionLimitError,
-    InvalidUrlError,
-    InvalidWebhookError,
-    LockedError,
-    LostFileError,
-    LostUploadError,
-    NoSpaceError,
-    QueueFullError,
-    QuotaError,
-    RefusedInputError,
-    ServiceError,
-    StoreError,
-    TooLargeError,
-    TooManyFilesError,
-    TooManyGaussiansError,
-    TooManyPixelsError,
-    TooManyViewsError,
-    UnfinishedUploadError,
-    UnknownInputError,
-    UnknownUploadError,
-    UrlsOffError,
-    WebhooksOffError,
-)
 from service.examples import UPLOAD_ID
 from service.files.staging import MOST_STYLES
 from service.parameters import JobParameters
-from sgsst_core.errors import (
-    CameraError,
-    ImageError,
-    MaskError,
-    SceneError,
-    SettingsError,
-    SgsstError,
-    TooManyIntersectionsError,
-    WeightsError,
-)
 from sgsst_core.files.formats import TITLES
 
 
@@ -136,56 +94,3 @@ BODY = {
         },
     }
 }
-
-#: Errors of the core that the inspection of the files reports: part of the request and example.
-_CORE_ERRORS: dict[type[SgsstError], tuple[str | None, str]] = {
-    SceneError: ("scene", "scene.ply: holds no Gaussians (element vertex 0). Export the scene again."),
-    ImageError: ("style", "style.jpg: is not an image that can be read. Give a PNG or JPEG."),
-    CameraError: ("cameras", "cameras.json: holds no cameras. Export them again."),
-    MaskError: (
-        "mask",
-        "head.bin: has 100 bytes, but scene.ply has 616 Gaussians. One bit for each makes 77 bytes.",
-    ),
-    SettingsError: (None, "Both numbers of steps are 0, so that nothing would change. Give some."),
-    WeightsError: (None, "The service has no weights of vgg19: its operator has to fetch them."),
-    TooManyIntersectionsError: (
-        None,
-        "view 'view_0' (5187x3361): its 9,000,000 visible Gaussians touch raster tiles 3,000,000,000 times, more than "
-        "can be addressed. Render at a lower resolution.",
-    ),
-}
-#: Errors of `POST /v1/jobs`.
-REFUSALS: tuple[type[ServiceError] | ServiceError, ...] = (
-    BadRequestError,
-    LostUploadError,
-    TooSlowError,
-    TooLargeError,
-    BodyTypeError(MEDIA_TYPES),
-    invalid("resolution", "Input should be greater than or equal to 1"),
-    *(RefusedInputError(message, error.code, role) for error, (role, message) in _CORE_ERRORS.items()),
-    RefusedInputError,
-    TooManyGaussiansError,
-    TooManyViewsError,
-    TooManyPixelsError,
-    ImageTooLargeError,
-    TooManyFilesError,
-    InspectionLimitError,
-    UnknownUploadError,
-    UnknownInputError,
-    UnfinishedUploadError,
-    UrlsOffError,
-    InvalidUrlError,
-    FetchError,
-    WebhooksOffError,
-    InvalidWebhookError,
-    IdempotencyError,
-    QueueFullError,
-    QuotaError,
-    BusyError,
-    NoSpaceError,
-    StoreError,
-    DamagedWeightsError,
-    LockedError,
-    LostFileError,
-    DamagedFileError,
-)

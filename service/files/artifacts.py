@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.errors import DamagedFileError, LostFileError
+from service import problems
 from service.files.blobs import disk_errors
 from service.files.cache import file_digest
 from service.files.objects import CHUNK, ObjectStore
@@ -94,9 +94,9 @@ class Artifacts:
                 digest = file_digest(temporary)
                 if digest != sha256:
                     _log.error("file damaged: name=%s sha256=%s expected=%s", location, digest, sha256)
-                    raise DamagedFileError(sha256)
+                    raise problems.FILE_DAMAGED(sha256=sha256)
         except FileNotFoundError as error:
-            raise LostFileError(sha256) from error
+            raise problems.FILE_LOST(sha256=sha256) from error
 
     def remove(self, location: str) -> None:
         """Remove a file if it exists."""

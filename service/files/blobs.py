@@ -22,7 +22,8 @@ from io import FileIO
 from pathlib import Path
 from typing import IO, Protocol
 
-from service.errors import LockedError, LostUploadError, NoSpaceError, NotFoundError, StoreError, TooLargeError
+from service import problems
+from service.errors import NotFoundError, StoreError
 from service.files.objects import CHUNK, ObjectStore
 from service.store.inputs import Inputs, check_offset
 from service.store.tables import BlobRow, UploadRow
@@ -52,7 +53,8 @@ def disk_errors() -> Iterator[None]:
         if not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EMFILE, errno.ENFILE):
             raise
         full = cause.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        raise (NoSpaceError if full else StoreError)(f"The service cannot write the file: {cause.strerror}.") from error
+        problem = problems.NO_SPACE if full else problems.STORE_UNAVAILABLE
+        raise problem(f"The service cannot write the file: {cause.strerror}.") from error
 
 
 class Receiver:
@@ -71,13 +73,13 @@ class Receiver:
         """Append bytes to the file.
 
         Raises:
-            TooLargeError: If the file exceeds its size limit.
+            TOO_LARGE: If the file exceeds its size limit.
             NoSpaceError: If the disk is too full.
             StoreError: If the disk fails otherwise.
         """
         self.size += len(data)
         if self.size > self._limit:
-            raise TooLargeError(f"A file has more than {self._limit:,} bytes.", self._limit)
+            raise problems.TOO_LARGE(f"A file has more than {self._limit:,} bytes.", limit=self._limit)
         with self._lock:
             self._ensure_space(len(data))
             write_all(self._file, data)
@@ -137,10 +139,10 @@ class Blobs(ABC):
     def ensure_space(self, size: int) -> None:
         """Raise NoSpaceError if `size` more bytes would leave too little free disk space."""
         if self.missing_space(size) > 0:
-            raise NoSpaceError
+            raise problems.NO_SPACE()
         inodes = os.statvfs(self.incoming)
         if inodes.f_files and inodes.f_favail < _MIN_FREE_INODES:  # file systems without an inode table report 0
-            raise NoSpaceError("The service's disk cannot hold more files. Try again later.")
+            raise problems.NO_SPACE("The service's disk cannot hold more files. Try again later.")
 
     def receive(self, limit: int) -> Receiver:
         """Return a new file to write to."""
@@ -213,7 +215,7 @@ class Blobs(ABC):
         Raises:
             NotFoundError: If the preceding bytes are gone.
             ConflictError: If the upload's offset has changed.
-            LockedError: If this or another process has an open writer of the upload.
+            UPLOAD_LOCKED: If this or another process has an open writer of the upload.
         """
 
     @abstractmethod
@@ -224,7 +226,7 @@ class Blobs(ABC):
 
         Raises:
             NotFoundError: If the upload's bytes are gone.
-            LockedError: If another request is finishing the upload.
+            UPLOAD_LOCKED: If another request is finishing the upload.
         """
 
     @abstractmethod
@@ -330,7 +332,7 @@ class BlobFolder(Blobs):
                 if known is not None:
                     return known
                 if os.fstat(file.fileno()).st_size != upload.length:
-                    raise LostUploadError(upload.id)
+                    raise problems.LOST_UPLOAD(upload_id=upload.id)
                 sha256 = self.add(path, upload.id, link=True)
                 self._inputs.finish_upload(upload.id, sha256, seconds)
                 path.unlink(missing_ok=True)
@@ -338,7 +340,7 @@ class BlobFolder(Blobs):
         except FileNotFoundError:  # missing also if another request has just finished the upload
             known = self._inputs.upload(upload.id, upload.owner).sha256
             if known is None:
-                raise LostUploadError(upload.id) from None
+                raise problems.LOST_UPLOAD(upload_id=upload.id) from None
             return known
 
     def discard_upload(self, upload_id: str) -> None:
@@ -375,11 +377,11 @@ class _FileWriter:
             with disk_errors():
                 self._file = open_file(path, "r+b")
         except FileNotFoundError:
-            raise LostUploadError(upload.id) from None
+            raise problems.LOST_UPLOAD(upload_id=upload.id) from None
         except StoreError:
             # while another request turns a complete upload into a blob, its file is read-only
             if inputs.upload(upload.id, upload.owner).offset == upload.length:
-                raise LockedError from None
+                raise problems.UPLOAD_LOCKED() from None
             raise
         try:
             _lock(self._file)
@@ -387,7 +389,7 @@ class _FileWriter:
             check_offset(inputs.upload(upload.id, upload.owner), upload.offset)
             # writing beyond the end of the file would fill the gap with zeros
             if os.fstat(self._file.fileno()).st_size < upload.offset:
-                raise LostUploadError(upload.id)
+                raise problems.LOST_UPLOAD(upload_id=upload.id)
             self._file.truncate(upload.offset)  # a crash may have left unrecorded bytes
             self._file.seek(upload.offset)
         except BaseException:
@@ -437,12 +439,12 @@ def _lock(file: IO[bytes]) -> None:
     """Lock an upload's file until it is closed; the system releases the lock if the process dies.
 
     Raises:
-        LockedError: If another writer holds the lock.
+        UPLOAD_LOCKED: If another writer holds the lock.
     """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise LockedError from None
+        raise problems.UPLOAD_LOCKED() from None
 
 
 def write_all(file: object, data: bytes) -> None:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.errors import DamagedFileError, LostFileError, NoSpaceError
+from service import problems
 
 _CHUNK = 1 << 20
 #: Number of fetches with a wrong digest after which the file counts as damaged in the store.
@@ -123,11 +123,11 @@ class FileCache:
                     self._add(partial, sha256)
                     return
         except FileNotFoundError as error:
-            raise LostFileError(sha256) from error
+            raise problems.FILE_LOST(sha256=sha256) from error
         finally:
             partial.unlink(missing_ok=True)
         _log.error("file damaged in the store: sha256=%s received=%s", sha256, digest)
-        raise DamagedFileError(sha256)
+        raise problems.FILE_DAMAGED(sha256=sha256)
 
     def _fetch(self, partial: Path, fetch: Fetch) -> None:
         """Fetch a file; if the disk is full, evict all unused files and retry."""
@@ -143,7 +143,7 @@ class FileCache:
             fetch(partial)
         except Exception as error:
             if is_full(error):
-                raise NoSpaceError(f"The disk of {self._files.parent} is full.") from error
+                raise problems.NO_SPACE(f"The disk of {self._files.parent} is full.") from error
             raise
 
     def _add(self, source: Path, sha256: str) -> None:

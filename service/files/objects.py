@@ -21,7 +21,8 @@ from typing import Any, Literal, TypeVar
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from service.errors import DamagedFileError, LostFileError, StoreError
+from service import problems
+from service.errors import StoreError
 
 #: Limits of each request to S3: timeouts for connecting and for responses in seconds, and number of tries, with
 #: exponential backoff. The S3 client alone retries; retries of fsspec around it would multiply both. A store that
@@ -166,7 +167,7 @@ class ObjectStore:
         fault = self.fault(name, sha256)
         if fault is not None:
             _log.error("file %s: store=%s name=%s sha256=%s", fault, self.url, name, sha256)
-            raise LostFileError(sha256) if fault == "missing" else DamagedFileError(sha256)
+            raise problems.FILE_LOST(sha256=sha256) if fault == "missing" else problems.FILE_DAMAGED(sha256=sha256)
 
     def fault(self, name: str, sha256: str) -> Literal["missing", "damaged"] | None:
         """Return the fault of an object that should have this SHA-256; None if it is intact."""
@@ -300,7 +301,7 @@ class ObjectStore:
         except Exception as error:
             if self.local:
                 raise
-            raise StoreError from _cause(name, error)
+            raise problems.STORE_UNAVAILABLE() from _cause(name, error)
 
 
 def _uninterrupted(read: Callable[[], T]) -> T:

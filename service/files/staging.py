@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from service.errors import RefusedInputError
+from service import problems
 from service.parameters import MAX_JOB_NAME
 from sgsst_core.files.camera_advice import advice_for_name
 from sgsst_core.files.formats import format_of_name
@@ -74,7 +74,7 @@ def staged_name(role: str, name: str, number: int = 0) -> str:
         number: Number of the input, for one without a name.
 
     Raises:
-        RefusedInputError: If a photo or mask cannot keep its name.
+        INVALID_INPUT: If a photo or mask cannot keep its name.
     """
     parts = PurePosixPath(unicodedata.normalize("NFC", name).replace("\\", "/")).parts
     given = [part for part in parts if part not in ("/", "..", ".")]
@@ -82,10 +82,9 @@ def staged_name(role: str, name: str, number: int = 0) -> str:
     if role not in _FOLDER_ROLES:
         safe = safe[-1:]
     elif safe != given or len(given) > _MAX_DEPTH:
-        raise RefusedInputError(
+        raise problems.INVALID_REQUEST(
             f"The name {ascii(name)[:200]} of {role!r} has more than {_MAX_DEPTH} parts, or a part that starts with a "
             f"dot, has more than {_MAX_NAME} bytes, is not UTF-8 or holds control characters. Rename the file.",
-            "invalid-request",
             input=role,
         )
     return "/".join(safe) or _FALLBACKS.get(role, f"photo_{number}")
@@ -136,45 +135,44 @@ def check_roles(
         regions: Regions of the job, whose styles and masks must be among the inputs.
 
     Raises:
-        RefusedInputError: If a file is missing, superfluous or inconsistent with the parameters.
+        INVALID_INPUT: If a file is missing, superfluous or inconsistent with the parameters.
     """
     by_role = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
     for role, most in (("scene", 1), ("style", MOST_STYLES)):
         if not 1 <= len(by_role[role]) <= most:
-            what = "is missing" if not by_role[role] else f"is there {len(by_role[role])} times"
+            what = "is missing" if not by_role[role] else f"was sent {len(by_role[role])} times"
             times = "once" if most == 1 else f"once, or up to {most} of them"
-            raise RefusedInputError(f"The file {role!r} {what}. Send it {times}.", "invalid-request", input=role)
+            raise problems.INVALID_REQUEST(f"The file {role!r} {what}. Send it {times}.", input=role)
     own = _check_region_styles([entry["name"] for entry in by_role["style"]], region_styles(regions))
     _check_region_masks([entry["name"] for entry in by_role["mask"]], regions)
     if weights is not None and len(weights) != own:
-        raise RefusedInputError(
+        raise problems.INVALID_REQUEST(
             f"style_weights has {len(weights)} values for {own} files 'style' that belong to no region. Give one per "
             "file, in the same order.",
-            "invalid-request",
             input="style_weights",
         )
     if not by_role["cameras"] and not orbit:
-        raise RefusedInputError(
+        raise problems.INVALID_INPUT(
             "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit'.",
-            "invalid-cameras",
+            code="invalid-cameras",
             input="cameras",
         )
     if by_role["cameras"] and orbit:
-        raise RefusedInputError(
+        raise problems.INVALID_INPUT(
             "Both 'cameras' and the parameter 'orbit' were sent. Send only one of them.",
-            "invalid-cameras",
+            code="invalid-cameras",
             input="cameras",
         )
     if by_role["photos"] and orbit:
-        raise RefusedInputError(
+        raise problems.INVALID_INPUT(
             "'photos' requires 'cameras', and cannot be combined with 'orbit'. Send 'cameras' instead.",
-            "invalid-cameras",
+            code="invalid-cameras",
             input="photos",
         )
     _check_camera_files([entry["name"] for entry in by_role["cameras"]])
     twice = _first_duplicate((entry["role"], entry["name"].lower()) for entry in inputs)
     if twice:
-        raise RefusedInputError(f"Two files of {twice[0]!r} have the name {twice[1]!r}. Rename one.", "invalid-request")
+        raise problems.INVALID_REQUEST(f"Two files of {twice[0]!r} have the name {twice[1]!r}. Rename one.")
     for role in _FOLDER_ROLES:
         _check_folders(role, by_role[role])
 
@@ -183,17 +181,15 @@ def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int
     """Verify that the styles of regions have been sent, and return the number of style images without a region."""
     missing = next((name for name in of_regions if name not in names), None)
     if missing is not None:
-        raise RefusedInputError(
+        raise problems.INVALID_REQUEST(
             f"A region's style is {missing!r}, but no file 'style' has that name; the names are "
             f"{', '.join(names)}. Send it, or correct the name.",
-            "invalid-request",
             input="style",
         )
     own = len([name for name in names if name not in of_regions])
     if not own:
-        raise RefusedInputError(
+        raise problems.INVALID_REQUEST(
             "Every file 'style' belongs to a region. Send one more for the rest of the scene.",
-            "invalid-request",
             input="style",
         )
     return own
@@ -210,18 +206,16 @@ def _check_region_masks(names: Sequence[str], regions: Sequence[RegionRequest]) 
         sent = {name: Path("mask", name) for name in names}
         matching = {name for name, file in sent.items() if (path in file.parents if folder else path == file)}
         if not matching:
-            raise RefusedInputError(
+            raise problems.INVALID_REQUEST(
                 f"Region {region.name!r} is selected by {region.selection.text}, but no file 'mask' has that "
                 f"{'folder' if folder else 'name'}. Send it, or correct the name.",
-                "invalid-request",
                 input="mask",
             )
         unused -= matching
     if unused:
-        raise RefusedInputError(
+        raise problems.INVALID_REQUEST(
             f"The mask {min(unused)!r} belongs to no region. Select a region by mask=NAME or masks=FOLDER, or leave "
             "out the file.",
-            "invalid-request",
             input="mask",
         )
 
@@ -241,20 +235,22 @@ def _check_folders(role: str, inputs: Sequence[Mapping[str, Any]]) -> None:
     for name in names:
         parent = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in names), None)
         if parent:
-            raise RefusedInputError(
-                f"The file {parent!r} of {role!r} is also the folder of {name!r}. Rename one.", "invalid-request"
+            raise problems.INVALID_REQUEST(
+                f"The file {parent!r} of {role!r} is also the folder of {name!r}. Rename one."
             )
 
 
 def _check_camera_files(names: Sequence[str]) -> None:
     if len(names) > MAX_CAMERA_FILES:
-        raise RefusedInputError(f"There are {len(names)} camera files; a COLMAP model has three.", "invalid-cameras")
+        raise problems.INVALID_INPUT(
+            f"There are {len(names)} camera files. Send the three files of a COLMAP model.", code="invalid-cameras"
+        )
     unsupported = next((name for name in names if PurePosixPath(name).suffix.lower() not in _CAMERA_SUFFIXES), None)
     if unsupported is not None:
-        raise RefusedInputError(
+        raise problems.INVALID_INPUT(
             f"The camera file {unsupported!r} is none of *.json, *.bin and *.txt.{advice_for_name(unsupported)} Send a "
             "cameras.json, a transforms.json, or the files of a COLMAP model, with their own names.",
-            "invalid-cameras",
+            code="invalid-cameras",
             input="cameras",
         )
 

@@ -9,15 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from service.errors import (
-    ConflictError,
-    DamagedFileError,
-    LostFileError,
-    LostUploadError,
-    NoSpaceError,
-    NotFoundError,
-    StoreError,
-)
+from service import problems
+from service.errors import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BLOBS, UPLOADS, BlobFolder, Blobs, PartWriter, write_all
 from service.files.cache import FileCache, file_digest
@@ -134,7 +127,7 @@ class StoredBlobs(Blobs):
             except (FileNotFoundError, NotFoundError):  # missing also if another request has just finished the upload
                 known = self._inputs.upload(upload.id, upload.owner).sha256
                 if known is None:
-                    raise LostUploadError(upload.id) from None
+                    raise problems.LOST_UPLOAD(upload_id=upload.id) from None
                 return known
             self._inputs.finish_upload(upload.id, sha256, seconds)
         finally:

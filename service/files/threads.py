@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
+from service import problems
 from service.deadlines import LEAST_RATE, extend
-from service.errors import StoreError
 
 #: Number of threads, and maximum number per owner. Threads mostly wait for the disk or the network.
 _THREADS, _THREADS_PER_OWNER = 16, 4
@@ -82,7 +82,7 @@ class FileThreads:
         except TimeoutError as error:
             if not limit.expired():
                 raise
-            raise StoreError from error
+            raise problems.STORE_UNAVAILABLE() from error
 
     @asynccontextmanager
     async def folder(self, owner: str, parent: Path) -> AsyncIterator[Path]:

@@ -17,8 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from service import problems
 from service.deadlines import suspended
-from service.errors import LostFileError, NoArtifactError, NotFoundError, TooManyBlendsError
+from service.errors import LostFileError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
@@ -89,9 +90,9 @@ class DerivedFiles:
 
         Raises:
             NotFoundError: If the job has no result yet, or the result is gone.
-            RefusedInputError: If the format cannot represent the result, or compressing exceeds the limits.
-            QuotaError: If the files exceed the owner's quota of stored bytes.
-            BusyError, NoSpaceError: If the result cannot be compressed now.
+            INVALID_INPUT: If the format cannot represent the result, or compressing exceeds the limits.
+            QUOTA_EXCEEDED: If the files exceed the owner's quota of stored bytes.
+            BUSY, NoSpaceError: If the result cannot be compressed now.
         """
         name = result_name(RESULT, format)
         return await self._derived(job, name, lambda: self._compress(job, name, quotas))
@@ -101,11 +102,11 @@ class DerivedFiles:
 
         Raises:
             NotFoundError: If a job has no result yet, or a result is gone.
-            RefusedInputError: If the results have other Gaussians than the scene, the format cannot represent the
+            INVALID_INPUT: If the results have other Gaussians than the scene, the format cannot represent the
                 blend, or blending exceeds the limits.
-            TooManyBlendsError: If the job has `MOST_BLENDS` already.
-            QuotaError: If the blend exceeds the owner's quota of stored bytes.
-            BusyError, NoSpaceError: If the results cannot be blended now.
+            TOO_MANY_BLENDS: If the job has `MOST_BLENDS` already.
+            QUOTA_EXCEEDED: If the blend exceeds the owner's quota of stored bytes.
+            BUSY, NoSpaceError: If the results cannot be blended now.
         """
         return await self._derived(job, blend.name, lambda: self._blend(job, blend, quotas))
 
@@ -127,13 +128,13 @@ class DerivedFiles:
                 raise
             row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
         if row is None:
-            raise NotFoundError(f"The results of job {job.id} are gone.")
+            raise problems.NOT_FOUND(f"The results of job {job.id} are gone.")
         return row
 
     def _result(self, job_id: str) -> ArtifactRow:
         row = self._store.jobs.artifact(job_id, RESULT)
         if row is None:
-            raise NoArtifactError(job_id, RESULT)
+            raise problems.NO_ARTIFACT(job_id=job_id, name=RESULT)
         return row
 
     # --- compressed formats ---------------------------------------------------------------------------------------
@@ -174,7 +175,7 @@ class DerivedFiles:
 
     def _check_count(self, job: JobRow) -> None:
         if sum(row.name.startswith(_BLENDS) for row in self._store.jobs.artifacts(job.id)) >= MOST_BLENDS:
-            raise TooManyBlendsError(job.id, MOST_BLENDS)
+            raise problems.TOO_MANY_BLENDS(job_id=job.id, limit=MOST_BLENDS)
 
     # --- both -----------------------------------------------------------------------------------------------------
 
@@ -238,7 +239,7 @@ def publish_derived(
         replace: Whether files replace those of the same names.
 
     Raises:
-        QuotaError: If they exceed the owner's quota of stored bytes; nothing is stored.
+        QUOTA_EXCEEDED: If they exceed the owner's quota of stored bytes; nothing is stored.
     """
     known = {row.name: row.size for row in store.jobs.artifacts(job.id)} if replace else {}
     size = sum(path.stat().st_size - known.get(name, 0) for name, path in files.items())

@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 import psutil
 
+from service import problems
 from service.deadlines import suspended
-from service.errors import BusyError, InspectionLimitError, RefusedInputError
 from service.files.blobs import Blobs
 from service.files.staging import stage
 from service.files.threads import FileThreads
@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 Work = Literal["validate", "plan"]
 #: Version of the validation; raising it invalidates stored findings.
 _VERSION = "5"
-#: Maximum number of requests that wait for the inspecting process; further ones are rejected with `BusyError`.
+#: Maximum number of requests that wait for the inspecting process; further ones are rejected with `BUSY`.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
 LEFTOVER_SECONDS = 3600.0
@@ -83,10 +83,10 @@ class InspectionProcess:
         """Return the response to a request; `show` receives the progress of planning.
 
         Raises:
-            BusyError: If too many requests wait already, or the process died twice.
+            BUSY: If too many requests wait already, or the process died twice.
         """
         if self._waiting >= _MAX_WAITING:
-            raise BusyError
+            raise problems.BUSY()
         self._waiting += 1
         try:
             async with self._lock:
@@ -97,7 +97,7 @@ class InspectionProcess:
                         return answer
         finally:
             self._waiting -= 1
-        raise BusyError("Files cannot be checked at the moment. Try again later.")
+        raise problems.BUSY("Files cannot be checked at the moment. Try again later.")
 
     async def warm(self) -> None:
         """Start the process in advance, so that the first request does not wait for it."""
@@ -189,7 +189,7 @@ class Inspector:
         """Return the stored finding of `inspect` for the same owner and inputs; None if there is none.
 
         Raises:
-            RefusedInputError: If the stored finding is a rejection.
+            INVALID_INPUT: If the stored finding is a rejection.
         """
         known = self._store.inputs.inspection(self._key(work, owner, inputs, parameters))
         return None if known is None else findings_of(known)
@@ -215,8 +215,8 @@ class Inspector:
                 step is one view.
 
         Raises:
-            RefusedInputError: If the inputs cannot be used.
-            BusyError: If the inputs cannot be checked now.
+            INVALID_INPUT: If the inputs cannot be used.
+            BUSY: If the inputs cannot be checked now.
         """
         recalled = await asyncio.to_thread(self.recall, work, owner, inputs, parameters)
         if recalled is not None:
@@ -226,7 +226,7 @@ class Inspector:
         with suspended():  # the process has its own limits
             async with self._lanes(work, inputs).turn(owner) as process:
                 answer = await self._ask_process(process, work, owner, inputs, rows, parameters, show)
-        transient = answer.get("error", {}).get("code") in (InspectionLimitError.code, WeightsError.code)
+        transient = answer.get("error", {}).get("code") in (problems.INSPECTION_LIMIT.code, WeightsError.code)
         if not transient:  # a later check may succeed
             key = self._key(work, owner, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
@@ -315,10 +315,10 @@ def findings_of(answer: Mapping[str, Any]) -> dict[str, Any]:
     """Return the findings in a response of the inspecting process.
 
     Raises:
-        RefusedInputError: If the response is an error.
+        INVALID_INPUT: If the response is an error.
     """
     if "error" in answer:
         error = answer["error"]
-        raise RefusedInputError(error["message"], error["code"], error["input"])
+        raise problems.INVALID_INPUT(error["message"], code=error["code"], input=error["input"])
     findings: dict[str, Any] = answer["findings"]
     return findings

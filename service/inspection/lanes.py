@@ -8,9 +8,9 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Generic, TypeVar
 
-from service.errors import BusyError
+from service import problems
 
-#: Maximum number of waiting requests per owner; further ones are rejected with `BusyError`.
+#: Maximum number of waiting requests per owner; further ones are rejected with `BUSY`.
 MAX_WAITING = 64
 
 Slot = TypeVar("Slot")
@@ -35,11 +35,11 @@ class Lanes(Generic[Slot]):
         """Wait for the owner's turn and occupy a slot for the duration of the block.
 
         Raises:
-            BusyError: If too many requests of this owner wait already.
+            BUSY: If too many requests of this owner wait already.
         """
         queue = self._waiting.setdefault(owner, deque())
         if len(queue) >= MAX_WAITING:
-            raise BusyError("Too many files of this key are being checked. Try again later.")
+            raise problems.BUSY("Too many files of this key are being checked. Try again later.")
         granted: asyncio.Future[Slot] = asyncio.get_running_loop().create_future()
         queue.append(granted)
         self._grant_turns()

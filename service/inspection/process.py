@@ -28,13 +28,7 @@ from typing import Any, NoReturn
 import psutil
 import torch
 
-from service.errors import (
-    ImageTooLargeError,
-    InspectionLimitError,
-    TooManyGaussiansError,
-    TooManyPixelsError,
-    TooManyViewsError,
-)
+from service import problems
 from service.files.staging import ROLES, Staged
 from service.inspection.sandbox import confine, installation
 from service.optional import install_command
@@ -115,7 +109,7 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
         `gaussians`, `dropped`, `sh_degree`, `views`, `pixels` (of all views), `style` (width, height), `photos`.
 
     Raises:
-        RefusedInputError, InvalidInputError: If an input cannot be used; the error's attribute `role` is the input's
+        INVALID_INPUT, InvalidInputError: If an input cannot be used; the error's attribute `role` is the input's
             role.
     """
     return _read_inputs(staged, parameters, limits)[0]
@@ -134,7 +128,9 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         header = read_scene_header(staged.scene)
         declared = int(header.count * settings.growth)
         if declared > limits["gaussians"]:
-            raise TooManyGaussiansError(declared, limits["gaussians"], _refinement_note(settings))
+            raise problems.TOO_MANY_GAUSSIANS(
+                count=declared, note=_refinement_note(settings), limit=limits["gaussians"], input="scene"
+            )
     with _errors_of("cameras"):
         if source.cameras is not None and staged.photos is None:
             _check_frames_have_sizes(source.cameras)
@@ -155,10 +151,10 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
         capture = read_capture(source, file.scene, staged.photos).fitted(settings)
         cameras = capture.cameras
         if len(cameras) > limits["views"]:
-            raise TooManyViewsError(len(cameras), limits["views"])
+            raise problems.TOO_MANY_VIEWS(count=len(cameras), limit=limits["views"], input="cameras")
         pixels = _pixels(cameras)
         if pixels > limits["pixels"]:
-            raise TooManyPixelsError(pixels, limits["pixels"])
+            raise problems.TOO_MANY_PIXELS(count=pixels, limit=limits["pixels"], input="cameras")
         check_scales(settings.scales, cameras, settings.coarsest_side)
         check_stroke_depth(settings, cameras, regions=bool(job.regions))
         check_something_in_view(file.scene, cameras, source.near)
@@ -362,7 +358,7 @@ def _check_encoder() -> None:
 def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
     width, height = image_size(path)
     if width * height > limits["image_pixels"]:
-        raise ImageTooLargeError(path.name, width, height, limits["image_pixels"])
+        raise problems.IMAGE_TOO_LARGE(name=path.name, width=width, height=height, limit=limits["image_pixels"])
 
 
 def _check_frames_have_sizes(path: Path) -> None:
@@ -413,7 +409,7 @@ def _without_folders(message: str) -> str:
 
 
 def _over_limit(message: str, role: str | None = None) -> dict[str, Any]:
-    return _refusal(InspectionLimitError.code, message, role)
+    return _refusal(problems.INSPECTION_LIMIT.code, message, role)
 
 
 def _limit_resources(seconds: float, size: int) -> None:
@@ -570,7 +566,7 @@ _TITLES = {
 def _limit_text(request: dict[str, Any]) -> str:
     what = _TITLES[request["work"]]
     text = f"{what} takes more time ({request['seconds']:.0f} s of a processor) or memory "
-    text += f"({request['bytes'] / 1e9:.1f} GB) than allowed for files of this size, or breaks their reader."
+    text += f"({request['bytes'] / 1e9:.1f} GB) than allowed for files of this size, or crashes their reader."
     return text if request["work"] != "plan" else f"{text} Ask for fewer views, or submit it without a dry run."
 
 

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from service import problems
 from service.deadlines import suspended
-from service.errors import BusyError, NoArtifactError, NotFoundError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
@@ -97,9 +97,9 @@ class VideoMaker:
 
         Raises:
             NotFoundError: If the job has no result, or was deleted meanwhile.
-            RefusedInputError: If the video cannot be rendered, or exceeds the limits.
-            QuotaError: If the video exceeds the owner's quota of stored bytes.
-            BusyError, NoSpaceError: If it cannot be rendered now; another video of the job may be in progress.
+            INVALID_INPUT: If the video cannot be rendered, or exceeds the limits.
+            QUOTA_EXCEEDED: If the video exceeds the owner's quota of stored bytes.
+            BUSY, NoSpaceError: If it cannot be rendered now; another video of the job may be in progress.
         """
         making = self._making.get(job.id)
         if making is None:
@@ -107,7 +107,7 @@ class VideoMaker:
             making.task = asyncio.create_task(self._render(job, making, quotas))
             making.task.add_done_callback(lambda task: self._end(job, task))
         elif making.options != options:
-            raise BusyError("Another video of this job is being rendered. Try again when it is done.")
+            raise problems.BUSY("Another video of this job is being rendered. Try again when it is done.")
         assert making.task is not None
         making.watchers.append(show)
         try:
@@ -117,7 +117,7 @@ class VideoMaker:
             making.watchers.remove(show)
         row = await asyncio.to_thread(self._store.jobs.artifact, job.id, VIDEO)
         if row is None:
-            raise NotFoundError(f"The results of job {job.id} are gone.")
+            raise problems.NOT_FOUND(f"The results of job {job.id} are gone.")
         return row
 
     def _end(self, job: JobRow, task: asyncio.Task[None]) -> None:
@@ -129,7 +129,7 @@ class VideoMaker:
         """Render the video, store it and make it visible."""
         result = await asyncio.to_thread(self._store.jobs.artifact, job.id, RESULT)
         if result is None:
-            raise NoArtifactError(job.id, RESULT)
+            raise problems.NO_ARTIFACT(job_id=job.id, name=RESULT)
         options = making.options
         side = options.resolution or DEFAULT_SIDE
         pixels = side * side * options.frames * (2 if options.compare else 1)

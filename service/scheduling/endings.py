@@ -52,7 +52,7 @@ class StopRequest(StrEnum):
 #: Error of an attempt that has failed because of a machine, a network or the file store, without the `cause`.
 OUTAGE = {
     "code": InfrastructureError.code,
-    "message": "A machine of the service, its network or its store of files has failed. The job is tried again.",
+    "message": "A machine of the service, its network or its store of files failed. The job will be retried.",
 }
 #: Causes by type of error; the first match counts. Jobs write to folders of the service, so output errors are the
 #: disk's, and only an operator can install missing weights.
@@ -145,7 +145,7 @@ def attempt_ending(
 def _crash_error(exit_code: int, log_tail: str | None) -> dict[str, Any]:
     """Return the error of a process that ended without a final message."""
     if exit_code == -signal.SIGKILL:
-        message = "The process that ran the job was killed; perhaps the machine had run out of memory."
+        message = "The process that ran the job was killed; the machine may have run out of memory."
     elif exit_code < 0:
         message = f"The process that ran the job was ended by {signal.Signals(-exit_code).name}."
     else:

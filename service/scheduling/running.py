@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from service import problems
 from service.deadlines import LEAST_RATE
 from service.errors import LeaseLostError, ServiceError, StoreError
 from service.files.artifacts import Artifacts
@@ -145,7 +146,7 @@ class RunningAttempt:
             if future.done():
                 raise
             future.cancel()
-            raise StoreError from error
+            raise problems.STORE_UNAVAILABLE() from error
 
     def _publish_later(self, publish: Callable[[], None]) -> None:
         """Publish files without waiting for the file store."""

@@ -21,7 +21,8 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from service.errors import DamagedFileError, LostFileError, ServiceError, StoreError
+from service import problems
+from service.errors import DamagedFileError, LostFileError, ServiceError
 from service.file_permissions import keep_private
 from service.files.artifacts import Artifacts
 from service.files.cache import file_digest
@@ -117,7 +118,7 @@ class StoreWorkplace:
         try:
             return RankFolder(self, rank, stored)
         except OSError as error:
-            raise InfrastructureError(f"The job's files cannot be laid out here: {error}.") from error
+            raise InfrastructureError(f"The job's files cannot be staged here: {error}.") from error
 
     def after(self, stored: Sequence[Published]) -> StoreWorkplace:
         """Return a copy whose checkpoint is the last one among these files."""
@@ -176,7 +177,7 @@ class RankFolder:
             for name, file in workplace.weights.items():
                 link(file, weights / name)
         except (LostFileError, DamagedFileError) as error:  # not the user's fault, and the user cannot send it again
-            raise StoreError("The network's weights in the store of files cannot be used.") from error
+            raise problems.STORE_UNAVAILABLE("The network's weights in the store of files cannot be used.") from error
         if workplace.weights:
             os.environ["SGSST_CACHE"] = str(weights)
         if workplace.checkpoint is not None and rank == 0:

@@ -17,7 +17,7 @@ import threading
 import time
 from functools import cached_property
 
-from service.errors import InvalidWebhookError, WebhooksOffError
+from service import problems
 from service.outgoing import parse_url, send
 from service.settings import ServiceSettings
 from service.store import Store
@@ -49,15 +49,15 @@ def check_url(url: str, settings: ServiceSettings) -> None:
     """Check that a URL may be used as a webhook; the addresses of its host are checked at each delivery.
 
     Raises:
-        WebhooksOffError: If the service sends no webhooks.
-        InvalidWebhookError: If the URL cannot be called.
+        WEBHOOKS_OFF: If the service sends no webhooks.
+        INVALID_WEBHOOK: If the URL cannot be called.
     """
     if not settings.webhooks:
-        raise WebhooksOffError
+        raise problems.WEBHOOKS_OFF(input="webhook")
     try:
         parse_url(url)
     except ValueError as error:
-        raise InvalidWebhookError(url, error) from error
+        raise problems.INVALID_WEBHOOK(url=url[:100], reason=error, input="webhook") from error
 
 
 class Deliverer:

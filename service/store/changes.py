@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
-from service.errors import NoJobError
+from service import problems
 from service.store.clocks import retained_until
 from service.store.database import count, new_id
 from service.store.states import JobStatus, Transition, next_status
@@ -31,7 +31,7 @@ def job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool
     """
     job = session.get(JobRow, job_id, with_for_update=lock, populate_existing=lock)
     if job is None or (owner is not None and job.owner != owner):
-        raise NoJobError(job_id)
+        raise problems.NO_JOB(job_id=job_id)
     return job
 
 

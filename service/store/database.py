@@ -18,7 +18,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
-from service.errors import DatabaseBusyError, IdempotencyError
+from service import problems
 from service.store.clocks import Clock, ServerClock, expiry_time
 from service.store.outages import Gate, impatient_connection, translated
 from service.store.rollback import NEWEST_EVENT, Marker
@@ -117,7 +117,7 @@ class Database:
             yield
             return
         if not self._write_lock.acquire(timeout=self._answer_seconds):
-            raise DatabaseBusyError
+            raise problems.DATABASE_BUSY()
         try:
             yield
         finally:
@@ -268,7 +268,7 @@ def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, no
     """Return the row of an Idempotency-Key; its `created_id` is set if the key was already used for the same request.
 
     Raises:
-        IdempotencyError: If the key was used for a different request.
+        IDEMPOTENCY_KEY_REUSED: If the key was used for a different request.
     """
     # on both kinds of databases, the second of two concurrent requests waits here for the first
     insert = upsert(session)(IdempotencyRow).values(
@@ -277,7 +277,7 @@ def idempotency_row(session: Session, owner: str, key: str, fingerprint: str, no
     session.execute(insert.on_conflict_do_nothing())
     row = session.get_one(IdempotencyRow, (owner, key), with_for_update=True)
     if row.fingerprint != fingerprint:
-        raise IdempotencyError
+        raise problems.IDEMPOTENCY_KEY_REUSED()
     return row
 
 

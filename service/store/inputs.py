@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import bindparam, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
-from service.errors import NotFoundError, NoUploadError, OffsetError, TooManyUploadsError
+from service import problems
 from service.store.changes import release_blobs
 from service.store.database import Database, idempotency_row, new_id, upsert
 from service.store.quotas import IS_RECEIPT, NO_QUOTAS, RECEIPT, Quotas, check_bytes, lock_owner
@@ -37,7 +37,7 @@ _INSPECTION = select(Base.metadata.tables["inspections"].c.result).where(Inspect
 def check_offset(upload: UploadRow, offset: int) -> None:
     """Raise ConflictError if an upload's next byte is at a different offset."""
     if upload.offset != offset:
-        raise OffsetError(offset, upload.offset)
+        raise problems.WRONG_OFFSET(given=offset, offset=upload.offset)
 
 
 class Inputs:
@@ -101,7 +101,7 @@ class Inputs:
             blobs = self.blobs(digests)
         missing = next((sha256 for sha256 in digests if sha256 not in blobs), None)
         if missing is not None:
-            raise NotFoundError(f"There is no file with SHA-256 {missing}.")
+            raise problems.NOT_FOUND(f"There is no file with SHA-256 {missing}.")
         return blobs
 
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
@@ -153,8 +153,8 @@ class Inputs:
 
         Raises:
             ConflictError: If the owner has `most` unfinished uploads.
-            IdempotencyError: If the key was used for a different upload.
-            QuotaError: If its bytes would exceed the owner's quota.
+            IDEMPOTENCY_KEY_REUSED: If the key was used for a different upload.
+            QUOTA_EXCEEDED: If its bytes would exceed the owner's quota.
         """
         now = self._database.clock()
         with self._database.writing() as session:
@@ -172,7 +172,7 @@ class Inputs:
                 if known is not None:
                     return known
             if _count_open_uploads(session, owner) >= most:
-                raise TooManyUploadsError(most)
+                raise problems.TOO_MANY_UPLOADS(limit=most)
             row = UploadRow(id=new_id("upl", now), owner=owner, length=length, offset=0, filename=filename)
             row.metadata_header, row.created_at, row.expires_at = header, now, now + seconds
             session.add(row)
@@ -191,7 +191,7 @@ class Inputs:
         with self._database.reading() as session:
             row = session.get(UploadRow, upload_id)
         if row is None or row.owner != owner or row.expires_at < self._database.clock():
-            raise NoUploadError(upload_id)
+            raise problems.NO_UPLOAD(upload_id=upload_id)
         return row
 
     def uploads(self, upload_ids: Sequence[str], owner: str) -> dict[str, UploadRow]:
@@ -223,7 +223,7 @@ class Inputs:
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None:
-                raise NoUploadError(upload_id)
+                raise problems.NO_UPLOAD(upload_id=upload_id)
             check_offset(row, start)
             if location is not None:
                 session.add(UploadPartRow(upload_id=upload_id, start=start, size=size, location=location))
@@ -246,7 +246,7 @@ class Inputs:
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None:
-                raise NoUploadError(upload_id)
+                raise problems.NO_UPLOAD(upload_id=upload_id)
             row.offset, row.sha256, row.expires_at = row.length, sha256, self._database.clock() + seconds
             session.execute(delete(UploadPartRow).where(UploadPartRow.upload_id == upload_id))
             use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
@@ -261,7 +261,7 @@ class Inputs:
         with self._database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None or row.owner != owner:
-                raise NoUploadError(upload_id)
+                raise problems.NO_UPLOAD(upload_id=upload_id)
             session.delete(row)
             return release_blobs(session, f"upload:{upload_id}")
 
@@ -273,7 +273,7 @@ class Inputs:
         The receipt holds the blobs made from the request's files. It expires like an upload unless it is renewed.
 
         Raises:
-            QuotaError: If the bytes would exceed the owner's quota.
+            QUOTA_EXCEEDED: If the bytes would exceed the owner's quota.
         """
         now = self._database.clock()
         row = UploadRow(id=new_id(RECEIPT, now), owner=owner, length=size, offset=0, filename="", metadata_header="")
@@ -289,7 +289,7 @@ class Inputs:
         """Charge further bytes for a request that did not declare its size.
 
         Raises:
-            QuotaError: If the bytes would exceed the owner's quota.
+            QUOTA_EXCEEDED: If the bytes would exceed the owner's quota.
             NotFoundError: If the receipt has expired.
         """
         with self._database.writing() as session:
@@ -350,7 +350,7 @@ def _lock_upload(session: Session, upload_id: str) -> UploadRow:
     """Lock and return an upload's row; call this before locking rows of blobs, so that no deadlock occurs."""
     row = session.get(UploadRow, upload_id, with_for_update=True)
     if row is None:
-        raise NoUploadError(upload_id)
+        raise problems.NO_UPLOAD(upload_id=upload_id)
     return row
 
 

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Float, Select, String, bindparam, func, inser
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from service.errors import CancelError, DeleteError, FinishError, NoJobError, NotFoundError, QueueFullError, RetryError
+from service import problems
 from service.store import job_inputs
 from service.store.changes import add_status_event, end, forget, holder_name, job_of_owner, move
 from service.store.database import Database, count, idempotency_row, new_id
@@ -127,9 +127,9 @@ class Jobs:
             Job, and whether it is new; if the Idempotency-Key was used before, the job created then.
 
         Raises:
-            IdempotencyError: If the key was used for a different request.
-            QueueFullError: If the owner has `limit` unfinished jobs.
-            QuotaError: If the job would exceed one of the owner's quotas.
+            IDEMPOTENCY_KEY_REUSED: If the key was used for a different request.
+            QUEUE_FULL: If the owner has `limit` unfinished jobs.
+            QUOTA_EXCEEDED: If the job would exceed one of the owner's quotas.
             NotFoundError: If an input was deleted meanwhile.
         """
         now = self._database.clock()
@@ -154,7 +154,7 @@ class Jobs:
             try:
                 session.execute(insert(_BLOB_USES), uses)
             except IntegrityError as error:
-                raise NotFoundError("An input was deleted while it was being checked. Upload it again.") from error
+                raise problems.NOT_FOUND("An input was deleted while it was being checked. Upload it again.") from error
             if receipt is not None:
                 close_receipt(session, receipt)
             check_bytes(session, new.owner, quotas)
@@ -180,7 +180,7 @@ class Jobs:
         with self._database.reading() as session:
             inputs: list[dict[str, Any]] | None = session.scalar(select(JobRow.inputs).where(JobRow.id == job_id))
         if inputs is None:
-            raise NoJobError(job_id)
+            raise problems.NO_JOB(job_id=job_id)
         return inputs
 
     def input_page(self, job_id: str, start: int, limit: int) -> list[tuple[int, dict[str, Any]]]:
@@ -202,7 +202,7 @@ class Jobs:
         with self._database.reading_rows() as connection:
             row = connection.execute(_JOB, {"job_id": job_id}).one_or_none()
             if row is None or (owner is not None and row.owner != owner):
-                raise NoJobError(job_id)
+                raise problems.NO_JOB(job_id=job_id)
             (shown,) = _shown(connection, [JobRow(**row._mapping)])
             rows = connection.execute(_ATTEMPTS_OF, {"job_id": job_id}) if shown.row.attempt else ()
             return shown, [AttemptRow(**each._mapping) for each in rows]
@@ -228,13 +228,13 @@ class Jobs:
         returned unchanged.
 
         Raises:
-            FinishError: If the job is not running.
+            NOT_RUNNING: If the job is not running.
         """
         now = self._database.clock()
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.FINISH):
-                raise FinishError(job.status)
+                raise problems.NOT_RUNNING(job_status=job.status)
             if job.status in ACTIONS[Transition.FINISH]:
                 job.finish_requested = True
                 move(session, job, Transition.FINISH, now)
@@ -246,13 +246,13 @@ class Jobs:
         A job that is already canceled is returned unchanged.
 
         Raises:
-            CancelError: If the job has ended in another way.
+            NOT_CANCELABLE: If the job has ended in another way.
         """
         now = self._database.clock()
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.CANCEL):
-                raise CancelError(job.status)
+                raise problems.NOT_CANCELABLE(job_status=job.status)
             if job.status in ACTIONS[Transition.CANCEL]:
                 if next_status(job.status, Transition.CANCEL) in ENDED:
                     end(session, job, Transition.CANCEL, now, self._retention)
@@ -266,16 +266,16 @@ class Jobs:
         A retry counts toward the day's jobs.
 
         Raises:
-            RetryError: If the job has another status.
-            QueueFullError: If the owner has `limit` unfinished jobs.
-            QuotaError: If the job would exceed one of the owner's quotas.
+            NOT_RETRYABLE: If the job has another status.
+            QUEUE_FULL: If the owner has `limit` unfinished jobs.
+            QUOTA_EXCEEDED: If the job would exceed one of the owner's quotas.
         """
         now = self._database.clock()
         with self._database.writing() as session:
             lock_owner(session, job_of_owner(session, job_id, owner).owner)
             job = job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.RETRY):
-                raise RetryError(job.status)
+                raise problems.NOT_RETRYABLE(job_status=job.status)
             _check_queue(session, job.owner, limit)
             count_job(session, job.owner, quotas, now)
             check_bytes(session, job.owner, quotas)
@@ -301,12 +301,13 @@ class Jobs:
             Locations of inputs that are no longer used, for `Blobs.remove`.
 
         Raises:
-            DeleteError: If the job has not ended.
+            NOT_ENDED: If the job has not ended.
         """
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, owner, lock=True)
             if job.status not in ENDED:
-                raise DeleteError(job.status)
+                advice = "It ends in some seconds" if job.status == JobStatus.CANCELING else "Cancel it first"
+                raise problems.NOT_ENDED(job_status=job.status, advice=advice)
             return forget(session, job)
 
     def artifacts(self, job_id: str, after: str = "", limit: int | None = None) -> list[ArtifactRow]:
@@ -344,7 +345,7 @@ class Jobs:
             Locations of files without a row: replaced ones, and those that were left out or whose `source` is gone.
 
         Raises:
-            QuotaError: If the files exceed the owner's quota of stored bytes; none is published.
+            QUOTA_EXCEEDED: If the files exceed the owner's quota of stored bytes; none is published.
         """
         unused = []
         with self._database.writing() as session:
@@ -406,9 +407,9 @@ def _row_of_new_job(new: NewJob, now: float) -> dict[str, Any]:
 
 
 def _check_queue(session: Session, owner: str, limit: int) -> None:
-    """Raise QueueFullError if an owner has `limit` unfinished jobs."""
+    """Raise QUEUE_FULL if an owner has `limit` unfinished jobs."""
     if session.execute(_UNFINISHED_OF, {"owner": owner}).scalar_one() >= limit:
-        raise QueueFullError(limit)
+        raise problems.QUEUE_FULL(limit=limit)
 
 
 def _shown(connection: Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:

@@ -7,7 +7,7 @@ import secrets
 
 from sqlalchemy import bindparam, delete, select
 
-from service.errors import NotFoundError
+from service import problems
 from service.store.clocks import expiry_time
 from service.store.database import Database, new_id
 from service.store.quotas import NO_QUOTAS, Quotas
@@ -71,7 +71,7 @@ class Keys:
         with self._database.writing() as session:
             row = session.get(KeyRow, key_id, with_for_update=True)
             if row is None:
-                raise NotFoundError(f"There is no key {key_id}. `sgsst keys list` shows their ids.")
+                raise problems.NOT_FOUND(f"There is no key {key_id}. `sgsst keys list` shows their ids.")
             row.revoked_at = row.revoked_at or self._database.clock()
             return row
 

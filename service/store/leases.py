@@ -15,6 +15,7 @@ from typing import Any
 from sqlalchemy import Delete, and_, bindparam, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
+from service import problems
 from service.errors import LeaseLostError
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, observe, upsert
@@ -340,9 +341,9 @@ class Leases:
 
     def _close_lost(self, session: Session, job: JobRow, dispatcher: str, now: float) -> bool:
         """Close an attempt whose lease `dispatcher` has found expired; return whether this has ended the job."""
-        error = {"code": DISPATCHER_LOST, "message": "The process that ran the job was not heard of again."}
+        error = {"code": DISPATCHER_LOST, "message": "The process that ran the job stopped responding."}
         if job.lease_owner == dispatcher or self._lives(session, job):
-            message = "The process that ran the job could not reach the database in time. The job is tried again."
+            message = "The process that ran the job could not reach the database in time. The job will be retried."
             error = {"code": InfrastructureError.code, "message": message, "cause": Cause.DATABASE}
         verdict = self._close(session, job, AttemptOutcome.LOST, error, now)
         count(session, "sgsst_lease_expirations_total")
@@ -409,7 +410,7 @@ _DELETE_OLD_PROGRESS = _delete_old_progress()
 
 
 def _lost(lease: Lease) -> LeaseLostError:
-    return LeaseLostError(f"{lease.job_id}: lease {lease.epoch} of {lease.dispatcher} is no longer held.")
+    return problems.LEASE_LOST(job_id=lease.job_id, epoch=lease.epoch, dispatcher=lease.dispatcher)
 
 
 def _is_held(job: JobRow, lease: Lease) -> bool:

@@ -10,7 +10,8 @@ from typing import Any
 from sqlalchemy.exc import DBAPIError, InterfaceError, NoResultFound, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from service.errors import ChangedMeanwhileError, DatabaseBusyError, DatabaseUnavailableError
+from service import problems
+from service.errors import DatabaseUnavailableError, ServiceError
 
 #: Time in seconds that a transaction waits for a probing transaction before it is rejected.
 _PROBE_SECONDS = 0.2
@@ -44,7 +45,7 @@ class Gate:
         """
         refusal = self._refusal
         if refusal is not None and not self._probe.acquire(timeout=_PROBE_SECONDS):
-            raise type(refusal)
+            raise refusal.problem()
         try:
             with translated():
                 yield
@@ -67,14 +68,14 @@ def translated() -> Iterator[None]:
 
     Raises:
         DatabaseUnavailableError: If the database is down or locked.
-        ChangedMeanwhileError: If a row that this transaction refers to is gone, or one that it adds is there.
+        ConflictError: If a row that this transaction refers to is gone, or one that it adds is there.
     """
     try:
         yield
     except PoolTimeoutError as error:
-        raise DatabaseBusyError from error
+        raise problems.DATABASE_BUSY() from error
     except NoResultFound as error:
-        raise ChangedMeanwhileError from error
+        raise problems.CHANGED_MEANWHILE() from error
     except DBAPIError as error:
         refusal = _refusal(error)
         if refusal is None:
@@ -82,18 +83,18 @@ def translated() -> Iterator[None]:
         raise refusal from error
 
 
-def _refusal(error: DBAPIError) -> DatabaseUnavailableError | ChangedMeanwhileError | None:
+def _refusal(error: DBAPIError) -> ServiceError | None:
     """Convert a driver's error to an exception for callers; return None if the error is a bug of the service."""
     sqlite: str | None = getattr(error.orig, "sqlite_errorname", None)
     sqlstate: str = getattr(error.orig, "sqlstate", None) or ""
     if (sqlite or "").startswith(_SQLITE_BUSY) or sqlstate.startswith(_POSTGRESQL_BUSY):
-        return DatabaseBusyError()
+        return problems.DATABASE_BUSY()
     if sqlite in _CHANGED or sqlstate in _CHANGED:
-        return ChangedMeanwhileError()
+        return problems.CHANGED_MEANWHILE()
     away = isinstance(error, OperationalError | InterfaceError) if sqlite is None else sqlite.startswith(_SQLITE_AWAY)
     if not away and not error.connection_invalidated:
         return None
-    return DatabaseUnavailableError()
+    return problems.DATABASE_UNAVAILABLE()
 
 
 def impatient_connection(seconds: float) -> Any:

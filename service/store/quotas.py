@@ -9,7 +9,7 @@ from typing import Any, Self
 from sqlalchemy import BindParameter, String, bindparam, func, or_, select, text, union
 from sqlalchemy.orm import Session
 
-from service.errors import BytesQuotaError, QuotaError
+from service import problems
 from service.settings import ServiceSettings
 from service.store.database import Database, upsert
 from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, UploadRow, UsageRow
@@ -105,25 +105,24 @@ def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
     """Count a new job, within the transaction that creates it.
 
     Raises:
-        QuotaError: If the job exceeds the daily number of jobs, or today's GPU seconds are used up.
+        QUOTA_EXCEEDED: If the job exceeds the daily number of jobs, or today's GPU seconds are used up.
     """
     insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=1, gpu_seconds=0.0)
     counted = insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"jobs": _USAGE.c.jobs + 1})
     jobs, seconds = session.execute(counted.returning(_USAGE.c.jobs, _USAGE.c.gpu_seconds)).one()
     tomorrow = _DAY - int(now % _DAY)
     if quotas.jobs_a_day is not None and jobs > quotas.jobs_a_day:
-        raise QuotaError(
-            f"This key may submit {quotas.jobs_a_day:,} jobs a day, and has done so. Try again tomorrow (UTC).",
-            "jobs-a-day",
-            quotas.jobs_a_day,
+        raise problems.QUOTA_EXCEEDED(
+            f"This key has submitted its {quotas.jobs_a_day:,} jobs of the day. Try again tomorrow (UTC).",
+            quota="jobs-a-day",
+            limit=quotas.jobs_a_day,
             retry_after=tomorrow,
         )
     if quotas.gpu_seconds_a_day is not None and seconds >= quotas.gpu_seconds_a_day:
-        raise QuotaError(
-            f"This key may use {quotas.gpu_seconds_a_day:,.0f} GPU seconds a day, and has used them. "
-            "Try again tomorrow (UTC).",
-            "gpu-seconds-a-day",
-            quotas.gpu_seconds_a_day,
+        raise problems.QUOTA_EXCEEDED(
+            f"This key has used its {quotas.gpu_seconds_a_day:,.0f} GPU seconds of the day. Try again tomorrow (UTC).",
+            quota="gpu-seconds-a-day",
+            limit=quotas.gpu_seconds_a_day,
             retry_after=tomorrow,
         )
 
@@ -139,11 +138,11 @@ def check_bytes(session: Session, owner: str, quotas: Quotas) -> None:
     """Check an owner's stored bytes against the quota, in the transaction that has added to them.
 
     Raises:
-        QuotaError: If the quota is exceeded; the caller must roll back the transaction.
+        QUOTA_EXCEEDED: If the quota is exceeded; the caller must roll back the transaction.
     """
     limit = quotas.stored_bytes
     if limit is not None and (used := stored_bytes(session, owner)) > limit:
-        raise BytesQuotaError(used, limit)
+        raise problems.STORED_BYTES_EXCEEDED(used=used, limit=limit, quota="stored-bytes")
 
 
 def stored_bytes(session: Session, owner: str) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import delete, func, select
 
-from service.errors import NoShareError, ShareError, TooManySharesError
+from service import problems
 from service.store.changes import job_of_owner
 from service.store.clocks import expiry_time
 from service.store.database import Database, new_id
@@ -45,19 +45,19 @@ class Shares:
 
         Raises:
             NoJobError: If there is no such job or it belongs to another owner.
-            ShareError: If the job has no result.
-            TooManySharesError: If the job has `MOST_SHARES` shares.
+            NO_RESULT: If the job has no result.
+            TOO_MANY_SHARES: If the job has `MOST_SHARES` shares.
         """
         now = self._database.clock()
         with self._database.writing() as session:
             job = job_of_owner(session, job_id, owner, lock=True)  # which a deletion then waits for
             if job.status != JobStatus.SUCCEEDED:
-                raise ShareError(job.status)
+                raise problems.NO_RESULT(job_status=job.status)
             of_job = ShareRow.job_id == job_id
             session.execute(delete(ShareRow).where(of_job, ShareRow.expires_at <= expiry_time(session, now)))
             valid = select(func.count()).select_from(ShareRow).where(of_job, ShareRow.expires_at > now)
             if (session.scalar(valid) or 0) >= MOST_SHARES:
-                raise TooManySharesError(MOST_SHARES)
+                raise problems.TOO_MANY_SHARES(limit=MOST_SHARES)
             row = ShareRow(id=new_id("shr", now), job_id=job_id, created_at=now, expires_at=now + seconds)
             token = f"{row.id}.{secrets.token_urlsafe(32)}"
             row.sha256 = digest(token)
@@ -80,7 +80,7 @@ class Shares:
         with self._database.writing() as session:
             row = session.get(ShareRow, share_id, with_for_update=True)
             if row is None or row.job_id != job_id:
-                raise NoShareError
+                raise problems.NO_SHARE()
             session.delete(row)
 
     def find(self, token: str) -> Shared:
@@ -92,15 +92,15 @@ class Shares:
         """
         match = _TOKEN.fullmatch(token)
         if match is None:
-            raise NoShareError
+            raise problems.NO_SHARE()
         with self._database.reading() as session:
             row = session.get(ShareRow, match[1])
             # compared in constant time, so that the time of the answer tells nothing about the digest
             if row is None or not hmac.compare_digest(row.sha256, digest(token)):
-                raise NoShareError
+                raise problems.NO_SHARE()
             job = session.get_one(JobRow, row.job_id)  # both are of one snapshot
             key = session.get(KeyRow, job.owner)
             revoked = key is not None and key.revoked_at is not None
             if row.expires_at <= self._database.clock() or job.status != JobStatus.SUCCEEDED or revoked:
-                raise NoShareError
+                raise problems.NO_SHARE()
             return Shared(row, job)

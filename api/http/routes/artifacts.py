@@ -12,37 +12,23 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.context import Caller, CallerDep, Context, ContextDep
-from api.http.documentation import Responses, invalid, links, problems
+from api.http.documentation import Responses, links
 from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import ArtifactList, ArtifactView, artifact_view
 from api.http.sending import (
-    ChangedError,
     ConditionsDep,
-    JustRemovedError,
-    RangeError,
     SentFile,
     file_answers,
     send_file,
     send_list,
 )
-from service.errors import (
-    BusyError,
-    BytesQuotaError,
-    DamagedFileError,
-    InspectionLimitError,
-    LostFileError,
-    NoArtifactError,
-    NoJobError,
-    NoSpaceError,
-    RefusedInputError,
-    StoreError,
-)
+from service import problems
+from service.errors import LostFileError
 from service.files.artifacts import media_type
 from service.files.staging import RESULT
 from service.store.tables import ArtifactRow, JobRow
-from sgsst_core.errors import OutputError
-from sgsst_core.files.formats import EXTRA_FORMATS, RESULT_FORMATS, ResultName, by_name, listed, result_name
+from sgsst_core.files.formats import EXTRA_FORMATS, ResultName, by_name, listed, result_name
 from sgsst_core.files.formats.ply import PLY
 
 router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
@@ -63,7 +49,6 @@ _SANDBOX = (
                 "get_artifact", "head_artifact", job_id="$request.path.job_id", name="$response.body#/artifacts/0/name"
             )
         },
-        **problems(NoJobError, invalid("query.limit", "Input should be less than or equal to 1000")),
     },
     operation_id="list_artifacts",
 )
@@ -100,23 +85,6 @@ _CONTENT = {
 }
 _ANSWERS: Responses = {
     **file_answers(_CONTENT),
-    **problems(
-        NoArtifactError,
-        RangeError,
-        ChangedError,
-        invalid("query.format", f"Input should be {listed([repr(each.name) for each in RESULT_FORMATS])}"),
-        RefusedInputError(
-            "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",
-            OutputError.code,
-        ),
-        InspectionLimitError("Compressing the result takes more time or memory than allowed."),
-        BytesQuotaError,
-        BusyError,
-        NoSpaceError,
-        StoreError,
-        LostFileError,
-        DamagedFileError,
-    ),
 }
 
 
@@ -172,11 +140,11 @@ async def _find_artifact(
     """Return the database row of a published file, or of the result in another format."""
     if format_ is not None and format_ != PLY.name:
         if name != RESULT:
-            raise RefusedInputError(f"Only {RESULT} has other formats. Omit 'format'.", "invalid-request")
+            raise problems.INVALID_REQUEST(f"Only {RESULT} has other formats. Omit 'format'.")
         return await context.derived.compressed(job, by_name(format_), caller.quotas)
     row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
     if row is None:
-        raise NoArtifactError(job.id, name[:80])
+        raise problems.NO_ARTIFACT(job_id=job.id, name=name[:80])
     return row
 
 
@@ -185,14 +153,14 @@ def check_artifact(context: Context, row: ArtifactRow) -> None:
 
     Raises:
         LostFileError, DamagedFileError: If the file is missing or damaged.
-        JustRemovedError: If the file has just been replaced by another one, or its job has been deleted.
+        NotFoundError: If the file has just been replaced by another one, or its job has been deleted.
     """
     try:
         context.artifacts.check(row.location, row.sha256)
     except LostFileError:
         now = context.store.jobs.artifact(row.job_id, row.name)
         if now is None or now.location != row.location:
-            raise JustRemovedError from None
+            raise problems.FILE_REMOVED() from None
         raise
 
 

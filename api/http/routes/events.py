@@ -10,10 +10,9 @@ from fastapi import APIRouter, Header, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.context import CallerDep, ContextDep
-from api.http.documentation import headers, invalid, problems
+from api.http.documentation import headers
 from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
-from service.errors import NoJobError
 from service.examples import SHA256
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -63,10 +62,6 @@ _EXAMPLES = {
             },
         },
         204: {"description": "The job has ended, and `Last-Event-ID` was its last event: do not reconnect."},
-        **problems(
-            NoJobError,
-            invalid("header.Last-Event-ID", "Input should be greater than or equal to 0"),
-        ),
     },
 )
 async def watch_job(

@@ -11,23 +11,20 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.context import Caller, CallerDep, Context, ContextDep
-from api.http.documentation import Responses, invalid, links, problems
+from api.http.documentation import Responses, links
 from api.http.input_references import find_input
 from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import InputFileView, InputList, input_views
 from api.http.sending import (
-    ChangedError,
     ConditionsDep,
-    JustRemovedError,
-    RangeError,
     SentFile,
     file_answers,
     send_file,
     send_list,
 )
-from service.errors import DamagedFileError, LostFileError, NoJobError, NotFoundError, StoreError
-from service.examples import JOB_ID
+from service import problems
+from service.errors import LostFileError
 from service.files.blobs import BLOBS
 from service.store.tables import BlobRow
 
@@ -45,15 +42,6 @@ _KINDS = {
 _POLICY = "sandbox; default-src 'none'"
 
 
-class NoInputError(NotFoundError):
-    """An input that a job does not have, or has released when it expired."""
-
-    example = (JOB_ID, "style:1")
-
-    def __init__(self, job_id: str, role: str) -> None:
-        super().__init__(f"Job {job_id} has no input {role!r} (any more). Its list of inputs has all there are.")
-
-
 _CONTENT: dict[str, Any] = {
     "application/octet-stream": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
     "application/json": [{"id": 0, "img_name": "view_0", "width": 64, "height": 48}],
@@ -63,14 +51,6 @@ _CONTENT: dict[str, Any] = {
 }
 _ANSWERS: Responses = {
     **file_answers(_CONTENT, always_policy=True),
-    **problems(
-        NoInputError,
-        RangeError,
-        ChangedError,
-        StoreError,
-        LostFileError,
-        DamagedFileError,
-    ),
 }
 
 
@@ -83,7 +63,6 @@ _ANSWERS: Responses = {
                 "get_input", "head_input", job_id="$request.path.job_id", role="$response.body#/inputs/0/role"
             )
         },
-        **problems(NoJobError, invalid("query.limit", "Input should be less than or equal to 1000")),
     },
     operation_id="list_inputs",
 )
@@ -143,13 +122,13 @@ def check_input(context: Context, row: BlobRow) -> None:
 
     Raises:
         LostFileError, DamagedFileError: If the file is missing or damaged.
-        JustRemovedError: If the file has just been deleted with its job.
+        NotFoundError: If the file has just been deleted with its job.
     """
     try:
         context.blobs.objects.check_once(f"{BLOBS}/{row.location}", row.sha256)
     except LostFileError:
         if not context.store.inputs.blobs([row.sha256]):
-            raise JustRemovedError from None
+            raise problems.FILE_REMOVED() from None
         raise
 
 
@@ -157,7 +136,7 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
     """Return the job's entry for an input file, and the database row of its blob.
 
     Raises:
-        NoInputError: If the job has no such input, or has expired and released its inputs.
+        NO_INPUT: If the job has no such input, or has expired and released its inputs.
     """
     job = find(context, caller, job_id)
     entry = find_input(context.store.jobs, job, role)
@@ -165,4 +144,4 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
         row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
         if row is not None:
             return entry, row
-    raise NoInputError(job.id, role[:40])
+    raise problems.NO_INPUT(job_id=job.id, name=role[:40])

@@ -11,21 +11,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 
 from api.http.addresses import address
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
-from api.http.documentation import headers, invalid, links, problems
+from api.http.documentation import headers, links
 from api.http.fetching import file_name, is_url
 from api.http.input_references import parse_input, parse_reference, uploaded_name
 from api.http.multipart import (
     MAX_TEXT,
-    BodyTypeError,
-    NotUtf8Error,
     Received,
-    TooSlowError,
     check_file,
-    check_media_type,
+    json_body,
     media_type,
     most_files,
     parse_json,
@@ -50,24 +47,10 @@ from api.http.schemas import (
     progress_history,
 )
 from api.http.sending import IfNoneMatch, names_etag, send_list
-from api.http.submission import BODY, REFUSALS, JobFromUploads
+from api.http.submission import BODY, JobFromUploads
+from service import problems
 from service.deadlines import suspended
-from service.errors import (
-    CancelError,
-    DamagedWeightsError,
-    DeleteError,
-    FinishError,
-    NoJobError,
-    QueueFullError,
-    QuotaError,
-    RefusedInputError,
-    RetryError,
-    TooLargeError,
-    TooManyFilesError,
-    UnfinishedUploadError,
-    UnknownInputError,
-    UnknownUploadError,
-)
+from service.errors import NoJobError
 from service.examples import JOB_ID
 from service.files.staging import check_roles, default_job_name, staged_name
 from service.inspection.inspector import Show
@@ -81,8 +64,6 @@ from service.weights import check_weights
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 #: Maximum bytes of a JSON body. Such a body contains no files, only the ids of uploads.
 _MAX_JSON = 1 << 20
-#: Maximum bytes of the JSON body that changes a job.
-_MAX_CHANGE = 4096
 
 IdempotencyHeader = Annotated[
     str | None,
@@ -126,7 +107,6 @@ _FOLLOWING_OPERATIONS = (
             "headers": headers("Location", "Retry-After", maybe=("Idempotency-Replayed",)),
             "links": links(*_FOLLOWING_OPERATIONS, job_id="$response.body#/id"),
         },
-        **problems(*REFUSALS),
     },
     operation_id="create_job",
 )
@@ -255,7 +235,7 @@ async def _from_form(request: Request, context: Context, receipt: Receipt) -> Pa
     text = received.texts.get("parameters", "").strip() or "{}"
     values = parse_json(text, "parameters")
     if not isinstance(values, dict):
-        raise RefusedInputError("parameters: is not a JSON object.", "invalid-request", input="parameters")
+        raise problems.INVALID_REQUEST("parameters: is not a JSON object.", input="parameters")
     parameters = JobParameters.model_validate(values)
     parameters.settings()
     return received, parameters, received.texts.get("webhook", "").strip() or None
@@ -265,12 +245,12 @@ async def _from_json(request: Request, context: Context) -> Parts:
     job = JobFromUploads.model_validate(await read_json(request, context.settings, _MAX_JSON))
     job.parameters.settings()
     if len(job.parameters.model_dump_json(exclude_unset=True)) > MAX_TEXT:
-        raise RefusedInputError(f"parameters: has more than {MAX_TEXT} bytes.", "invalid-request", input="parameters")
+        raise problems.INVALID_REQUEST(f"parameters: has more than {MAX_TEXT} bytes.", input="parameters")
     styles = [job.style] if isinstance(job.style, str) else job.style
     named = [("scene", job.scene), *(("style", each) for each in styles)]
     named += [(role, each) for role in ("cameras", "photos", "mask") for each in getattr(job, role)]
     if len(named) > (most := most_files(context.settings)):
-        raise TooManyFilesError(most, "files")
+        raise problems.TOO_MANY_FILES(limit=most, what="files")
     uploads = [(index, *each) for index, each in enumerate(named)]
     return Received(uploads=uploads), job.parameters, job.webhook
 
@@ -299,7 +279,7 @@ def _resolve_inputs(
             continue
         upload = uploads.get(text)
         if upload is None:
-            raise UnknownUploadError(text, role)
+            raise problems.UNKNOWN_UPLOAD(upload_id=text[:60], input=role)
         resolved.append((uploaded_name(upload.metadata_header), _upload_digest(context, upload, role)))
     digests = {sha256 for _, sha256 in resolved} | {entry["sha256"] for entry in inputs}
     rows = context.store.inputs.hold(sorted(filter(None, digests)))
@@ -320,18 +300,18 @@ def _referred_input(
         jobs: Inputs of jobs that were read for other references, to which this one's are added.
 
     Raises:
-        UnknownInputError: If the input does not exist, or was released.
+        UNKNOWN_INPUT: If the input does not exist, or was released.
     """
     try:
         if job_id not in jobs:
             released = find(context, caller, job_id).status == JobStatus.EXPIRED
             jobs[job_id] = [] if released else context.store.jobs.inputs(job_id)
     except NoJobError:
-        raise UnknownInputError(job_id, name, role) from None
+        raise problems.UNKNOWN_INPUT(job_id=job_id, name=name, input=role) from None
     place = parse_input(name)
     entries = [entry for entry in jobs[job_id] if place and entry["role"] == place[0]]
     if place is None or place[1] >= len(entries):
-        raise UnknownInputError(job_id, name, role)
+        raise problems.UNKNOWN_INPUT(job_id=job_id, name=name, input=role)
     return entries[place[1]]
 
 
@@ -341,7 +321,7 @@ def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
     if sha256 is None and upload.offset == upload.length:  # the service died before it recorded the upload as complete
         sha256 = context.blobs.finish_upload(upload, context.settings.upload_hours * 3600)
     if sha256 is None:
-        raise UnfinishedUploadError(upload.id, upload.offset, upload.length, role)
+        raise problems.UNFINISHED_UPLOAD(upload_id=upload.id, offset=upload.offset, length=upload.length, input=role)
     return sha256
 
 
@@ -361,7 +341,6 @@ def _idempotency(
     response_model=JobPage,
     responses={
         200: {"links": links(*_FOLLOWING_OPERATIONS, job_id="$response.body#/jobs/0/id")},
-        **problems(invalid("query.limit", "Input should be less than or equal to 200")),
     },
     operation_id="list_jobs",
 )
@@ -393,7 +372,6 @@ async def list_jobs(
     responses={
         200: {"headers": _SHOWN, "links": links(*_FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
         304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
-        **problems(NoJobError),
     },
     operation_id="get_job",
 )
@@ -411,29 +389,18 @@ def get_job(
 @router.patch(
     "/{job_id}",
     response_model=JobDetail,
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/JobChange"}}},
-        }
-    },
     responses={
         200: {"headers": _SHOWN, "links": links(*_FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
-        **problems(
-            NoJobError,
-            invalid("name", "String should have at most 200 characters"),
-            BodyTypeError("application/json"),
-            TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", _MAX_CHANGE),
-            NotUtf8Error,
-            TooSlowError,
-        ),
     },
     operation_id="change_job",
 )
-async def change_job(request: Request, job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+async def change_job(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    change: Annotated[JobChange, Depends(json_body(JobChange))],
+) -> Response:
     """Rename a job, whatever its status."""
-    check_media_type(request, "application/json")
-    change = JobChange.model_validate(await read_json(request, context.settings, _MAX_CHANGE))
     return await asyncio.to_thread(_rename, context, caller, job_id, change.name)
 
 
@@ -448,7 +415,6 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Respons
 @router.get(
     "/{job_id}/progress",
     response_model=ProgressHistory,
-    responses=problems(NoJobError),
     operation_id="get_progress",
 )
 def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
@@ -464,7 +430,6 @@ def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> Progr
             "headers": _SHOWN,
             "links": links("get_job", "cancel_job", "watch_job", "list_artifacts", job_id="$response.body#/id"),
         },
-        **problems(NoJobError, FinishError),
     },
     operation_id="finish_job",
 )
@@ -483,7 +448,6 @@ def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
             "headers": _SHOWN,
             "links": links("get_job", "retry_job", "delete_job", "watch_job", job_id="$response.body#/id"),
         },
-        **problems(NoJobError, CancelError),
     },
     operation_id="cancel_job",
 )
@@ -504,18 +468,6 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
             "headers": _SHOWN,
             "links": links("get_job", "cancel_job", "list_artifacts", job_id="$response.body#/id"),
         },
-        **problems(
-            NoJobError,
-            RetryError,
-            QueueFullError,
-            QuotaError,
-            RefusedInputError(
-                "Setting sharpness = 3: Extra inputs are not permitted. The job was stored by an earlier version "
-                "that accepted this. Submit a new job without it.",
-                "invalid-settings",
-            ),
-            DamagedWeightsError,
-        ),
     },
     operation_id="retry_job",
 )
@@ -532,7 +484,6 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
     status_code=204,
     responses={
         204: {"description": "The job and its results are deleted."},
-        **problems(NoJobError, DeleteError),
     },
     operation_id="delete_job",
 )
@@ -561,7 +512,7 @@ def find(context: Context, caller: Caller, job_id: str) -> JobRow:
 def check_id(job_id: str) -> None:
     """Raise NoJobError if a text cannot be a job's id."""
     if not is_id(job_id):
-        raise NoJobError(job_id[:60])
+        raise problems.NO_JOB(job_id=job_id[:60])
 
 
 def _job_response(

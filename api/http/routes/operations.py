@@ -6,13 +6,13 @@ from fastapi import APIRouter, Response
 from fastapi.responses import JSONResponse, PlainTextResponse
 
 from api.http.context import ContextDep
-from api.http.documentation import headers, problems
+from api.http.documentation import headers
 from api.http.schemas import Health
 
 router = APIRouter(tags=["operations"])
 
 
-@router.get("/livez", response_model=Health, responses=problems(key=False), operation_id="livez")
+@router.get("/livez", response_model=Health, operation_id="livez")
 async def livez() -> Health:
     """Check that the process answers. If it does not, restart it."""
     return Health(status="ok", checks={})
@@ -42,7 +42,6 @@ async def livez() -> Health:
                 }
             },
         },
-        **problems(key=False),
     },
 )
 async def readyz(context: ContextDep) -> Response:
@@ -77,7 +76,6 @@ async def readyz(context: ContextDep) -> Response:
             "description": "Metrics in the Prometheus text format.",
             "content": {"text/plain": {"example": 'sgsst_jobs{status="queued"} 3.0\n'}},
         },
-        **problems(key=False),
     },
     operation_id="metrics",
 )

@@ -3,68 +3,53 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Annotated
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 
 from api.http.addresses import subpath
 from api.http.context import (
     SESSION_COOKIE,
     Context,
     ContextDep,
-    CrossOriginError,
-    UnknownKeyError,
     check_origin,
 )
-from api.http.documentation import headers, invalid, problems
-from api.http.multipart import BodyTypeError, NotUtf8Error, TooSlowError, check_media_type, read_json
+from api.http.documentation import headers, raises
+from api.http.multipart import json_body
 from api.http.schemas import SessionView, SignIn
-from api.http.sign_ins import TooManyTriesError
-from service.errors import ServiceError, TooLargeError
+from service import problems
+from service.errors import ServiceError
 
 router = APIRouter(prefix="/v1/session", tags=["session"])
 
-#: Maximum bytes of a body, which holds only a key.
-_MAX_BODY = 4096
+
+@raises(problems.CROSS_ORIGIN)
+async def check_page(request: Request) -> None:
+    """Raise an error if a request comes from a page of another origin."""
+    check_origin(request, required=False)
 
 
 @router.post(
     "",
+    dependencies=[Depends(check_page)],
     status_code=204,
     response_class=Response,
     operation_id="sign_in",
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/SignIn"}}},
-        }
-    },
     responses={
         204: {
             "description": "Signed in; the cookie is the session.",
             "headers": headers("Set-Cookie", "Cache-Control"),
         },
-        **problems(
-            UnknownKeyError,
-            CrossOriginError,
-            TooManyTriesError,
-            invalid("key", "Field required"),
-            BodyTypeError("application/json"),
-            TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", _MAX_BODY),
-            NotUtf8Error,
-            TooSlowError,
-            key=False,
-        ),
     },
 )
-async def sign_in(request: Request, context: ContextDep) -> Response:
+async def sign_in(
+    request: Request, context: ContextDep, sign_in: Annotated[SignIn, Depends(json_body(SignIn))]
+) -> Response:
     """Sign in: exchange an API key for a session cookie.
 
     The cookie is HttpOnly, and browsers send it only from pages of this site. A session ends after some days
     (`SGSST_SESSION_DAYS`), with `DELETE`, or when its key is revoked.
     """
-    check_origin(request, required=False)
-    check_media_type(request, "application/json")
-    sign_in = SignIn.model_validate(await read_json(request, context.settings, _MAX_BODY))
     address = request.client.host if request.client else ""
     context.sign_ins.attempt(address)
     try:
@@ -73,14 +58,14 @@ async def sign_in(request: Request, context: ContextDep) -> Response:
         context.sign_ins.withdraw(address)
         raise
     if key is None:
-        raise UnknownKeyError
+        raise problems.UNKNOWN_KEY()
     context.sign_ins.succeeded(address)
     await _end(request, context)
     text = await asyncio.to_thread(context.store.sessions.create, key.id)
     return _answer(request, text, int(context.store.sessions.seconds))
 
 
-@router.get("", response_model=SessionView, operation_id="get_session", responses=problems(key=False))
+@router.get("", response_model=SessionView, operation_id="get_session")
 async def get_session(request: Request, context: ContextDep, response: Response) -> SessionView:
     """Get whether a key is required, and whether this browser has a session."""
     response.headers["Cache-Control"] = "no-store"
@@ -96,7 +81,6 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     operation_id="sign_out",
     responses={
         204: {"description": "The session has ended.", "headers": headers("Set-Cookie", "Cache-Control")},
-        **problems(CrossOriginError, key=False),
     },
 )
 async def sign_out(request: Request, context: ContextDep) -> Response:

@@ -10,27 +10,17 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.addresses import address
-from api.http.context import CallerDep, Context, ContextDep, ForeignSiteError, check_site, is_id
-from api.http.documentation import Responses, headers, invalid, links, problems
+from api.http.context import CallerDep, Context, ContextDep, check_site, is_id
+from api.http.documentation import Responses, headers, links, raises
 from api.http.input_references import find_input
-from api.http.multipart import BodyTypeError, NotUtf8Error, TooSlowError, check_media_type, read_json
+from api.http.multipart import json_body
 from api.http.routes.artifacts import check_artifact
 from api.http.routes.inputs import check_input
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import SHARED_RESULTS, NewShare, ShareCreated, SharedView, ShareList, ShareView, shared_view
-from api.http.sending import ChangedError, ConditionsDep, RangeError, SentFile, file_answers, send_file
-from service.errors import (
-    DamagedFileError,
-    LostFileError,
-    NoJobError,
-    NoSharedFileError,
-    NoShareError,
-    RateLimitError,
-    ShareError,
-    StoreError,
-    TooLargeError,
-    TooManySharesError,
-)
+from api.http.sending import ConditionsDep, SentFile, file_answers, send_file
+from service import problems
+from service.errors import NoJobError, NoShareError
 from service.examples import SHARE_ID, SHARE_TOKEN
 from service.store.jobs import ShownJob
 from service.store.quotas import Quotas
@@ -38,8 +28,6 @@ from service.store.shares import Shared
 
 router = APIRouter(tags=["shares"])
 
-#: Maximum bytes of the JSON body that creates a share.
-_MAX_BODY = 4096
 _DAY = 86_400.0
 #: Content-Security-Policy of shared files.
 _POLICY = "sandbox; default-src 'none'"
@@ -49,12 +37,13 @@ _SECRET = {"Referrer-Policy": "no-referrer", "Cache-Control": "no-store"}
 ShareToken = Annotated[str, Path(description="Token of a share.", max_length=120, examples=[SHARE_TOKEN])]
 
 
+@raises(problems.NO_SHARE, problems.RATE_LIMITED, problems.FOREIGN_SITE)
 async def get_shared(request: Request, context: ContextDep, token: ShareToken) -> Shared:
     """Return the share that a request names by its token, instead of a caller.
 
     Raises:
-        ForeignSiteError: If the service requires no keys, and the request does not come from this machine's pages.
-        RateLimitError: If requests of one share, or with wrong tokens from one address, arrive too fast.
+        FOREIGN_SITE: If the service requires no keys, and the request does not come from this machine's pages.
+        RATE_LIMITED: If requests of one share, or with wrong tokens from one address, arrive too fast.
         NoShareError: If the token is not valid.
     """
     if not context.settings.keys_required:
@@ -76,40 +65,24 @@ SharedDep = Annotated[Shared, Depends(get_shared)]
     "/v1/jobs/{job_id}/shares",
     status_code=201,
     response_model=ShareCreated,
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/NewShare"}}},
-        }
-    },
     responses={
         201: {
             "description": "The link. Its token is not shown again.",
             "headers": headers("Cache-Control"),
             "links": links("revoke_share", job_id="$request.path.job_id", share_id="$response.body#/id"),
         },
-        **problems(
-            NoJobError,
-            ShareError,
-            TooManySharesError,
-            invalid("days", "Input should be less than or equal to 90"),
-            BodyTypeError("application/json"),
-            TooLargeError("The request has more than 4,096 bytes. JSON only names uploads, or a key.", _MAX_BODY),
-            NotUtf8Error,
-            TooSlowError,
-        ),
     },
     operation_id="create_share",
 )
-async def create_share(request: Request, job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+async def create_share(
+    job_id: JobId, context: ContextDep, caller: CallerDep, new: Annotated[NewShare, Depends(json_body(NewShare))]
+) -> Response:
     """Create a read-only link to the result of a job, for people without a key.
 
     Whoever has the link sees the scene before and after in 3D, and nothing else, until it expires or is revoked. The
     link also ends with the results of the job, and if the key that created the job is revoked.
     """
     await asyncio.to_thread(find, context, caller, job_id)
-    check_media_type(request, "application/json")
-    new = NewShare.model_validate(await read_json(request, context.settings, _MAX_BODY))
     row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
     url = address(f"/shared#{token}")
     view = ShareCreated(id=row.id, created_at=row.created_at, expires_at=row.expires_at, url=url)
@@ -120,7 +93,6 @@ async def create_share(request: Request, job_id: JobId, context: ContextDep, cal
 @router.get(
     "/v1/jobs/{job_id}/shares",
     response_model=ShareList,
-    responses=problems(NoJobError),
     operation_id="list_shares",
 )
 def list_shares(job_id: JobId, context: ContextDep, caller: CallerDep) -> ShareList:
@@ -135,7 +107,9 @@ def list_shares(job_id: JobId, context: ContextDep, caller: CallerDep) -> ShareL
 @router.delete(
     "/v1/jobs/{job_id}/shares/{share_id}",
     status_code=204,
-    responses={204: {"description": "The link no longer works."}, **problems(NoJobError, NoShareError)},
+    responses={
+        204: {"description": "The link no longer works."},
+    },
     operation_id="revoke_share",
 )
 def revoke_share(
@@ -147,7 +121,7 @@ def revoke_share(
     """Revoke a link to the result of a job."""
     find(context, caller, job_id)
     if not is_id(share_id):
-        raise NoShareError
+        raise problems.NO_SHARE()
     context.store.shares.revoke(job_id, share_id)
 
 
@@ -156,13 +130,6 @@ def revoke_share(
     response_model=SharedView,
     responses={
         200: {"headers": headers("Cache-Control", "Referrer-Policy")},
-        **problems(
-            NoShareError,
-            RateLimitError,
-            ForeignSiteError,
-            invalid("path.token", "String should have at most 120 characters"),
-            key=False,
-        ),
     },
     operation_id="get_shared",
 )
@@ -183,26 +150,13 @@ def _find_shown(context: Context, shared: Shared) -> tuple[ShownJob, list[str]]:
     try:
         return jobs.detail(job_id, None)[0], [name for name in SHARED_RESULTS if jobs.artifact(job_id, name)]
     except NoJobError:
-        raise NoShareError from None
+        raise problems.NO_SHARE() from None
 
 
 #: Files that a share gives access to: the scene and its cameras as they were sent, and the result.
 _NAMES = r"^(scene|cameras:[0-7]|colors\.f16|stylized\.ply)$"
 _ANSWERS: Responses = {
     **file_answers({"application/octet-stream": "ply\nformat binary_little_endian 1.0\n"}, always_policy=True),
-    **problems(
-        NoShareError,
-        NoSharedFileError,
-        RangeError,
-        ChangedError,
-        RateLimitError,
-        ForeignSiteError,
-        StoreError,
-        LostFileError,
-        DamagedFileError,
-        invalid("path.name", f"String should match pattern '{_NAMES}'"),
-        key=False,
-    ),
 }
 
 
@@ -235,20 +189,20 @@ def _find_file(context: Context, shared: Shared, name: str) -> SentFile:
     """Return the shared file with this name.
 
     Raises:
-        NoSharedFileError: If the job has no such file, such as `colors.f16` after Gaussians were split.
+        NO_SHARED_FILE: If the job has no such file, such as `colors.f16` after Gaussians were split.
     """
     check: partial[None]
     entry = find_input(context.store.jobs, shared.job, name)
     if entry is not None:
         blob = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
         if blob is None:
-            raise NoSharedFileError(name)
+            raise problems.NO_SHARED_FILE(name=name)
         check, read = partial(check_input, context, blob), partial(context.blobs.read, blob)
         sha256, size = blob.sha256, blob.size
     else:
         row = context.store.jobs.artifact(shared.job.id, name)
         if row is None:
-            raise NoSharedFileError(name)
+            raise problems.NO_SHARED_FILE(name=name)
         check, read = partial(check_artifact, context, row), partial(context.artifacts.read, row.location)
         sha256, size = row.sha256, row.size
     values: dict[str, Any] = {"kind": "application/octet-stream", "inline": False, "policy": _POLICY}

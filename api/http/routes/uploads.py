@@ -7,33 +7,20 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from functools import partial
-from types import MappingProxyType
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Request, Response
 
 from api.http.addresses import address
 from api.http.context import CallerDep, Context, ContextDep, is_id
-from api.http.documentation import headers, invalid, links, problems
+from api.http.documentation import headers, links, raises
 from api.http.input_references import uploaded_name
-from api.http.multipart import BadRequestError, BodyTypeError, TooSlowError, body_blocks, check_media_type, media_type
+from api.http.multipart import body_blocks, check_media_type, media_type
 from api.http.numbers import Digits
-from api.http.receiving import ALGORITHMS, ChecksumError, LongerThanDeclaredError, append_body, parse_checksum
+from api.http.receiving import ALGORITHMS, append_body, longer_than_declared, parse_checksum
 from api.http.routes.jobs import IdempotencyHeader
 from api.http.schemas import UploadView, upload_view
-from service.errors import (
-    BytesQuotaError,
-    ConflictError,
-    FileTooLargeError,
-    IdempotencyError,
-    LockedError,
-    NoSpaceError,
-    NoUploadError,
-    OffsetError,
-    ServiceError,
-    StoreError,
-    TooManyUploadsError,
-)
+from service import problems
 from service.examples import UPLOAD_ID
 from service.files.staging import staged_name
 from service.store.inputs import check_offset
@@ -52,34 +39,6 @@ _UNSUPPORTED = (
 #: Media type of a part of a file.
 _PART_TYPE = "application/offset+octet-stream"
 _HEADERS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
-
-
-class WrongVersionError(ServiceError):
-    """An unsupported version of the tus protocol."""
-
-    code, status = "unsupported-tus-version", 412
-    headers = MappingProxyType({"Tus-Version": VERSION})
-    example = ("0.2.2",)
-
-    def __init__(self, version: str) -> None:
-        wrong = f"{version[:20]!r} is not supported" if version else "is missing"
-        super().__init__(f"Tus-Resumable: {wrong}. Send {VERSION}.")
-
-
-class ExtensionError(ServiceError):
-    """A header of an extension of the tus protocol that is not supported."""
-
-    code, status = "unsupported-tus-extension", 400
-    example = ("Upload-Concat", "concatenation")
-
-    def __init__(self, header: str, extension: str) -> None:
-        super().__init__(f"{header}: the extension {extension!r} is not supported. Those supported are {EXTENSIONS}.")
-
-
-class EmptyFileError(BadRequestError):
-    """An upload of a file without content."""
-
-    message = "The file is empty. Give its size as Upload-Length."
 
 
 UploadId = Annotated[str, Path(description="ID of an upload.", examples=[UPLOAD_ID])]
@@ -102,23 +61,25 @@ OffsetHeader = Annotated[
 ]
 
 
+@raises(problems.TUS_VERSION, problems.TUS_EXTENSION)
 def check_protocol(request: Request, tus: Tus = "") -> None:
     """Refuse a request that does not state the protocol version, or uses an unsupported extension.
 
     tus requires the version for all methods except OPTIONS.
 
     Raises:
-        WrongVersionError: If the version is missing or not supported.
-        ExtensionError: If a header belongs to an unsupported extension. Ignoring it would store other bytes than meant.
+        TUS_VERSION: If the version is missing or not supported.
+        TUS_EXTENSION: If a header belongs to an unsupported extension. Ignoring it would store other bytes than meant.
     """
     if tus != VERSION:
-        raise WrongVersionError(tus)
+        reason = f"{tus[:20]!r} is not supported" if tus else "is missing"
+        raise problems.TUS_VERSION(reason=reason, version=VERSION)
     for header, value, extension in _UNSUPPORTED:
         if value in request.headers.get(header, "").lower() and header in request.headers:
-            raise ExtensionError(header, extension)
+            raise problems.TUS_EXTENSION(header=header, extension=extension, supported=EXTENSIONS)
     empty = request.headers.get("content-length", "0") == "0" and "transfer-encoding" not in request.headers
     if request.method == "POST" and media_type(request) == _PART_TYPE and not empty:
-        raise ExtensionError("Content-Type", "creation-with-upload")
+        raise problems.TUS_EXTENSION(header="Content-Type", extension="creation-with-upload", supported=EXTENSIONS)
 
 
 _REQUIRES_TUS = [Depends(check_protocol)]
@@ -140,7 +101,6 @@ def _following_operations(**parameters: str) -> dict[str, Any]:
                 "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Checksum-Algorithm", "Tus-Max-Size"
             ),
         },
-        **problems(key=False),
     },
     operation_id="describe_uploads",
 )
@@ -168,18 +128,6 @@ def describe_uploads(context: ContextDep) -> Response:
             "headers": headers("Location", "Tus-Resumable", "Upload-Expires", "Cache-Control"),
             "links": _following_operations(upload_id="$response.body#/id"),
         },
-        **problems(
-            EmptyFileError,
-            TooManyUploadsError,
-            WrongVersionError,
-            ExtensionError,
-            FileTooLargeError,
-            invalid("header.Upload-Length", "Field required"),
-            IdempotencyError,
-            BytesQuotaError,
-            NoSpaceError,
-            StoreError,
-        ),
     },
 )
 async def create_upload(
@@ -200,9 +148,9 @@ async def create_upload(
     """Start an upload. Send its bytes with PATCH to the `Location` of the answer."""
     limit = context.settings.max_upload_bytes
     if length > limit:
-        raise FileTooLargeError(length, limit)
+        raise problems.TOO_LARGE(f"The file has {length:,} bytes. At most {limit:,} are allowed.", limit=limit)
     if not length:
-        raise EmptyFileError
+        raise problems.MALFORMED_BODY("The file is empty. Give its size as Upload-Length.")
     name = staged_name("upload", uploaded_name(metadata))
     seconds = context.settings.upload_hours * 3600
     await context.threads.run(caller.owner, context.blobs.ensure_space, length)
@@ -226,7 +174,7 @@ async def create_upload(
     return Response(upload_view(row).model_dump_json(), 201, response_headers, "application/json")
 
 
-@router.get("/{upload_id}", response_model=UploadView, responses=problems(NoUploadError), operation_id="get_upload")
+@router.get("/{upload_id}", response_model=UploadView, operation_id="get_upload")
 def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> UploadView:
     """Get the state of an upload as JSON."""
     return upload_view(_find_upload(context, caller.owner, upload_id))
@@ -247,7 +195,6 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
                 maybe=("Upload-Metadata",),
             ),
         },
-        **problems(NoUploadError, WrongVersionError(""), ExtensionError),
     },
     operation_id="head_upload",
     response_class=Response,
@@ -288,21 +235,6 @@ _PATCH_BODY = {
             "description": "The part is stored; `Upload-Offset` is where the next part starts.",
             "headers": headers("Upload-Offset", "Upload-Expires", "Tus-Resumable", "Cache-Control"),
         },
-        **problems(
-            BadRequestError,
-            NoUploadError,
-            TooSlowError,
-            OffsetError,
-            WrongVersionError,
-            ExtensionError,
-            LongerThanDeclaredError,
-            BodyTypeError(_PART_TYPE),
-            invalid("header.Upload-Offset", "Field required"),
-            LockedError,
-            ChecksumError,
-            NoSpaceError,
-            StoreError,
-        ),
     },
     operation_id="append_upload",
     openapi_extra=_PATCH_BODY,
@@ -328,7 +260,7 @@ async def append_upload(
     expected = parse_checksum(checksum) if checksum else None
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     if row.sha256 is not None and offset != row.length:
-        raise ConflictError(f"The upload is complete with {row.length} bytes.", offset=row.length)
+        raise problems.CONFLICT(f"The upload is complete with {row.length} bytes.", offset=row.length)
     check_offset(row, offset)
     expires = row.expires_at
     if row.sha256 is None and row.offset == row.length:  # the service died before it recorded the upload as complete
@@ -338,7 +270,7 @@ async def append_upload(
         expires = await append_body(request, context, row, expected)
     else:
         async for _ in body_blocks(request, context.settings):
-            raise LongerThanDeclaredError(row.length)
+            raise longer_than_declared(row.length)
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     return Response(
         status_code=204,
@@ -352,7 +284,6 @@ async def append_upload(
     dependencies=_REQUIRES_TUS,
     responses={
         204: {"description": "The upload is deleted.", "headers": headers("Tus-Resumable", "Cache-Control")},
-        **problems(NoUploadError, WrongVersionError(""), ExtensionError),
     },
     operation_id="delete_upload",
 )
@@ -371,7 +302,7 @@ def _remove_files(context: Context, upload_id: str, unused: Sequence[str]) -> No
 
 def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
     if not is_id(upload_id):
-        raise NoUploadError(upload_id[:60])
+        raise problems.NO_UPLOAD(upload_id=upload_id[:60])
     return context.store.inputs.upload(upload_id, owner)
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterator
+from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import pytest
@@ -11,11 +14,13 @@ from openapi_spec_validator import validate
 
 from api.http.app import create_app
 from api.http.problems import MEDIA_TYPE
-from service.errors import LeaseLostError, ServiceError
+from service import problems
+from service.errors import ProblemType
 from service.settings import ServiceSettings
 from sgsst_core.files.formats import RESULT_FORMATS
 
 DOCUMENT: dict[str, Any] = create_app(ServiceSettings()).openapi()
+PROBLEMS = {name: value for name, value in vars(problems).items() if isinstance(value, ProblemType)}
 SCHEMAS: dict[str, Any] = DOCUMENT["components"]["schemas"]
 OPERATIONS: list[tuple[str, dict[str, Any]]] = [
     (f"{method.upper()} {path}", operation)
@@ -109,12 +114,6 @@ def test_every_refusal_has_its_codes(label: str, operation: dict[str, Any]) -> N
         assert all(value["code"] == code and value["status"] == status for code, value in shown.items())
 
 
-def subclasses(kind: type[ServiceError]) -> Iterator[type[ServiceError]]:
-    for each in kind.__subclasses__():
-        yield each
-        yield from subclasses(each)
-
-
 def test_document_lists_every_error_code() -> None:
     """Errors of the service that reach a client are documented by at least one operation."""
     documented = {
@@ -124,8 +123,25 @@ def test_document_lists_every_error_code() -> None:
         if MEDIA_TYPE in answer.get("content", {})
         for code in answer["content"][MEDIA_TYPE]["examples"]
     }
-    internal = {LeaseLostError.code}
-    assert {kind.code for kind in subclasses(ServiceError)} - internal <= documented
+    assert {problem.code for problem in PROBLEMS.values() if problem is not problems.LEASE_LOST} <= documented
+
+
+def test_calls_of_problems_name_all_values_of_their_messages() -> None:
+    """A missing value would show only when the error occurs."""
+    called = set()
+    for file in (file for package in ("api", "service") for file in Path(package).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            name = ast.unparse(node.func).partition("problems.")[2] if isinstance(node, ast.Call) else ""
+            if not isinstance(node, ast.Call) or name not in PROBLEMS or any(key.arg is None for key in node.keywords):
+                continue
+            given, problem = {key.arg for key in node.keywords}, PROBLEMS[name]
+            fields = {field for text in problem.headers.values() for _, field, _, _ in Formatter().parse(text)}
+            if not node.args:
+                fields |= {field for _, field, _, _ in Formatter().parse(problem.message)}
+            assert fields - {None} <= given, f"{file}:{node.lineno}"
+            assert node.args or problem.message, f"{file}:{node.lineno}: no message"
+            called.add(name)
+    assert len(called) > 60
 
 
 def test_media_type_of_every_result_format_is_documented() -> None:

@@ -17,8 +17,9 @@ from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
 from api.http.deadline import Deadlines
+from service import problems
 from service.deadlines import suspended
-from service.errors import DeadlineError, StoreError
+from service.errors import StoreError
 from service.files.threads import FileThreads
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -163,7 +164,7 @@ def server() -> Iterator[str]:
 
 def test_deadline_is_of_a_request_without_progress(server: str) -> None:
     answer = httpx.get(f"{server}/hang")
-    assert (answer.status_code, answer.json()["code"]) == (503, DeadlineError.code)
+    assert (answer.status_code, answer.json()["code"]) == (503, problems.DEADLINE_EXCEEDED.code)
     assert int(answer.headers["retry-after"]) > 0
     assert httpx.get(f"{server}/works").json() == "done"
     assert httpx.get(f"{server}/stream?stall=false").text == "x" * 10

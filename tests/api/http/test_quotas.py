@@ -15,13 +15,15 @@ import httpx
 import pytest
 
 from api.http.rates import Rates
-from service.errors import RateLimitError
+from service import problems
+from service.errors import ServiceError
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.store.quotas import NO_QUOTAS, Quotas
 from tests.api.http.test_api import TUS, form, refused
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.postgres import fresh_database, is_installed, server
+from tests.raised import raises_problem
 from tests.small_scenes import wall, write_files
 
 
@@ -37,12 +39,12 @@ def test_average_rate_is_limited() -> None:
     rates = Rates(clock)
     for _ in range(20):
         rates.take("alice", 2.0)
-    with pytest.raises(RateLimitError) as caught:
+    with raises_problem(problems.RATE_LIMITED) as caught:
         rates.take("alice", 2.0)
     assert (caught.value.extra, caught.value.retry_after) == ({"limit": 2.0}, 1)
     rates.take("bob", 2.0)
     clock.now += 0.4
-    with pytest.raises(RateLimitError):
+    with raises_problem(problems.RATE_LIMITED):
         rates.take("alice", 2.0)
     clock.now += 0.11
     rates.take("alice", 2.0)
@@ -57,7 +59,7 @@ def test_request_after_retry_after_is_allowed(a_second: float) -> None:
     for _ in range(200):
         try:
             rates.take("alice", a_second)
-        except RateLimitError as error:
+        except ServiceError as error:
             clock.now += error.retry_after or 0
             rates.take("alice", a_second)
 

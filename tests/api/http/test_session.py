@@ -11,12 +11,14 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.http.sign_ins import MOST_FAILURES, WITHIN_SECONDS, SignIns, TooManyTriesError
+from api.http.sign_ins import MOST_FAILURES, WITHIN_SECONDS, SignIns
+from service import problems
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.keys import MOST_SESSIONS
 from tests.api.service import Service, check_documented
+from tests.raised import raises_problem
 
 COOKIE = "sgsst_session"
 
@@ -332,7 +334,7 @@ def test_sign_in_failures_expire() -> None:
     tries = SignIns(lambda: now)
     for _ in range(MOST_FAILURES):
         tries.attempt("a")
-    with pytest.raises(TooManyTriesError):
+    with raises_problem(problems.TOO_MANY_TRIES):
         tries.attempt("a")
     tries.attempt("b")
     now = WITHIN_SECONDS
@@ -351,7 +353,7 @@ def test_attempt_whose_key_was_not_looked_up_does_not_count() -> None:
         tries.attempt("a")
         tries.withdraw("a")
     tries.attempt("a")
-    with pytest.raises(TooManyTriesError):
+    with raises_problem(problems.TOO_MANY_TRIES):
         tries.attempt("a")
 
 

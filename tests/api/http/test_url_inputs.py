@@ -24,8 +24,8 @@ from api.client import Client
 from api.client.answers import RequestError
 from api.http.fetching import Fetcher, file_name
 from api.http.receipts import Receipts
-from service import outgoing
-from service.errors import BusyError, FetchError, InvalidUrlError, QuotaError, ServiceError, TooLargeError, UrlsOffError
+from service import outgoing, problems
+from service.errors import ServiceError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.stored_blobs import open_blobs
@@ -36,6 +36,7 @@ from service.store import Store, open_store
 from service.store.quotas import Quotas
 from tests.api.service import Service, check_documented
 from tests.http_servers import serve
+from tests.raised import raises_problem
 from tests.small_scenes import wall, write_files
 
 #: Time limit of a test's waits in seconds.
@@ -191,7 +192,7 @@ def test_file_is_stored_with_its_digest(stored: Stored, files: FileServer) -> No
 
 
 def test_nothing_is_fetched_by_default(stored: Stored, files: FileServer) -> None:
-    with pytest.raises(UrlsOffError):
+    with raises_problem(problems.URLS_OFF):
         fetch(stored, files.url("/a", sends(FILE)))
     assert files.requests == []
 
@@ -216,7 +217,7 @@ def test_nothing_is_fetched_by_default(stored: Stored, files: FileServer) -> Non
 )
 def test_only_allowed_hosts_are_contacted(url: str, stored: Stored, names: dict[str, list[str]]) -> None:
     """Names are compared as the client will look them up; `names` fails the test's lookup of any of them."""
-    with pytest.raises(InvalidUrlError) as caught:
+    with raises_problem(problems.INVALID_URL) as caught:
         fetch(stored, url, url_hosts="allowed.example, other.example")
     assert (caught.value.code, caught.value.extra["input"]) == ("invalid-url", "style")
     assert len(str(caught.value)) < 800
@@ -226,7 +227,7 @@ def test_only_allowed_hosts_are_contacted(url: str, stored: Stored, names: dict[
     "url", ["https://ALLOWED.example/a", "https://allowed.example:443/a", "HTTPS://allowed.example"]
 )
 def test_spellings_of_an_allowed_host(url: str, stored: Stored, names: dict[str, list[str]]) -> None:
-    with pytest.raises(FetchError, match=r"allowed\.example was looked up"):
+    with raises_problem(problems.URL_NOT_FETCHED, match=r"allowed\.example was looked up"):
         fetch(stored, url, url_hosts=" allowed.example ,")
 
 
@@ -272,7 +273,7 @@ def test_names_with_private_addresses_are_refused(
     addresses: list[str], stored: Stored, names: dict[str, list[str]]
 ) -> None:
     names["allowed.example"] = addresses
-    with pytest.raises(InvalidUrlError, match="not public") as caught:
+    with raises_problem(problems.INVALID_URL, match="not public") as caught:
         fetch(stored, "http://allowed.example/", url_hosts="http://allowed.example", url_private_addresses=False)
     assert not any(address in str(caught.value) for address in addresses)
 
@@ -331,7 +332,7 @@ def test_redirects_are_checked_like_urls(
     names["metadata.allowed"], names["rebound.allowed"] = [METADATA], [PUBLIC, "10.0.0.1"]
     url = files.url("/a", redirects(target))
     hosts = f"{files.origin}, http://metadata.allowed, http://rebound.allowed"
-    with pytest.raises(InvalidUrlError) as caught:
+    with raises_problem(problems.INVALID_URL) as caught:
         fetch(stored, url, url_hosts=hosts, url_private_addresses=False)
     assert str(caught.value).startswith(repr(url))
     assert len(files.requests) == 1
@@ -339,13 +340,13 @@ def test_redirects_are_checked_like_urls(
 
 @pytest.mark.parametrize("location", ["http://[::1", "http://a:99999999/", "/\x7f", "data:text/plain,x"])
 def test_invalid_redirects_are_refused(location: str, stored: Stored, files: FileServer) -> None:
-    with pytest.raises((FetchError, InvalidUrlError)):
+    with pytest.raises(ServiceError):
         fetch(stored, files.url("/a", redirects(location)), url_hosts=files.origin)
     assert len(files.requests) == 1
 
 
 def test_redirect_loops_end(stored: Stored, files: FileServer) -> None:
-    with pytest.raises(FetchError, match="redirects more than 5 times"):
+    with raises_problem(problems.URL_NOT_FETCHED, match="redirects more than 5 times"):
         fetch(stored, files.url("/a", redirects("/a")), url_hosts=files.origin)
     assert len(files.requests) == 6
 
@@ -355,7 +356,7 @@ def test_redirect_loops_end(stored: Stored, files: FileServer) -> None:
 
 def test_declared_size_is_checked_first(stored: Stored, files: FileServer) -> None:
     url = files.url("/a", sends(b"", Content_Length="1001"))
-    with pytest.raises(TooLargeError):
+    with raises_problem(problems.TOO_LARGE):
         fetch(stored, url, url_hosts=files.origin, url_bytes=1000)
 
 
@@ -371,7 +372,7 @@ def test_undeclared_size_is_limited(chunked: bool, stored: Stored, files: FileSe
         except OSError:
             cut_off.set()
 
-    with pytest.raises(TooLargeError):
+    with raises_problem(problems.TOO_LARGE):
         fetch(stored, files.url("/a", endless), url_hosts=files.origin, url_bytes=1_000_000)
     assert cut_off.wait(PATIENCE), f"{sent[0]:,} bytes were read"
 
@@ -379,7 +380,7 @@ def test_undeclared_size_is_limited(chunked: bool, stored: Stored, files: FileSe
 def test_size_limit_counts_all_files_of_a_request(stored: Stored, files: FileServer) -> None:
     urls = [files.url(f"/{index}", sends(FILE)) for index in range(3)]
     assert len(fetch(stored, *urls, url_hosts=files.origin, url_bytes=3 * len(FILE))) == 3
-    with pytest.raises(TooLargeError):
+    with raises_problem(problems.TOO_LARGE):
         fetch(stored, *urls, url_hosts=files.origin, url_bytes=3 * len(FILE) - 1)
 
 
@@ -387,12 +388,12 @@ def test_bytes_count_toward_the_quota(stored: Stored, files: FileServer) -> None
     """The second file exceeds the quota, with and without a declared size."""
     urls = [files.url("/a", sends(FILE, Content_Length=str(len(FILE)))), files.url("/b", sends(FILE + b"b"))]
     for order in (urls, urls[::-1]):
-        with pytest.raises(QuotaError):
+        with raises_problem(problems.QUOTA_EXCEEDED):
             fetch(stored, *order, url_hosts=files.origin, bytes_quota=2 * len(FILE))
 
 
 def test_missing_bytes_are_noticed(stored: Stored, files: FileServer) -> None:
-    with pytest.raises(FetchError):
+    with raises_problem(problems.URL_NOT_FETCHED):
         fetch(stored, files.url("/a", sends(FILE, Content_Length="10000000")), url_hosts=files.origin)
 
 
@@ -403,18 +404,18 @@ def test_bytes_beyond_the_declared_size_are_ignored(stored: Stored, files: FileS
 
 @pytest.mark.parametrize("length", ["-1", "x", "1_0", "7, 8", "9" * 5000, ""])
 def test_malformed_sizes_are_refused(length: str, stored: Stored, files: FileServer) -> None:
-    with pytest.raises((FetchError, TooLargeError)):
+    with pytest.raises(ServiceError):
         fetch(stored, files.url("/a", sends(FILE, Content_Length=length)), url_hosts=files.origin)
 
 
 @pytest.mark.parametrize("status", [204, 206, 304, 401, 404, 500])
 def test_other_answers_are_refused(status: int, stored: Stored, files: FileServer) -> None:
-    with pytest.raises(FetchError, match=f"answered {status}"):
+    with raises_problem(problems.URL_NOT_FETCHED, match=f"answered {status}"):
         fetch(stored, files.url("/a", sends(b"", status, Content_Length="0")), url_hosts=files.origin)
 
 
 def test_compressed_answers_are_refused(stored: Stored, files: FileServer) -> None:
-    with pytest.raises(FetchError, match="compresses"):
+    with raises_problem(problems.URL_NOT_FETCHED, match="compresses"):
         fetch(stored, files.url("/a", sends(FILE, Content_Encoding="gzip")), url_hosts=files.origin)
 
 
@@ -427,7 +428,7 @@ def test_unreachable_servers_are_reported(stored: Stored, names: dict[str, list[
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         origin = f"http://127.0.0.1:{closed.getsockname()[1]}"
-        with pytest.raises(FetchError):
+        with raises_problem(problems.URL_NOT_FETCHED):
             fetch(stored, f"{origin}/a", url_hosts=origin)
 
 
@@ -447,7 +448,9 @@ def test_slow_answers_are_cut_off_at_the_deadline(head: bytes, stored: Stored, f
         except OSError:
             cut_off.set()
 
-    with pytest.raises(FetchError, match="within 2 s"):  # long enough to send the request on a busy machine
+    with raises_problem(
+        problems.URL_NOT_FETCHED, match="within 2 s"
+    ):  # long enough to send the request on a busy machine
         fetch(stored, files.url("/a", drip), url_hosts=files.origin, url_seconds=2)
     assert cut_off.wait(PATIENCE)
 
@@ -460,7 +463,7 @@ def test_deadline_covers_all_files_and_redirects(stored: Stored, files: FileServ
         sends(FILE)(handler)
 
     urls = [files.url(f"/{index}", answer) for index in range(50)]
-    with pytest.raises(FetchError, match="within 1 s"):
+    with raises_problem(problems.URL_NOT_FETCHED, match="within 1 s"):
         fetch(stored, *urls, url_hosts=files.origin, url_seconds=1)
     assert len(files.requests) < 50
 
@@ -468,7 +471,7 @@ def test_deadline_covers_all_files_and_redirects(stored: Stored, files: FileServ
 def test_deadline_covers_lookups(stored: Stored, monkeypatch: pytest.MonkeyPatch) -> None:
     release = threading.Event()
     monkeypatch.setattr(socket, "getaddrinfo", lambda *arguments, **named: release.wait(PATIENCE) and [])
-    with pytest.raises(FetchError, match="within"):
+    with raises_problem(problems.URL_NOT_FETCHED, match="within"):
         fetch(stored, "https://allowed.example/", url_hosts="allowed.example", url_seconds=0.5)
     release.set()
 
@@ -476,7 +479,7 @@ def test_deadline_covers_lookups(stored: Stored, monkeypatch: pytest.MonkeyPatch
 def test_requests_of_one_owner_are_limited(stored: Stored, files: FileServer) -> None:
     release = threading.Event()
     url = files.url("/a", lambda handler: release.wait(PATIENCE))
-    with pytest.raises(BusyError):
+    with raises_problem(problems.BUSY):
         fetch(stored, url, requests=5, url_hosts=files.origin)
     release.set()
 

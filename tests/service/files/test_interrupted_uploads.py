@@ -14,12 +14,14 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.errors import LockedError, StoreError
+from service import problems
+from service.errors import StoreError
 from service.files.blobs import BlobFolder
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.store.inputs import Inputs
 from tests.api.service import Service
+from tests.raised import raises_problem
 from tests.small_scenes import wall, write_files
 
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -130,7 +132,7 @@ def test_upload_that_becomes_a_blob_is_locked(tmp_path: Path) -> None:
         blobs.start_upload(row.id)
         blobs.upload_path(row.id).chmod(0o400)
         inputs.advance_upload(row.id, 0, 5, 3600)
-        with unprivileged(), pytest.raises(LockedError):
+        with unprivileged(), raises_problem(problems.UPLOAD_LOCKED):
             blobs.append(row, 3600)
 
 

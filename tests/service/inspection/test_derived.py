@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import QuotaError, TooManyBlendsError
+from service import problems
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.files.staging import RESULT
@@ -25,6 +25,7 @@ from service.store.tables import JobRow
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.ply import PLY
 from tests.api.service import PATIENCE
+from tests.raised import raises_problem
 from tests.small_scenes import wall, write_files
 
 
@@ -102,7 +103,7 @@ def test_parallel_blends_cannot_pass_their_limit(stored: Stored, tmp_path: Path)
             await derived.close()
 
     outcomes = asyncio.run(blend_all())
-    assert sum(isinstance(outcome, TooManyBlendsError) for outcome in outcomes) == 3
+    assert sum(getattr(outcome, "problem", None) is problems.TOO_MANY_BLENDS for outcome in outcomes) == 3
     assert sum(row.name.startswith("blends/") for row in stored.store.jobs.artifacts(job.id)) == MOST_BLENDS
 
 
@@ -118,7 +119,7 @@ def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Pat
         finally:
             await derived.close()
 
-    with pytest.raises(QuotaError):
+    with raises_problem(problems.QUOTA_EXCEEDED):
         asyncio.run(compress(Quotas(stored_bytes=used)))
     assert set(stored.artifacts.objects.below("")) == objects
     assert stored.store.usage.of("one").stored_bytes == used

@@ -6,10 +6,9 @@ import asyncio
 import random
 from collections import Counter
 
-import pytest
-
-from service.errors import BusyError
+from service import problems
 from service.inspection.lanes import MAX_WAITING, Lanes
+from tests.raised import raises_problem
 
 
 class Work:
@@ -80,7 +79,7 @@ def test_queue_limit_applies_per_owner() -> None:
     async def run() -> None:
         work = Work(Lanes(["one", "two"]))
         tasks = await start(work, *(f"a{number}" for number in range(1 + MAX_WAITING)))
-        with pytest.raises(BusyError):
+        with raises_problem(problems.BUSY):
             await work.ask("a-more")
         tasks += await start(work, "b0")
         assert sorted(work.at_work) == ["a0", "b0"]

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import pytest
 from PIL import Image
 
-from service.errors import RefusedInputError
+from service.errors import ServiceError
 from service.files.blobs import BlobFolder
 from service.files.threads import FileThreads
 from service.inspection.inspector import InspectionProcess, Inspector, Show
@@ -89,7 +89,7 @@ def test_limits_grow_with_the_size_of_a_scene(files: dict[str, Path], tmp_path: 
 def test_small_file_that_expands_exceeds_the_memory_limit(files: dict[str, Path], tmp_path: Path) -> None:
     Image.new("RGB", (6000, 6000)).save(files["style"])  # 432 MB as float32, 100 kB as a file
     assert files["style"].stat().st_size < 1_000_000
-    with pytest.raises(RefusedInputError, match="memory") as caught:
+    with pytest.raises(ServiceError, match="memory") as caught:
         inspect(tmp_path, files, inspection_bytes=64_000_000)
     assert caught.value.code == "inspection-limit"
 

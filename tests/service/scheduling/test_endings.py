@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from service.errors import DatabaseBusyError, NoSpaceError, StoreError
+from service import problems
 from service.scheduling.attempt_process import failure
 from service.scheduling.endings import Ending, Message, StopRequest, attempt_ending, cause_of_error, outage
 from service.store.retries import Cause, cause_of
@@ -77,7 +77,7 @@ def test_reported_failure_is_recorded_unchanged(permanent: bool) -> None:
 @pytest.mark.parametrize(
     ("code", "text"),
     [
-        (-signal.SIGKILL, "was killed; perhaps the machine had run out of memory"),
+        (-signal.SIGKILL, "was killed; the machine may have run out of memory"),
         (-signal.SIGSEGV, "was ended by SIGSEGV"),
         (3, "ended with code 3"),
         (0, "ended with code 0"),
@@ -95,9 +95,9 @@ def test_process_without_a_final_message_has_crashed(last: Message | None, code:
 @pytest.mark.parametrize(
     ("error", "cause"),
     [
-        (StoreError("The store of files does not answer."), Cause.STORE),
-        (DatabaseBusyError(), Cause.DATABASE),
-        (NoSpaceError("The disk is full."), Cause.DISK),
+        (problems.STORE_UNAVAILABLE("The store of files does not answer."), Cause.STORE),
+        (problems.DATABASE_BUSY(), Cause.DATABASE),
+        (problems.NO_SPACE("The disk is full."), Cause.DISK),
         (OutputError("out/stylized.ply: cannot be written: No space left on device."), Cause.DISK),
         (OSError(errno.ENOSPC, "No space left on device"), Cause.DISK),
         (OSError("24576 requested and 4096 written"), Cause.DISK),

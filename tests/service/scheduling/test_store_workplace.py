@@ -170,7 +170,7 @@ def test_staging_failures_are_infrastructure_errors(
     s3.heal()
     (tmp_path / "full").write_bytes(b"a file where the folder should be")
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "full" / "data"))
-    with pytest.raises(InfrastructureError, match="cannot be laid out"):
+    with pytest.raises(InfrastructureError, match="cannot be staged"):
         job.open(1, Recorder())
 
 

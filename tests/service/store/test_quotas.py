@@ -7,12 +7,14 @@ from collections.abc import Callable
 
 import pytest
 
-from service.errors import ConflictError, NotFoundError, QueueFullError, QuotaError, ServiceError
+from service import problems
+from service.errors import ConflictError, NotFoundError, ServiceError
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.inputs import GRACE_SECONDS
 from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas, Used
+from tests.raised import raises_problem
 from tests.service.store.helpers import LEASE, SHA, Clock, lease, new_job, queue
 
 DAY = 86_400.0
@@ -22,8 +24,8 @@ def submit(store: Store, quotas: Quotas, owner: str = "local") -> str:
     return store.jobs.create(new_job(owner), limit=100, quotas=quotas)[0].id
 
 
-def refusal(store: Store, quotas: Quotas, owner: str = "local") -> QuotaError:
-    with pytest.raises(QuotaError) as caught:
+def refusal(store: Store, quotas: Quotas, owner: str = "local") -> ServiceError:
+    with raises_problem(problems.QUOTA_EXCEEDED) as caught:
         submit(store, quotas, owner)
     return caught.value
 
@@ -90,7 +92,7 @@ def test_stored_bytes_count_uploads_inputs_and_results(store: Store, clock: Cloc
     submit(store, quotas)
     assert store.usage.of("local") == Used(2, 0, 3)
     store.inputs.create_upload("local", 5, "x", "", 1000, quotas=quotas)
-    with pytest.raises(QuotaError) as caught:
+    with raises_problem(problems.QUOTA_EXCEEDED) as caught:
         store.inputs.create_upload("local", 3, "x", "", 1000, quotas=quotas)
     assert caught.value.extra["quota"] == "stored-bytes"
     assert caught.value.retry_after
@@ -109,7 +111,7 @@ def test_blends_count_toward_stored_bytes(store: Store) -> None:
     store.leases.succeed(lease(store), [Published("stylized.ply", "x/1", 4, SHA)], {})
     result, blend = store.jobs.artifact(job_id, "stylized.ply"), Published("blends/a.ply", "x/2", 4, SHA)
     assert result is not None
-    with pytest.raises(QuotaError):
+    with raises_problem(problems.QUOTA_EXCEEDED):
         store.jobs.add_derived(result, [blend], "local", Quotas(stored_bytes=10))
     assert store.jobs.artifact(job_id, blend.name) is None
     assert store.jobs.add_derived(result, [blend], "local", Quotas(stored_bytes=11)) == []
@@ -123,7 +125,7 @@ def test_derived_files_are_charged_before_they_are_stored(store: Store) -> None:
     assert result is not None
     receipt = store.inputs.open_receipt("local", blend.size, quotas)
     assert store.usage.of("local").stored_bytes == 11
-    with pytest.raises(QuotaError):
+    with raises_problem(problems.QUOTA_EXCEEDED):
         store.inputs.open_receipt("local", blend.size, quotas)
     assert store.jobs.add_derived(result, [blend], "local", quotas, receipt=receipt) == []
     assert store.usage.of("local").stored_bytes == 11
@@ -145,7 +147,7 @@ def test_retry_is_bounded_like_a_new_job(store: Store, clock: Clock) -> None:
     store.jobs.retry(job_id, "local", limit=10, quotas=quotas)
     store.jobs.cancel(job_id, "local")
     for bound, quota in ((quotas, "jobs-a-day"), (Quotas(stored_bytes=2), "stored-bytes")):
-        with pytest.raises(QuotaError) as caught:
+        with raises_problem(problems.QUOTA_EXCEEDED) as caught:
             store.jobs.retry(job_id, "local", limit=10, quotas=bound)
         assert caught.value.extra["quota"] == quota
     assert store.jobs.get(job_id, "local").status == "canceled"
@@ -161,7 +163,7 @@ def test_retry_is_refused_once_the_gpu_seconds_are_used_up(store: Store, clock: 
     store.leases.hold_gpus(held, 8)
     clock.now += 5
     store.leases.fail(held, {"code": "x", "message": "x"}, permanent=True)
-    with pytest.raises(QuotaError) as caught:
+    with raises_problem(problems.QUOTA_EXCEEDED) as caught:
         store.jobs.retry(held.job_id, "local", limit=10, quotas=quotas)
     assert caught.value.extra["quota"] == "gpu-seconds-a-day"
 
@@ -212,7 +214,7 @@ def test_quota_errors_name_the_quota(store: Store) -> None:
         store.inputs.create_upload("local", 4, "x", "", 1000, most=1)
     job_id = queue(store)
     store.jobs.cancel(job_id, "local")
-    with pytest.raises(QueueFullError):
+    with raises_problem(problems.QUEUE_FULL):
         store.jobs.retry(job_id, "local", limit=0)
 
 

@@ -17,17 +17,13 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from sqlalchemy import event, func, inspect, select
 
+from service import problems
 from service.errors import (
-    ChangedMeanwhileError,
     ConflictError,
-    IdempotencyError,
     LeaseLostError,
     NotFoundError,
-    QueueFullError,
-    ServiceError,
 )
 from service.store import Store, open_store
-from service.store.database import MIGRATIONS
 from service.store.history import GROWTH, add_point
 from service.store.inputs import GRACE_SECONDS
 from service.store.jobs import Idempotency
@@ -35,6 +31,7 @@ from service.store.leases import MAX_PROGRESS_EVENTS, Lease, Published
 from service.store.retries import MAX_LOSSES
 from service.store.states import ACTIVE, FINISHED
 from service.store.tables import Base, JobRow, ProgressPointRow, ShareRow
+from tests.raised import raises_problem
 from tests.service.store.helpers import (
     ATTEMPTS,
     LEASE,
@@ -93,9 +90,9 @@ def test_detail_is_one_snapshot(store: Store) -> None:
 
 def test_rows_that_vanish_are_conflicts(store: Store) -> None:
     """A row that refers to a missing one, or that is missing itself, is decided in one place."""
-    with pytest.raises(ChangedMeanwhileError), store.database.writing() as session:
+    with raises_problem(problems.CHANGED_MEANWHILE), store.database.writing() as session:
         session.add(ShareRow(id="shr_1", job_id="job_1", sha256="0" * 64, created_at=0.0, expires_at=1.0))
-    with pytest.raises(ChangedMeanwhileError), store.database.reading() as session:
+    with raises_problem(problems.CHANGED_MEANWHILE), store.database.reading() as session:
         session.get_one(JobRow, "job_1")
 
 
@@ -103,7 +100,7 @@ def test_idempotency_key_creates_one_job(store: Store) -> None:
     first, created = store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "f" * 64))
     again, created_again = store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "f" * 64))
     assert (created, created_again, first.id) == (True, False, again.id)
-    with pytest.raises(IdempotencyError):
+    with raises_problem(problems.IDEMPOTENCY_KEY_REUSED):
         store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "e" * 64))
     other, created = store.jobs.create(new_job("other"), limit=10, idempotency=Idempotency("k", "e" * 64))
     assert created
@@ -363,28 +360,6 @@ def test_dispatchers_are_alive_while_they_send_heartbeats(store: Store, clock: C
         assert session.connection().exec_driver_sql("SELECT name FROM dispatchers").scalars().all() == ["three"]
 
 
-def test_migrations_preserve_data(database: str | None, tmp_path: Path) -> None:
-    from alembic import command
-    from alembic.config import Config
-
-    settings = store_settings(tmp_path, database)
-    first = Store(settings)
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS))
-    config.attributes["engine"] = first.database.engine
-    command.upgrade(config, "0001")
-    old = "id, owner, name, status, priority, parameters, inputs, created_at, queued_at, not_before, attempt, failures"
-    values = "'job_1', 'me', '', 'failed', 0, '{}', '[]', 1, 1, 1, 3, 3"
-    with first.database.writing() as session:
-        session.connection().exec_driver_sql(f"INSERT INTO jobs ({old}, lease_epoch) VALUES ({values}, 4)")
-    first.close()
-    store = open_store(settings)
-    job = store.jobs.get("job_1", "me")
-    assert (job.failures, job.saved_step, job.failed_step, job.swept) == (3, None, None, False)
-    assert store.retention.unswept(10) == [("job_1", 4)]
-    store.close()
-
-
 def test_release_is_not_a_failure(store: Store) -> None:
     queue(store)
     for _ in range(2 * ATTEMPTS):
@@ -405,7 +380,7 @@ def test_job_of_another_owner_is_not_found(store: Store) -> None:
 def test_unfinished_jobs_of_a_key_are_limited(store: Store) -> None:
     for _ in range(3):
         store.jobs.create(new_job("a"), limit=3)
-    with pytest.raises(QueueFullError):
+    with raises_problem(problems.QUEUE_FULL):
         store.jobs.create(new_job("a"), limit=3)
     store.jobs.create(new_job("b"), limit=3)
 
@@ -735,9 +710,3 @@ TestStoreMachine.settings = settings(
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
-
-
-def test_errors_of_the_service_have_codes_and_statuses() -> None:
-    kinds: list[type[ServiceError]] = [ServiceError, *ServiceError.__subclasses__()]
-    assert all(400 <= kind.status < 600 for kind in kinds)
-    assert len({(kind.code, kind.status) for kind in kinds}) == len(kinds)

@@ -1,0 +1,455 @@
+"""Table of all problems that the service reports. The API's documentation derives from it."""
+
+from __future__ import annotations
+
+from service.errors import (
+    ConflictError,
+    DamagedFileError,
+    DamagedWeightsError,
+    DatabaseBusyError,
+    DatabaseUnavailableError,
+    LeaseLostError,
+    LostFileError,
+    NoJobError,
+    NoShareError,
+    NoSpaceError,
+    NotFoundError,
+    ProblemType,
+    StoreError,
+)
+from service.examples import JOB_ID, SHA256, UPLOAD_ID
+
+_RECOVERY = "If you uploaded it, upload it again; if it is a result, run the job again."
+_EXAMPLE_URL = "https://example.com/scene.ply"
+_OF_JOB = ("job_status",)
+
+# --- requests -------------------------------------------------------------------------------------------------------
+
+MALFORMED_REQUEST = ProblemType(
+    "malformed-request",
+    400,
+    example={"message": "The request violates HTTP: its first line, a header or a chunk is malformed."},
+)
+HEAD_TOO_LARGE = ProblemType(
+    "head-too-large", 431, example={"message": "The request's line and headers have more than 131,072 bytes."}
+)
+TOO_MANY_CONNECTIONS = ProblemType(
+    "too-many-connections",
+    503,
+    retry_after=5,
+    example={"message": "There are 10,000 connections already. Try again later."},
+)
+MALFORMED_BODY = ProblemType("malformed-body", 400, "The request was cut off. Send it again.")
+UNSUPPORTED_TYPE = ProblemType(
+    "unsupported-media-type", 415, "The body must be {supported}.", example={"supported": "application/json"}
+)
+TOO_SLOW = ProblemType(
+    "too-slow",
+    408,
+    "No data arrived for {seconds:g} s, or fewer than {rate} bytes per second. Send the request again.",
+    headers={"Connection": "close"},  # the rest of the body may never arrive
+    example={"seconds": 60.0, "rate": 1000},
+)
+TOO_LARGE = ProblemType(
+    "too-large",
+    413,
+    members=("limit",),
+    example={
+        "message": "The request has 5,000,000,000 bytes. At most 4,000,000,000 are allowed. Use uploads.",
+        "limit": 4_000_000_000,
+    },
+)
+INVALID_REQUEST = ProblemType("invalid-request", 422, members=("input", "errors"))
+UNAUTHORIZED = ProblemType(
+    "unauthorized",
+    401,
+    "An API key is required: send it as 'Authorization: Bearer KEY'.",
+    headers={"WWW-Authenticate": "Bearer"},
+)
+UNKNOWN_KEY = ProblemType(
+    "unauthorized",
+    401,
+    "The API key is unknown or was revoked. `sgsst keys create NAME` creates one.",
+    headers={"WWW-Authenticate": "Bearer"},
+)
+FOREIGN_SITE = ProblemType(
+    "foreign-site",
+    403,
+    example={"message": "Pages of 'https://example.com' may not use this service without an API key."},
+)
+CROSS_ORIGIN = ProblemType(
+    "cross-origin",
+    403,
+    example={"message": "Pages of 'https://example.com' may not use the sessions of this service."},
+)
+TOO_MANY_TRIES = ProblemType(
+    "too-many-tries", 429, "Too many invalid keys came from this address. Try again later.", retry_after=30
+)
+RATE_LIMITED = ProblemType(
+    "rate-limited",
+    429,
+    "This key may send {limit:g} requests a second on average. Wait, and watch jobs by their events instead of "
+    "polling.",
+    members=("limit",),
+    example={"limit": 20, "retry_after": 1},
+)
+IDEMPOTENCY_KEY_REUSED = ProblemType(
+    "idempotency-key-reused", 422, "This Idempotency-Key was used for another request. Give each request its own key."
+)
+
+# --- objects that do not exist --------------------------------------------------------------------------------------
+
+NOT_FOUND = ProblemType("not-found", 404, error=NotFoundError)
+FILE_REMOVED = ProblemType("not-found", 404, "The file has just been removed.", error=NotFoundError)
+NO_JOB = ProblemType("not-found", 404, "There is no job {job_id}.", error=NoJobError, example={"job_id": JOB_ID})
+NO_ARTIFACT = ProblemType(
+    "not-found",
+    404,
+    "Job {job_id} has no file {name!r}, or not yet. Its list of artifacts has all files.",
+    error=NotFoundError,
+    example={"job_id": JOB_ID, "name": "stylized.ply"},
+)
+NO_INPUT = ProblemType(
+    "not-found",
+    404,
+    "Job {job_id} has no input {name!r}, or no longer has it. Its list of inputs has all files.",
+    error=NotFoundError,
+    example={"job_id": JOB_ID, "name": "style:1"},
+)
+NO_UPLOAD = ProblemType(
+    "not-found",
+    404,
+    "There is no upload {upload_id}, or it has expired.",
+    error=NotFoundError,
+    example={"upload_id": UPLOAD_ID},
+)
+LOST_UPLOAD = ProblemType(
+    "not-found",
+    404,
+    "The bytes of upload {upload_id} are gone. Start a new one.",
+    error=NotFoundError,
+    example={"upload_id": UPLOAD_ID},
+)
+NO_SHARE = ProblemType("not-found", 404, "This link does not work: it has expired or was revoked.", error=NoShareError)
+NO_SHARED_FILE = ProblemType(
+    "no-shared-file", 404, "This result has no file {name!r}.", error=NotFoundError, example={"name": "colors.f16"}
+)
+
+# --- inputs of jobs -------------------------------------------------------------------------------------------------
+
+INVALID_INPUT = ProblemType(
+    "invalid-input", 422, members=("input",), example={"message": "The files cannot be read.", "input": "scene"}
+)
+TOO_MANY_GAUSSIANS = ProblemType(
+    "too-many-gaussians",
+    422,
+    "The scene has {count:,} Gaussians{note}. At most {limit:,} are allowed.",
+    members=("input", "limit"),
+    example={"count": 30_000_000, "note": "", "limit": 20_000_000, "input": "scene"},
+)
+TOO_MANY_VIEWS = ProblemType(
+    "too-many-views",
+    422,
+    "There are {count:,} views. At most {limit:,} are allowed.",
+    members=("input",),
+    example={"count": 3000, "limit": 2000, "input": "cameras"},
+)
+TOO_MANY_PIXELS = ProblemType(
+    "too-many-pixels",
+    422,
+    "All views have {count:,} pixels. At most {limit:,} are allowed.",
+    members=("input",),
+    example={"count": 30_000_000_000, "limit": 20_000_000_000, "input": "cameras"},
+)
+IMAGE_TOO_LARGE = ProblemType(
+    "image-too-large",
+    422,
+    "{name}: has {width} x {height} pixels. At most {limit:,} are allowed.",
+    members=("input",),
+    example={"name": "style.jpg", "width": 20_000, "height": 20_000, "limit": 100_000_000, "input": "style"},
+)
+TOO_MANY_FILES = ProblemType(
+    "too-many-files", 422, "There are more than {limit} {what}.", example={"limit": 2041, "what": "files"}
+)
+INSPECTION_LIMIT = ProblemType(
+    "inspection-limit",
+    422,
+    members=("input",),
+    example={"message": "Reading the files takes more time or memory than allowed, or crashes the reader."},
+)
+UNKNOWN_UPLOAD = ProblemType(
+    "unknown-upload",
+    422,
+    "{upload_id!r} is not the ID of a usable upload, and {input!r} has no file name. Send an upload's ID, or a file "
+    "with its name.",
+    members=("input",),
+    example={"upload_id": UPLOAD_ID, "input": "scene"},
+)
+UNKNOWN_INPUT = ProblemType(
+    "unknown-input",
+    422,
+    "Job {job_id} has no input {name!r}, or no longer has it. Upload the file again.",
+    members=("input",),
+    example={"job_id": JOB_ID, "name": "style:1", "input": "style"},
+)
+UNFINISHED_UPLOAD = ProblemType(
+    "unfinished-upload",
+    422,
+    "Upload {upload_id} has {offset:,} of {length:,} bytes. Finish it first.",
+    members=("input",),
+    example={"upload_id": UPLOAD_ID, "offset": 16_384, "length": 42_301, "input": "scene"},
+)
+URLS_OFF = ProblemType(
+    "urls-off",
+    422,
+    "Inputs by URL are switched off on this service. Upload the file instead.",
+    members=("input",),
+    example={"input": "scene"},
+)
+INVALID_URL = ProblemType(
+    "invalid-url",
+    422,
+    "{url!r} cannot be fetched: {reason}. Name a file of an allowed host, or upload the file.",
+    members=("input",),
+    example={
+        "url": _EXAMPLE_URL,
+        "reason": "'example.com' is not among the hosts that its operator allows",
+        "input": "scene",
+    },
+)
+URL_NOT_FETCHED = ProblemType(
+    "url-not-fetched",
+    422,
+    "{url!r} was not fetched: {reason}. Check the URL and try again, or upload the file.",
+    members=("input",),
+    example={"url": _EXAMPLE_URL, "reason": "the server answered 404", "input": "scene"},
+)
+WEBHOOKS_OFF = ProblemType(
+    "webhooks-off",
+    422,
+    "Webhooks are switched off on this service.",
+    members=("input",),
+    example={"input": "webhook"},
+)
+INVALID_WEBHOOK = ProblemType(
+    "invalid-webhook",
+    422,
+    "{url!r} cannot be called: {reason}. Give a URL such as 'https://example.com/hook'.",
+    members=("input",),
+    example={"url": "ftp://example.com", "reason": "its scheme is neither http nor https", "input": "webhook"},
+)
+
+# --- states of jobs and uploads -------------------------------------------------------------------------------------
+
+CONFLICT = ProblemType("conflict", 409, members=("offset",), error=ConflictError)
+CHANGED_MEANWHILE = ProblemType(
+    "conflict",
+    409,
+    "Another request changed or deleted this at the same time. Get its current state, then try again.",
+    error=ConflictError,
+)
+NOT_CANCELABLE = ProblemType(
+    "conflict",
+    409,
+    "The job has {job_status} and cannot be canceled.",
+    members=_OF_JOB,
+    error=ConflictError,
+    example={"job_status": "succeeded"},
+)
+NOT_RUNNING = ProblemType(
+    "conflict",
+    409,
+    "The job has status {job_status}; only a running job can be finished early.",
+    members=_OF_JOB,
+    error=ConflictError,
+    example={"job_status": "queued"},
+)
+NOT_RETRYABLE = ProblemType(
+    "conflict",
+    409,
+    "The job has status {job_status}; only failed or canceled jobs can be retried.",
+    members=_OF_JOB,
+    error=ConflictError,
+    example={"job_status": "running"},
+)
+NOT_ENDED = ProblemType(
+    "conflict",
+    409,
+    "The job has status {job_status}. {advice}; delete it once it has ended.",
+    members=_OF_JOB,
+    error=ConflictError,
+    example={"job_status": "running", "advice": "Cancel it first"},
+)
+NO_RESULT = ProblemType(
+    "conflict",
+    409,
+    "The job has status {job_status}; only results can be shared.",
+    members=_OF_JOB,
+    error=ConflictError,
+    example={"job_status": "running"},
+)
+TOO_MANY_SHARES = ProblemType(
+    "too-many-shares",
+    409,
+    "The job has {limit} links already. Revoke some.",
+    error=ConflictError,
+    example={"limit": 20},
+)
+TOO_MANY_BLENDS = ProblemType(
+    "conflict",
+    409,
+    "Job {job_id} already has {limit} blends, the maximum. Blend downloaded scenes with `sgsst blend`.",
+    members=("limit",),
+    error=ConflictError,
+    example={"job_id": JOB_ID, "limit": 20},
+)
+WRONG_OFFSET = ProblemType(
+    "conflict",
+    409,
+    "Upload-Offset is {given}, but the next byte is {offset}.",
+    members=("offset",),
+    error=ConflictError,
+    example={"given": 0, "offset": 16_384},
+)
+TOO_MANY_UPLOADS = ProblemType(
+    "conflict",
+    409,
+    "There are {limit} unfinished uploads of this key. Finish or delete some.",
+    error=ConflictError,
+    example={"limit": 1000},
+)
+UPLOAD_LOCKED = ProblemType(
+    "upload-locked", 423, "Another request is writing to this upload. Get its offset and resume from there."
+)
+CHECKSUM_MISMATCH = ProblemType(
+    "checksum-mismatch",
+    460,
+    "The digest of this part differs from Upload-Checksum. The part was discarded; send it again.",
+)
+TUS_VERSION = ProblemType(
+    "unsupported-tus-version",
+    412,
+    "Tus-Resumable: {reason}. Send {version}.",
+    headers={"Tus-Version": "{version}"},
+    example={"reason": "'0.2.2' is not supported", "version": "1.0.0"},
+)
+TUS_EXTENSION = ProblemType(
+    "unsupported-tus-extension",
+    400,
+    "{header}: the extension {extension!r} is not supported. Those supported are {supported}.",
+    example={"header": "Upload-Concat", "extension": "concatenation", "supported": "creation,expiration"},
+)
+RANGE_NOT_SATISFIABLE = ProblemType(
+    "range-not-satisfiable",
+    416,
+    "The file has {size} bytes.",
+    headers={"Content-Range": "bytes */{size}"},
+    example={"size": 42_301},
+)
+PRECONDITION_FAILED = ProblemType(
+    "precondition-failed",
+    412,
+    "The file is not the one that If-Match names. Get its current ETag with a HEAD request.",
+)
+
+# --- limits ---------------------------------------------------------------------------------------------------------
+
+QUEUE_FULL = ProblemType(
+    "queue-full",
+    429,
+    "There are already {limit} unfinished jobs of this key. Wait for one to finish, or cancel one.",
+    members=("limit",),
+    retry_after=30,
+    example={"limit": 100},
+)
+QUOTA_EXCEEDED = ProblemType(
+    "quota-exceeded",
+    429,
+    members=("quota", "limit"),
+    example={
+        "message": "This key has submitted its 1,000 jobs of the day. Try again tomorrow (UTC).",
+        "quota": "jobs-a-day",
+        "limit": 1000,
+        "retry_after": 30_000,
+    },
+)
+STORED_BYTES_EXCEEDED = ProblemType(
+    "quota-exceeded",
+    429,
+    "This would raise the stored bytes of this key to {used:,}. At most {limit:,} are allowed. Delete jobs or uploads "
+    "first.",
+    members=("quota", "limit"),
+    retry_after=3600,
+    example={"used": 120_000_000_000, "limit": 100_000_000_000, "quota": "stored-bytes"},
+)
+BUSY = ProblemType("busy", 503, "Too many files are being checked. Try again later.", retry_after=10)
+
+# --- faults of the service ------------------------------------------------------------------------------------------
+
+INTERNAL = ProblemType(
+    "internal", 500, "Something went wrong on the service's side; its log says what.", members=("request_id",)
+)
+NO_SPACE = ProblemType(
+    "insufficient-storage",
+    507,
+    "The service's disk is too full to store this. Try again later.",
+    retry_after=30,
+    error=NoSpaceError,
+)
+STORE_UNAVAILABLE = ProblemType(
+    "store-unavailable",
+    503,
+    "The service's store of files does not answer. Try again later.",
+    retry_after=10,
+    error=StoreError,
+)
+DEADLINE_EXCEEDED = ProblemType(
+    "deadline-exceeded",
+    503,
+    "The service got no answer for {seconds:g} s from its database, its store of files or its disk. Try again later.",
+    retry_after=10,
+    example={"seconds": 30.0},
+)
+WEIGHTS_DAMAGED = ProblemType(
+    "weights-damaged",
+    503,
+    "The service's feature networks are damaged. Retry after its operator has reinstalled them; the log and "
+    "`sgsst weights list` name them.",
+    retry_after=60,
+    error=DamagedWeightsError,
+)
+FILE_LOST = ProblemType(
+    "file-lost",
+    500,
+    f"The service has lost the file with SHA-256 {{sha256}}. {_RECOVERY}",
+    error=LostFileError,
+    example={"sha256": SHA256},
+)
+FILE_DAMAGED = ProblemType(
+    "file-damaged",
+    500,
+    f"The service's copy of the file with SHA-256 {{sha256}} is damaged. {_RECOVERY}",
+    error=DamagedFileError,
+    example={"sha256": SHA256},
+)
+DATABASE_UNAVAILABLE = ProblemType(
+    "database-unavailable",
+    503,
+    "The service's database does not answer. Try again later.",
+    retry_after=5,
+    error=DatabaseUnavailableError,
+)
+DATABASE_BUSY = ProblemType(
+    "database-busy",
+    503,
+    "The service's database is busy. Try again later.",
+    retry_after=5,
+    error=DatabaseBusyError,
+)
+LEASE_LOST = ProblemType(
+    "lease-lost",
+    409,
+    "{job_id}: lease {epoch} of {dispatcher} is no longer held.",
+    error=LeaseLostError,
+    example={"job_id": JOB_ID, "epoch": 1, "dispatcher": "local"},
+)
