@@ -25,7 +25,7 @@ from service.store.rollback import NEWEST_EVENT, Marker
 from service.store.tables import Base, CounterRow, IdempotencyRow
 
 #: Version of the newest migration; a database with this version is opened without loading the migrations.
-SCHEMA = "0009"
+SCHEMA = "0001"
 MIGRATIONS = Path(__file__).with_name("migrations")
 #: Default timeout in seconds of each wait of a transaction: for the write lock, a connection, and each response.
 ANSWER_SECONDS = 30.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, false, text
+from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, MetaData, String, Text, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 #: SQLite numbers rows automatically only with INTEGER; PostgreSQL needs BIGINT for large numbers.
@@ -53,8 +53,8 @@ class JobRow(Base):
     failures: Mapped[int] = mapped_column(Integer, default=0)
     saved_step: Mapped[int | None] = mapped_column(Integer)
     failed_step: Mapped[int | None] = mapped_column(Integer)
-    finish_requested: Mapped[bool] = mapped_column(Boolean, default=False, server_default=false())
-    swept: Mapped[bool] = mapped_column(Boolean, default=False, server_default=false())
+    finish_requested: Mapped[bool] = mapped_column(Boolean, default=False)
+    swept: Mapped[bool] = mapped_column(Boolean, default=False)
     progress: Mapped[dict[str, Any] | None]
     result: Mapped[dict[str, Any] | None]
     error: Mapped[dict[str, Any] | None]
@@ -91,7 +91,7 @@ class AttemptRow(Base):
     started_at: Mapped[float] = mapped_column(Float)
     finished_at: Mapped[float | None] = mapped_column(Float)
     outcome: Mapped[str | None] = mapped_column(String(20))
-    gpus: Mapped[int] = mapped_column(Integer, default=0, server_default=text("0"))
+    gpus: Mapped[int] = mapped_column(Integer, default=0)
     gpus_since: Mapped[float | None] = mapped_column(Float)
     error: Mapped[dict[str, Any] | None]
 
@@ -103,8 +103,7 @@ class DispatcherRow(Base):
 
     name: Mapped[str] = mapped_column(String(120), primary_key=True)
     seen_at: Mapped[float] = mapped_column(Float)
-    # The column keeps its first name: without it, dispatchers of earlier versions stop during a rolling upgrade.
-    slots: Mapped[int] = mapped_column("places", Integer, key="slots")
+    slots: Mapped[int] = mapped_column(Integer)
     free: Mapped[int] = mapped_column(Integer)
 
 
