@@ -108,7 +108,7 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
 
         If `lets_in`, the next job may use the reserved GPUs; otherwise, no job may.
         """
-        return [lambda job: False, lambda job: True, lambda reserved: lambda job: lets_in]
+        return [lambda job: False, lambda job: True, lambda job: lets_in]
 
     def some() -> Lease:
         own().append(own().pop(0))

@@ -1,7 +1,7 @@
 """Jobs of a simulated fleet: their sizes, owners and arrival times, determined by a seed.
 
-Predicted times come from `service.scheduling.job_size`, which a test compares with `benchmarks.forecast`. A job's
-actual time is the predicted one times a random factor that the scheduler does not know.
+Predicted times are those of an H200; a test compares them with `benchmarks.forecast`. A job's actual time is the
+predicted one times a random factor that the scheduler does not know.
 """
 
 from __future__ import annotations
@@ -13,14 +13,24 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-from service.scheduling.job_size import JobSize, estimated_size
 from sgsst_core.planning.ranks import LEAST_GAIN
+from sgsst_core.settings import make_settings
 
 #: Bytes of a Gaussian with SH of degree 3 in a PLY file.
 GAUSSIAN_BYTES = 248
 #: Overhead before a job's first step: seconds to start the process, CUDA and the network; download rate from the file
 #: store in bytes per second; seconds of planning, and number of steps that planning makes.
 _START_SECONDS, _STAGING_BYTES, _PLAN_SECONDS, _PLAN_STEPS = 12.0, 1e9, 6.0, 10
+#: Seconds per step: network forward and backward per pixel; rasterization per Gaussian; and a fixed time for kernel
+#: launches.
+_PIXEL_SECONDS = {"float32": 7e-8, "tf32": 1.6e-8, "bfloat16": 7e-9}
+_GAUSSIAN_SECONDS, _FIXED_SECONDS = 1e-9, 1e-3
+#: Network time of a step in phase 1, which optimizes only the coarsest scale, as a fraction of that in phase 2.
+_COARSE_FRACTION = 0.1
+#: Communication between ranks: bytes per second that one rank sends, and seconds of latency per message.
+_LINK_BYTES, _LINK_SECONDS = 3e11, 1e-5
+#: Ratio of a view's height to its width.
+_ASPECT = 0.625
 #: Standard deviation of the logarithm of actual over predicted time of a job.
 _SPREAD = 0.35
 #: Fraction of the jobs above the usual size whose request specifies the number of workers.
@@ -59,6 +69,39 @@ KINDS = (
 )
 #: Fraction of large jobs among the kinds whose `share` is None.
 _LARGE_PAPERS = 0.04
+
+
+@dataclass(frozen=True)
+class JobSize:
+    """Amount of work of a job, estimated from its record.
+
+    Attributes:
+        gaussians: Number of Gaussians of the scene.
+        pixels: Number of pixels per view.
+        steps_coarse, steps_sos: Steps of the two phases, times views per step.
+        precision: Precision of the feature network.
+    """
+
+    gaussians: float
+    pixels: float
+    steps_coarse: int
+    steps_sos: int
+    precision: str = "float32"
+
+    def seconds(self, gpus: int = 1) -> float:
+        """Return the duration of all steps on this number of GPUs, in seconds."""
+        raster = _GAUSSIAN_SECONDS * self.gaussians
+        network = _PIXEL_SECONDS[self.precision] * self.pixels
+        overhead = _FIXED_SECONDS + self._communication(gpus)
+        coarse = (raster + _COARSE_FRACTION * network) / gpus + overhead
+        return self.steps_coarse * coarse + self.steps_sos * ((raster + network) / gpus + overhead)
+
+    def _communication(self, gpus: int) -> float:
+        """Return the communication time per step in seconds: images, gradients of images and colors, and statistics."""
+        if gpus == 1:
+            return 0.0
+        sent = 2 * 12 * (self.pixels + self.gaussians)
+        return 6 * (gpus - 1) * _LINK_SECONDS + sent / _LINK_BYTES
 
 
 @dataclass(frozen=True)
@@ -115,8 +158,16 @@ class SimulatedJob:
 
 @cache
 def _size(preset: str, side: int, scene_bytes: int) -> JobSize:
-    entry = {"role": "scene", "name": "scene.ply", "size": scene_bytes}
-    return estimated_size({"preset": preset, "resolution": side}, [entry])
+    settings = make_settings(preset)
+    side = min(side, settings.max_resolution or side)
+    steps = settings.views_per_step
+    return JobSize(
+        settings.growth * scene_bytes / GAUSSIAN_BYTES,
+        _ASPECT * side**2,
+        settings.steps_coarse * steps,
+        settings.steps_sos * steps,
+        settings.precision,
+    )
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,8 @@ from benchmarks.fleet_parts.demand import SimulatedJob
 from service.files.staging import CHECKPOINT
 from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.machine import Machine
-from service.scheduling.packing import Capacity, Grant
-from service.scheduling.scheduler import Holding
-from service.scheduling.selection import JobSelector
+from service.scheduling.packing import Capacity, Grant, estimated_seconds
+from service.scheduling.selection import Holding, JobSelector
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -85,7 +84,8 @@ class Attempt:
         """Resources in use, as a real attempt reports them: with the expected end only after the first step."""
         if self.ends is None:
             return Holding(self.grant)
-        pace = None if self.record.attempts > 1 else self.record.job.factor
+        estimated = estimated_seconds(self.lease.job, self.grant.ranks)
+        pace = None if self.record.attempts > 1 else (self.ends - self.begun) / estimated
         return Holding(self.grant, _EPOCH + self.ends, pace)
 
 

@@ -1,7 +1,7 @@
 """Packing of jobs on a machine: pure functions that decide what capacity the next job gets, or that it has to wait.
 
 Jobs do not share GPUs. A job that does not specify `workers` gets a portion of the free GPUs: all of them if no other
-job waits, one if many do, but never more than its size justifies (`service.scheduling.job_size`). The job's plan then
+job waits, one if many do, but never more than its estimated duration justifies. The job's plan then
 decides from measured times how many of them make the job faster, and the others are released
 (`service.scheduling.running`). A job also waits if the running jobs leave too little of the machine's memory for its
 scene. On a Ray cluster, Ray tracks the memory per machine (`worker.ranks.cluster`).
@@ -14,13 +14,14 @@ slots.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
-from service.scheduling.job_size import estimated_size, settings_of
 from service.scheduling.machine import Machine
-from worker.ranks.host_memory import memory_beside_gpus, scene_bytes
+from service.store.tables import JobRow
+from sgsst_core.errors import SettingsError
+from sgsst_core.settings import Settings, make_settings
+from worker.ranks.host_memory import GAUSSIAN_BYTES, memory_beside_gpus, scene_bytes
 
 #: Maximum fractions of the machine's memory that all concurrent jobs together, and each of them, may plan with. The
 #: latter equals the default of a job that runs alone (`sgsst_core.budget`), so that both round in the same way.
@@ -30,22 +31,16 @@ _MEMORY_FRACTION, _JOB_FRACTION = 0.8, 0.4
 #: for 50,000.
 _MIN_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4
-
-
-@dataclass(frozen=True)
-class QueuedJob:
-    """Record of a waiting job, as far as scheduling needs it.
-
-    Attributes:
-        queued_at: Time since which the job waits, by the store's clock.
-        parameters: Stored parameters.
-        inputs: `role`, `name` and `size` of each file.
-    """
-
-    id: str
-    queued_at: float
-    parameters: Mapping[str, Any]
-    inputs: Sequence[Mapping[str, Any]]
+#: Estimated seconds of a step on an H200: network per pixel of a view by precision, rasterization per Gaussian, and
+#: kernel launches. A step of phase 1, which optimizes only the coarsest scale, takes a tenth.
+_PIXEL_SECONDS = {"float32": 7e-8, "tf32": 1.6e-8, "bfloat16": 7e-9}
+_GAUSSIAN_SECONDS, _FIXED_SECONDS, _COARSE_FRACTION = 1e-9, 1e-3, 0.1
+#: Default longer side of views, and ratio of height to width.
+_LONGER_SIDE, _ASPECT = 1600, 0.625
+#: Seconds before a job's first step (process, CUDA, network and plan).
+_START_SECONDS = 20.0
+#: Estimated seconds of all steps on one GPU that justify another one.
+_SECONDS_PER_GPU = 30.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +91,7 @@ class Capacity:
         held = list(held)
         return len(self._free_gpus(held)) if self._machine.gpus else self._free_slots(held)
 
-    def grant(self, job: QueuedJob, held: Iterable[Grant], waiting: int) -> Grant | None:
+    def grant(self, job: JobRow, held: Iterable[Grant], waiting: int) -> Grant | None:
         """Return the capacity that a job gets beside the running jobs; None if it has to wait.
 
         Args:
@@ -119,13 +114,13 @@ class Capacity:
     def _free_slots(self, held: list[Grant]) -> int:
         return self._slots - sum(grant.slots for grant in held)
 
-    def _on_gpus(self, job: QueuedJob, requested: int, held: list[Grant], sharers: int) -> Grant | None:
+    def _on_gpus(self, job: JobRow, requested: int, held: list[Grant], sharers: int) -> Grant | None:
         free = self._free_gpus(held)
         if requested:
             ranks = min(requested, len(self._machine.gpus))
         else:
             portion = max(1, len(free) // sharers)
-            ranks = estimated_size(job.parameters, job.inputs).gpus(portion) if portion > 1 else 1
+            ranks = min(portion, 1 + int(_seconds_of_steps(job) / _SECONDS_PER_GPU))
         if ranks > len(free):
             return None
         grant = Grant(ranks, tuple(free[:ranks]), scene=_scene_bytes(job))
@@ -134,7 +129,7 @@ class Capacity:
         together = sum(each.host_bytes for each in (grant, *held))
         return grant if together <= _MEMORY_FRACTION * self._machine.memory else None
 
-    def _on_cores(self, job: QueuedJob, ranks: int, free: int) -> Grant | None:
+    def _on_cores(self, job: JobRow, ranks: int, free: int) -> Grant | None:
         if self._machine.cluster:
             return Grant(ranks)
         requested = _requested(job, "memory_limit")
@@ -151,14 +146,41 @@ class Capacity:
         return Grant(ranks, (), slots, threads, min(requested or limit, limit))
 
 
-def _scene_bytes(job: QueuedJob) -> int:
+def estimated_seconds(job: JobRow, gpus: int = 1) -> float:
+    """Estimate the duration of a job in seconds from its record, before its files are read.
+
+    The constants are for H200 GPUs; `service.scheduling.selection` scales the estimate by the measured pace.
+    """
+    return _START_SECONDS + _seconds_of_steps(job) / max(gpus, 1)
+
+
+def _seconds_of_steps(job: JobRow) -> float:
+    """Estimate the duration of all steps of a job on one GPU in seconds."""
+    settings = _settings(job)
+    side = min(_requested(job, "resolution") or _LONGER_SIDE, settings.max_resolution or math.inf)
+    network = _PIXEL_SECONDS[settings.precision] * _ASPECT * side**2
+    step = _FIXED_SECONDS + _GAUSSIAN_SECONDS * _scene_bytes(job) / GAUSSIAN_BYTES + network
+    return settings.views_per_step * (settings.steps_sos + _COARSE_FRACTION * settings.steps_coarse) * step
+
+
+def _settings(job: JobRow) -> Settings:
+    """Return the settings of a job; the defaults if another version has stored them, which the attempt rejects."""
+    known = Settings.model_fields.keys() - {"preset"}
+    given = {name: value for name, value in job.parameters.items() if name in known}
+    try:
+        return make_settings(job.parameters.get("preset", "standard"), **given)
+    except (SettingsError, TypeError):
+        return make_settings()
+
+
+def _scene_bytes(job: JobRow) -> int:
     """Return the size of a job's scene in bytes, once it is read and refined."""
     files = [entry for entry in job.inputs if entry["role"] == "scene"]
     size = sum(scene_bytes(str(entry.get("name", "")), entry["size"]) for entry in files)
-    return int(size * settings_of(job.parameters).growth)
+    return int(size * _settings(job).growth)
 
 
-def _requested(job: QueuedJob, name: str) -> int:
+def _requested(job: JobRow, name: str) -> int:
     """Return an integer parameter of a job; 0 if it is missing or has another type.
 
     Other types were stored by an earlier version of the service. The attempt will reject them, so they need no

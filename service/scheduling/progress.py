@@ -6,9 +6,8 @@ import time
 from typing import Any
 
 from service.scheduling.endings import Message
-from service.scheduling.job_size import estimated_seconds
-from service.scheduling.packing import Grant
-from service.scheduling.scheduler import Holding
+from service.scheduling.packing import Grant, estimated_seconds
+from service.scheduling.selection import Holding
 from service.store import Store
 from service.store.leases import Lease
 
@@ -49,7 +48,7 @@ class ProgressWriter:
         until = self._store.database.clock() + ends_at - time.monotonic()
         if job.attempt > 1:  # it may have resumed from a checkpoint, so its pace is unknown
             return Holding(grant, until)
-        pace = (ends_at - self._started_at) / estimated_seconds(job.parameters, job.inputs, grant.ranks)
+        pace = (ends_at - self._started_at) / estimated_seconds(job, grant.ranks)
         return Holding(grant, until, pace)
 
 

@@ -25,7 +25,7 @@ from service.scheduling.endings import Ending, Message, StopRequest, attempt_end
 from service.scheduling.packing import Grant
 from service.scheduling.progress import ProgressWriter
 from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
-from service.scheduling.scheduler import Holding
+from service.scheduling.selection import Holding
 from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
 from service.store import Store

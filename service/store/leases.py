@@ -100,7 +100,7 @@ class Leases:
         dispatcher: str,
         fits: Callable[[JobRow], bool] = lambda job: True,
         should_reserve: Callable[[JobRow], bool] = lambda job: True,
-        backfills: Callable[[JobRow], Callable[[JobRow], bool] | None] = lambda reserved: None,
+        backfills: Callable[[JobRow], bool] = lambda job: False,
         is_lost: Callable[[JobRow], bool] = lambda job: True,
     ) -> Lease | None:
         """Take the next job: by highest priority, then the owner who has waited longest, then the oldest job.
@@ -118,8 +118,7 @@ class Leases:
             fits: Callback that returns whether there is capacity for a job.
             should_reserve: Callback that returns whether to reserve capacity for a job that does not fit; if not, the
                 job is skipped.
-            backfills: Callback that returns, for a reserved job, a predicate of jobs that would not delay it; None if
-                no job may run before it.
+            backfills: Callback that returns whether a job fits and would not delay the job that was just reserved.
             is_lost: Callback that returns whether a job with an expired lease may be taken over; if not, the job is
                 skipped.
         """
@@ -140,9 +139,12 @@ class Leases:
                     return self._lease(session, job, dispatcher, now)
                 if lost:  # otherwise the same loss would be counted again next time
                     self._requeue(session, job, now, now)
-                if should_reserve(job) and reserve(session, job.id, dispatcher, now, self._seconds):
-                    return self._backfill(session, dispatcher, now, [*skipped, job.id], backfills(job))
                 skipped.append(job.id)
+                if should_reserve(job) and reserve(session, job.id, dispatcher, now, self._seconds):
+                    for other in next_jobs(session, dispatcher, now, skipped, _MAX_BACKFILL_CANDIDATES):
+                        if other.status == JobStatus.QUEUED and backfills(other):
+                            return self._lease(session, other, dispatcher, now, keep_reservation=True)
+                    return None
 
     def waiting(self, most: int = 1_000_000) -> int:
         """Return the number of jobs that could be leased now, counting up to `most`."""
@@ -152,22 +154,6 @@ class Leases:
             for query in (WAITING, LOST):
                 total += connection.execute(query, {"now": now, "most": most - total}).scalar_one()
         return total
-
-    def _backfill(
-        self,
-        session: Session,
-        dispatcher: str,
-        now: float,
-        skipped: Sequence[str],
-        allowed: Callable[[JobRow], bool] | None,
-    ) -> Lease | None:
-        """Lease the first of the next jobs that does not delay the reserved one."""
-        if allowed is None:
-            return None
-        for job in next_jobs(session, dispatcher, now, skipped, _MAX_BACKFILL_CANDIDATES):
-            if job.status == JobStatus.QUEUED and allowed(job):
-                return self._lease(session, job, dispatcher, now, keep_reservation=True)
-        return None
 
     def _lease(
         self, session: Session, job: JobRow, dispatcher: str, now: float, *, keep_reservation: bool = False

@@ -16,11 +16,10 @@ import pytest
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.scheduling.dispatcher import Dispatcher
-from service.scheduling.job_size import estimated_seconds
 from service.scheduling.machine import Machine, is_dead, own_name
-from service.scheduling.packing import Capacity, Grant, QueuedJob
+from service.scheduling.packing import Capacity, Grant, estimated_seconds
 from service.scheduling.running import RunningAttempt
-from service.scheduling.scheduler import Holding
+from service.scheduling.selection import Holding
 from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
 from service.store import Store
@@ -115,7 +114,7 @@ def test_attempt_reports_its_expected_end(settings: ServiceSettings, store: Stor
     holding = attempt.holding
     assert holding.until is not None
     assert holding.until - store.database.clock() == pytest.approx(1000.0, abs=60.0)
-    estimated = estimated_seconds(held.job.parameters, held.job.inputs)
+    estimated = estimated_seconds(held.job)
     assert holding.pace == pytest.approx(1000.0 / estimated, rel=0.06)
     held.job.attempt = 2  # the seconds may be those left after a checkpoint
     assert attempt.holding.pace is None
@@ -130,8 +129,7 @@ def test_released_gpus_are_free_for_other_jobs(settings: ServiceSettings, store:
     for gpu in ("7", "5"):
         attempt._handle({"kind": "left-out", "gpus": [gpu]})
     assert attempt.grant == Grant(1, ("6",))
-    job = QueuedJob(held.job_id, held.job.queued_at, held.job.parameters, held.job.inputs)
-    following = capacity.grant(job, [attempt.grant], 1)
+    following = capacity.grant(held.job, [attempt.grant], 1)
     assert following is not None
     assert (following.ranks, following.gpus) == (2, ("5", "7"))
 

@@ -14,13 +14,12 @@ from sqlalchemy import event, select
 
 from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.machine import Machine
-from service.scheduling.packing import Capacity, Grant, QueuedJob
-from service.scheduling.scheduler import Holding
-from service.scheduling.selection import JobSelector
+from service.scheduling.packing import Capacity, Grant, estimated_seconds
+from service.scheduling.selection import Holding, JobSelector
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
-from service.store.tables import ReservationRow
+from service.store.tables import JobRow, ReservationRow
 from tests.stores import new_store
 
 GB = 1_000_000_000
@@ -323,8 +322,32 @@ def test_one_job_at_a_time_runs_without_gpus(tmp_path: Path) -> None:
     queue.store.close()
 
 
-def job(scene: int, **parameters: Any) -> QueuedJob:
-    return QueuedJob("job", 0.0, parameters, [{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}])
+def job(scene: int, **parameters: Any) -> JobRow:
+    inputs = [{"role": "scene", "size": scene}, {"role": "style", "size": 10**12}]
+    return JobRow(id="job", parameters=parameters, inputs=inputs)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "ranks"),
+    [
+        ({"preset": "preview"}, 1),
+        ({"preset": "paper", "resolution": 5187}, 8),
+        ({"resolution": 5187}, 8),
+        ({"preset": "paper", "resolution": 5187, "max_resolution": 64, "steps_sos": 7}, 1),
+        ({"steps_sos": "many", "preset": "unknown", "resolution": "large", "bygone": 1}, 1),
+    ],
+)
+def test_larger_jobs_get_more_gpus(parameters: dict[str, Any], ranks: int) -> None:
+    grant = Capacity(machine(8), None).grant(job(GB, **parameters), [], 1)
+    assert grant is not None
+    assert grant.ranks == ranks
+
+
+def test_estimated_seconds_do_not_depend_on_the_format() -> None:
+    plain = estimated_seconds(job(248_000_000))
+    for name, scene in (("s.compressed.ply", 61_000_000), ("s.SPZ", 25_000_000), ("s.splat", 32_000_000)):
+        row = JobRow(id="job", parameters={}, inputs=[{"role": "scene", "name": name, "size": scene}])
+        assert estimated_seconds(row) == plain
 
 
 def test_memory_limit_of_a_single_job_is_at_most_its_fraction_of_the_machine() -> None:
