@@ -40,7 +40,7 @@ _LONGER_SIDE, _ASPECT = 1600, 0.625
 #: Seconds before a job's first step (process, CUDA, network and plan).
 _START_SECONDS = 20.0
 #: Estimated seconds of all steps on one GPU that justify another one.
-_SECONDS_PER_GPU = 30.0
+_SECONDS_PER_GPU = 10.0
 
 
 @dataclass(frozen=True)

@@ -334,7 +334,7 @@ def job(scene: int, **parameters: Any) -> JobRow:
         ({"preset": "paper", "resolution": 5187}, 8),
         ({"resolution": 5187}, 8),
         ({"preset": "paper", "resolution": 5187, "max_resolution": 64, "steps_sos": 7}, 1),
-        ({"steps_sos": "many", "preset": "unknown", "resolution": "large", "bygone": 1}, 1),
+        ({"steps_sos": "many", "preset": "unknown", "resolution": "large", "bygone": 1}, 3),
     ],
 )
 def test_larger_jobs_get_more_gpus(parameters: dict[str, Any], ranks: int) -> None:
