@@ -27,8 +27,7 @@ from typing import Any, Literal, get_args
 import psutil
 
 from benchmarks.machine import write_result
-from sgsst_core.stylizing.evaluation import mean_loss
-from sgsst_core.stylizing.loop import Progress
+from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
 from worker.ranks.attempts import RanksResult, WorkerOptions, stylize_on_ranks
 from worker.ranks.cluster import Cluster
@@ -211,7 +210,8 @@ def main() -> None:
 
 def _loss(ended: RanksResult) -> float:
     assert ended.result is not None
-    return mean_loss(ended.result.after)
+    assert ended.result.loss_after is not None
+    return ended.result.loss_after
 
 
 if __name__ == "__main__":

@@ -36,12 +36,7 @@ def main() -> None:
     settings, styles = make_settings(arguments.preset), (StyleFile(arguments.style),)
     arguments.out.mkdir(parents=True, exist_ok=True)
     request = StylizeRequest(source, styles, None, arguments.out / "stylized.ply", "vgg16", False, settings)
-    preview = Previews(
-        arguments.out / "previews",
-        0.0,
-        lambda path: print(f"{path.name}: {time.time() - started:.1f} s after the process started", flush=True),
-        print,
-    )
+    preview = Previews(arguments.out / "previews", 0.0, print)
     job = prepare(request, preview=preview)
     from worker.execute import execute  # as jobs of the service do: after the first preview
 
@@ -52,6 +47,8 @@ def main() -> None:
         warn=print,
         preview=preview,
     )
+    for path in sorted((arguments.out / "previews").iterdir()):
+        print(f"{path.name}: {path.stat().st_mtime - started:.1f} s after the process started")
 
 
 if __name__ == "__main__":

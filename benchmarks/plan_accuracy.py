@@ -119,8 +119,8 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
         begun = peak_memory()
 
         def progress(now: Any) -> None:
-            if now.views is None:
-                promises.append((now.stage, now.step, now.seconds, time.perf_counter(), now.seconds_left))
+            if now.is_step and now.views_to_check is None:
+                promises.append((now.stage, now.step, now.seconds, time.perf_counter(), now.eta_s))
 
         execute(job, progress=progress, stop=lambda: False, warn=print)
         ended = time.perf_counter()

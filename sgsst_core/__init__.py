@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sgsst_core.files.images import load_image
     from sgsst_core.files.library import load_cameras, load_scene, save
+    from sgsst_core.progress import Progress
     from sgsst_core.scene.camera import Camera
     from sgsst_core.scene.gaussians import Scene
     from sgsst_core.settings import Settings, make_settings
     from sgsst_core.style import Style
-    from sgsst_core.stylizing.loop import Callbacks, Progress, run
+    from sgsst_core.stylizing.loop import Callbacks, run
     from sgsst_core.stylizing.stylize import stylize
     from sgsst_core.stylizing.stylizer import Stylizer
 
@@ -46,7 +47,7 @@ __all__ = [
 _MODULES = {
     "Callbacks": "stylizing.loop",
     "Camera": "scene.camera",
-    "Progress": "stylizing.loop",
+    "Progress": "progress",
     "Scene": "scene.gaussians",
     "Settings": "settings",
     "Style": "style",

@@ -45,3 +45,17 @@ def byte_count(count: float | None) -> str:
         if abs(count) >= size:
             return f"{number(count / size)}{_GAP}{unit}"
     return f"{count:.0f}{_GAP}bytes"
+
+
+def time_left(seconds: float | None) -> str:
+    """Return the remaining time of a stage as text; empty if it is unknown."""
+    if seconds is None:
+        return ""
+    return f"{clock(seconds)} left" if seconds >= 1 else "almost done"
+
+
+def clock(seconds: float) -> str:
+    """Return a duration as minutes and seconds, or hours, minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -5,8 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 
@@ -15,7 +14,7 @@ from sgsst_core.files.atomic import remove_leftovers
 from sgsst_core.files.json_files import write_json
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.files.stylized_ply import write_colors, write_stylized
-from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
+from sgsst_core.progress import Progress
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
@@ -23,8 +22,9 @@ from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, sent_json
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
-from sgsst_core.stylizing.loop import Callbacks, Progress, Stopped, run
+from sgsst_core.stylizing.loop import Callbacks, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
+from worker.job import Result
 from worker.options import RunOptions
 from worker.prepare import Job, Warn
 from worker.previews import Previews
@@ -33,38 +33,6 @@ from worker.video import write_job_video
 
 #: Default seconds between checkpoints. If a rank is lost, at most this much work is repeated.
 CHECKPOINT_SECONDS = RunOptions().checkpoint_seconds
-
-
-@dataclass(frozen=True)
-class Result:
-    """Result of a job.
-
-    Attributes:
-        stopped: Reason why the job ended; see `run`. If it is "interrupted", only a checkpoint was written.
-        step, total: Number of completed steps, and number of all steps.
-        before: Loss of the unstylized scene on the evaluation views; empty if the job was interrupted.
-        after: Loss of the last round of views; empty if the job was interrupted.
-        loss_over_time: Summary for the report (`loss_over_time`); None if no step was made on all scales.
-        report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
-        compressed: Measured loss of quality in the compressed file; None if no compressed file was requested.
-        weights: Weights of the scales in `before` and `after`.
-    """
-
-    stopped: Stopped
-    step: int
-    total: int
-    before: Evaluation
-    after: Evaluation
-    loss_over_time: dict[str, Any] | None = None
-    report_error: str | None = None
-    compressed: CompressionLoss | None = None
-    weights: ScaleWeights = EVEN
-
-    @property
-    def losses(self) -> tuple[float, float]:
-        """Return the mean loss before and after, over the same scales."""
-        before = on_scales_of(self.after, self.before)
-        return mean_loss(before, self.weights), mean_loss(self.after, self.weights)
 
 
 def execute(
@@ -87,7 +55,7 @@ def execute(
 
     Args:
         job: Prepared job.
-        progress: Callback for the progress of the steps.
+        progress: Callback for the progress of the steps, called first with the stage "starting".
         stop: Callback that returns True to interrupt the job.
         finish: Callback that returns True to end the job after a step, with its present colors as the result.
         warn: Callback for warnings, such as a checkpoint that cannot be written while the job runs.
@@ -107,6 +75,7 @@ def execute(
     if job.resumed:
         stylizer.load_state(job.resumed.state)
     if first:
+        progress(Progress(stage="starting", step=stylizer.step, total=stylizer.job.total_steps))
         _clear_outputs(job.outputs)
     stylizer.job.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.job.plan)))
     if first:
@@ -123,7 +92,7 @@ def execute(
     if stopped == "interrupted":
         if checkpoint.error is not None:
             raise checkpoint.error
-        return Result(stopped, stylizer.step, stylizer.job.total_steps, {}, {})
+        return Result(stopped=stopped, steps=stylizer.step, total=stylizer.job.total_steps)
     result = _finish(job, stopped, measure)
     if first and preview:
         preview.finish(stylizer)
@@ -183,8 +152,9 @@ class _ReportedSteps:
     def show_views(self, done: int, total: int) -> None:
         """Report the views of a quality check; ignored before the first step."""
         if self._latest is not None:
-            left = max(self._latest.seconds_left - (time.monotonic() - self._at), 0.0)
-            self._report(replace(self._latest, stage="measuring", seconds_left=left, views=(done, total)))
+            left = max((self._latest.eta_s or 0.0) - (time.monotonic() - self._at), 0.0)
+            checked = {"stage": "measuring", "eta_s": left, "views_checked": done, "views_to_check": total}
+            self._report(self._latest.model_copy(update=checked))
 
 
 class _CheckpointWriter:
@@ -229,14 +199,13 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     error = _write_reports(job, stopped, before, after, compressed) if first else None
     return Result(
         stopped=stopped,
-        step=stylizer.step,
+        steps=stylizer.step,
         total=stylizer.job.total_steps,
-        before=before,
-        after=after,
-        loss_over_time=loss_over_time(stylizer, before),
+        loss_before=mean_loss(on_scales_of(after, before), weights),
+        loss_after=mean_loss(after, weights),
         report_error=str(error) if error else None,
-        compressed=compressed,
-        weights=weights,
+        compressed=compressed and compressed.text("the PLY"),
+        loss_over_time=loss_over_time(stylizer, before),
     )
 
 

@@ -10,13 +10,15 @@ import torch
 from torch import Tensor
 
 from sgsst_core.files.images import save_jpg
+from sgsst_core.files.scene_file import write_scene
+from sgsst_core.files.stylized_ply import write_colors
 from sgsst_core.planning.measurement_choice import LOSS_VIEWS
 from sgsst_core.scene.camera import resized, spread
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.result_colors import render_first_view, transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.inputs import Inputs
-from worker.live import LiveColors
 
 #: Minimum time between two previews, as a fraction of the job's elapsed time. It limits the number of previews.
 _SHARE = 0.05
@@ -26,6 +28,10 @@ _SIDE = 960
 _THUMBNAIL_SIDE = 480
 #: Name of the thumbnail. Clients show the last preview by name.
 _THUMBNAIL = "thumbnail.jpg"
+#: Minimum time between two writes of the colors, in seconds and as a fraction of the elapsed time.
+_COLOR_SECONDS, _COLOR_SHARE = 2.0, 0.02
+#: Maximum fraction of the elapsed time that writing the colors may take.
+_COST_SHARE = 0.01
 
 
 class Previews:
@@ -39,19 +45,15 @@ class Previews:
         folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview. Colors are written to
             the folder `live` beside it.
         seconds: Minimum seconds between two previews.
-        written: Callback that receives the path of each preview.
         warn: Callback that receives the reason why a preview is missing. A missing preview does not fail the job.
 
     Attributes:
         live: Writer of the colors.
     """
 
-    def __init__(
-        self, folder: Path, seconds: float, written: Callable[[Path], None], warn: Callable[[str], None]
-    ) -> None:
+    def __init__(self, folder: Path, seconds: float, warn: Callable[[str], None]) -> None:
         self._folder = folder
         self._seconds = seconds
-        self._written = written
         self._warn = warn
         self._started = time.monotonic()
         #: Time of the last preview; None before the first.
@@ -83,12 +85,9 @@ class Previews:
             before = _rendered(stylizer, stylizer.job.views.scene.sh_dc.to(stylizer.sh_dc.device), _THUMBNAIL_SIDE)
             after = _rendered(stylizer, stylizer.shown(), _THUMBNAIL_SIDE)
             middle = before.shape[1] // 2
-            path = self._path(_THUMBNAIL)
-            save_jpg(path, torch.cat([before[:, :middle], after[:, middle:]], dim=1))
+            save_jpg(self._path(_THUMBNAIL), torch.cat([before[:, :middle], after[:, middle:]], dim=1))
         except Exception as error:
             self._warn(f"The thumbnail could not be rendered: {error}")
-        else:
-            self._written(path)
 
     def _write(self, step: int, render: Callable[[], Tensor | None]) -> None:
         """Write the preview of a step, if there is an image to write."""
@@ -96,12 +95,9 @@ class Previews:
             image = render()
             if image is None:
                 return
-            path = self._path(f"step_{step:07d}.jpg")
-            save_jpg(path, image)
+            save_jpg(self._path(f"step_{step:07d}.jpg"), image)
         except Exception as error:
             self._warn(f"The preview could not be rendered: {error}")
-        else:
-            self._written(path)
         self._last = time.monotonic()
 
     def _path(self, name: str) -> Path:
@@ -130,3 +126,48 @@ def _rendered(stylizer: Stylizer, colors: Tensor, side: int) -> Tensor:
     camera = resized(camera, min(camera.side, side))
     with torch.no_grad():
         return views.rasterizer.render(views.colors(index, colors), camera)
+
+
+class LiveColors:
+    """Writer of a job's current colors (`colors.f16`), each time in place of the former ones.
+
+    Gaussians that no view shows have their original colors, because theirs are computed only at the end.
+
+    Args:
+        folder: Folder of the files. It is created with the first one.
+        warn: Callback that receives the reason why a file is missing. A missing file does not fail the job.
+    """
+
+    def __init__(self, folder: Path, warn: Callable[[str], None]) -> None:
+        self._folder = folder
+        self._warn = warn
+        self._started = self._due = time.monotonic()
+
+    def share_scene(self, scene: Scene) -> None:
+        """Write the scene to which the colors belong (`scene.ply`), whose rows are not those of the job's input."""
+        self._write(lambda: write_scene(self._path("scene.ply"), scene))
+
+    def __call__(self, stylizer: Stylizer) -> None:
+        """Write the colors after a step if enough time has passed since the last time."""
+        started = time.monotonic()
+        if not stylizer.step or started < self._due:
+            return
+        self._write(lambda: self._write_colors(stylizer))
+        now = time.monotonic()
+        self._due = now + max(_COLOR_SECONDS, _COLOR_SHARE * (now - self._started), (now - started) / _COST_SHARE)
+
+    def _write_colors(self, stylizer: Stylizer) -> None:
+        job = stylizer.job
+        colors = job.scene.sh_dc.clone()
+        colors[job.plan.seen] = stylizer.shown().cpu()
+        write_colors(self._path("colors.f16"), colors)
+
+    def _write(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except Exception as error:
+            self._warn(f"The colors to watch could not be written: {error}")
+
+    def _path(self, name: str) -> Path:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        return self._folder / name

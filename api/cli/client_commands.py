@@ -39,7 +39,8 @@ from sgsst_core.files.formats import (
     result_name,
 )
 from sgsst_core.number_format import duration
-from sgsst_core.stylizing.progress_bar import live_bar, set_total, time_left
+from sgsst_core.progress import Progress
+from sgsst_core.stylizing.progress_bar import live_bar, set_total
 from worker.options import ESSENTIALS
 from worker.outputs import check_file, check_folder, check_is_not_input, result_format
 from worker.region_requests import RegionOptions, RegionRequest, region_requests
@@ -404,7 +405,7 @@ def _show_events(client: Client, job_id: str, as_json: bool) -> Job:
                 if not live:
                     error_console.print(f"{event.data['status']} (attempt {event.data['attempt']})")
             elif event.kind == "progress":
-                text = _step_text(event.data)
+                text = Progress.model_validate(event.data).text()
                 bar.update(task, completed=event.data["fraction"], text=text)
                 if not live:
                     error_console.print(text)
@@ -444,23 +445,6 @@ def _format_of(out: Path) -> ExtraName | None:
     return format.name if format in EXTRA_FORMATS else None
 
 
-def _step_text(progress: Any) -> str:
-    if not progress.get("total"):
-        return str(progress["stage"])
-    unit, done, total = "step", progress["step"], progress["total"]
-    if progress.get("views_to_check"):
-        unit, done, total = "view", progress["views_checked"], progress["views_to_check"]
-    elif progress["stage"] in ("planning", "refining"):
-        unit = "view"
-    text = f"{progress['stage']}: {unit} {done} of {total}"
-    loss = progress.get("mean_loss") or progress.get("loss")
-    if loss is not None:
-        text += f", loss {loss:.3g}"
-    if left := time_left(progress.get("eta_s")):
-        text += f", {left}"
-    return text
-
-
 def _print_job(job: Job, as_json: bool) -> None:
     out_console.print(json.dumps(job.data) if as_json else _job_text(job))
 
@@ -468,7 +452,7 @@ def _print_job(job: Job, as_json: bool) -> None:
 def _progress_text(job: Job) -> str:
     if job.status == "queued" and job.data.get("queue_position"):
         return f"position {job.data['queue_position']} in the queue"
-    return _step_text(job.progress) if job.progress and not job.finished else ""
+    return Progress.model_validate(job.progress).text() if job.progress and not job.finished else ""
 
 
 def _short_status(job: Job) -> str:

@@ -25,8 +25,8 @@ from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
-from sgsst_core.number_format import duration
-from sgsst_core.stylizing.progress_bar import clock, job_bar, live_bar
+from sgsst_core.number_format import clock, duration
+from sgsst_core.stylizing.progress_bar import job_bar, live_bar
 from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def plan(
 
     request = inputs.request(options, out)
     with job_bar(error_console) as bar:
-        plan = make_plan(request, bar.show_planning, sheet)
+        plan = make_plan(request, bar.show, sheet)
     out_console.print(_decisions_table(plan))
     if plan.prediction:
         seconds, peak = plan.prediction.seconds, plan.prediction.peak_bytes / 1e9

@@ -16,13 +16,14 @@ from api.cli.options import with_arguments, with_options
 from api.cli.weights_commands import fetch
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
+from sgsst_core.number_format import clock
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.progress_bar import clock, job_bar
+from sgsst_core.stylizing.progress_bar import job_bar
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
     from worker.description import Prepared
-    from worker.execute import Result
+    from worker.job import Result
     from worker.ranks.attempts import RanksResult, WorkerOptions
     from worker.request import Outputs, StylizeRequest
 
@@ -115,17 +116,15 @@ def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, check
     from worker.prepare import prepare
 
     with job_bar(error_console) as bar:
-        job = prepare(request, warn=error_console.print, show_planning=bar.show_planning)
+        job = prepare(request, warn=error_console.print, show_planning=bar.show)
     with stop_on_signal(_announce_stop) as stop:
-        prepared = describe(job)
-        _print_plan(prepared)
+        _print_plan(describe(job))
         with job_bar(error_console) as bar:
-            bar.start(prepared.step, prepared.total)
             result = execute(
                 job, progress=bar.show, stop=stop, warn=error_console.print, checkpoint_seconds=checkpoint_seconds
             )
     if result.stopped == "interrupted":
-        _print_interruption(outputs, result.step, result.total, result.step, command)
+        _print_interruption(outputs, result.steps, result.total, result.steps, command)
         raise typer.Exit(stop.exit_code)
     _print_result(outputs, result, command)
 
@@ -138,15 +137,8 @@ def _stylize_on_ranks(
     from worker.ranks.listener import Listener
 
     with stop_on_signal(_announce_stop) as stop, job_bar(error_console) as bar:
-
-        def start(prepared: Prepared) -> None:
-            _print_plan(prepared)
-            bar.start(prepared.step, prepared.total)
-
         notify = error_console.print
-        listener = Listener(
-            planning=bar.show_planning, prepared=start, progress=bar.show, happened=notify, warn=notify, stop=stop
-        )
+        listener = Listener(prepared=_print_plan, progress=bar.show, happened=notify, warn=notify, stop=stop)
         ended = stylize_on_ranks(request, workers, listener, options=options)
     if ended.interrupted:
         _print_interruption(outputs, ended.step, ended.total, ended.saved, command)
@@ -185,12 +177,14 @@ def _print_restarts(ended: RanksResult) -> None:
 
 
 def _print_result(outputs: Outputs, result: Result, command: str) -> None:
-    print_field("loss", loss_text(*result.losses))
+    assert result.loss_before is not None
+    assert result.loss_after is not None
+    print_field("loss", loss_text(result.loss_before, result.loss_after))
     for line in _loss_over_time(result):
         print_field("loss over time", line)
     paths = [("stylized scene", outputs.ply)]
     if outputs.compressed is not None and result.compressed is not None:
-        print_field("compressed", result.compressed.text("the PLY"))
+        print_field("compressed", result.compressed)
         paths.append(("compressed scene", outputs.compressed))
     paths += [("views", outputs.views)] if outputs.views.exists() else []
     if result.report_error is None:
@@ -200,11 +194,11 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
         print_field(heading, path)
     if result.stopped == "max-seconds":
         out_console.print(
-            f"Reached --max-seconds at step {result.step} of {result.total}. The checkpoint is kept. To continue, "
+            f"Reached --max-seconds at step {result.steps} of {result.total}. The checkpoint is kept. To continue, "
             f"raise --max-seconds, which counts from the first step:\n{command}"
         )
     elif result.stopped in EARLY_ENDS:
-        out_console.print(f"Stopped at step {result.step} of {result.total}: {EARLY_ENDS[result.stopped]}.")
+        out_console.print(f"Stopped at step {result.steps} of {result.total}: {EARLY_ENDS[result.stopped]}.")
     if result.report_error is not None:
         error_console.print(
             f"The stylized scene is complete, but its report could not be written: {result.report_error}"

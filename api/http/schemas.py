@@ -12,12 +12,12 @@ from api.http.addresses import address
 from service.examples import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.files.artifacts import media_type
 from service.parameters import JobName, JobParameters
-from service.store.history import Point
 from service.store.jobs import ShownJob
 from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
 from sgsst_core.files.formats import ResultName
 from sgsst_core.files.formats.ply import PLY
+from sgsst_core.progress import Progress
 
 if TYPE_CHECKING:
     StatusName = str
@@ -54,7 +54,7 @@ def _with_example(**example: Any) -> ConfigDict:
     return ConfigDict(json_schema_extra={"examples": [example]})
 
 
-def _example_of(model: type[BaseModel]) -> dict[str, Any]:
+def example_of(model: type[BaseModel]) -> dict[str, Any]:
     """Return the example of a model, for use in another example."""
     extra = model.model_config["json_schema_extra"]
     assert isinstance(extra, dict)
@@ -75,44 +75,16 @@ class ErrorView(BaseModel):
     message: str
 
 
-class ProgressView(BaseModel):
+class ProgressView(Progress):
     """Progress of a job."""
 
-    model_config = _with_example(
-        stage="sos",
-        step=120,
-        total=300,
-        fraction=0.4,
-        eta_s=310.5,
-        loss=23729174.8,
-        scales=[41029174.8, 19120331.2, 11038018.4],
-        mean_loss=24105220.5,
-        mean_scales=[42105220.5, 19210441.0, 11000000.0],
-        seconds=205.1,
-        attempt=1,
-        updated_at=_NOW,
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{**example_of(Progress), "attempt": 1, "updated_at": _NOW}],
+            "required": ["stage", "step", "total", "fraction", "eta_s", "loss", "seconds", "attempt", "updated_at"],
+        }
     )
 
-    stage: str = Field(
-        description="`reading`, `planning` (surveying the views), `refining` (choosing Gaussians to split), `probing` "
-        "(measuring the speed of this machine), `starting`, `coarse` (coarsest scale), `sos` (all scales), `measuring` "
-        "(checking the quality of some views) or `video` (frames of the video)."
-    )
-    step: int = Field(description="Completed steps; views while `planning` or `refining`; frames while `video`.")
-    total: int = Field(description="Maximum number of steps or views; 0 while unknown.")
-    fraction: float = Field(description="Completed fraction of the steps or views, 0 to 1.")
-    eta_s: float | None = Field(
-        description="Estimated remaining seconds, including measurements at the end; null if unknown."
-    )
-    loss: float | None
-    scales: list[float | None] | None = Field(
-        None, description="Loss of each scale, full size first; null for scales that the step skipped."
-    )
-    mean_loss: float | None = Field(None, description="Loss of the last round of views, comparable over time.")
-    mean_scales: list[float | None] | None = Field(None, description="The same for each scale.")
-    views_checked: int | None = Field(None, description="While `measuring`: completed views of this check of quality.")
-    views_to_check: int | None = Field(None, description="While `measuring`: all views of this check of quality.")
-    seconds: float | None = Field(description="Seconds of all steps so far.")
     attempt: int
     updated_at: Time
 
@@ -121,16 +93,7 @@ class ProgressPoint(BaseModel):
     """Progress of a job at one moment."""
 
     model_config = _with_example(
-        attempt=1,
-        stage="sos",
-        step=120,
-        total=300,
-        seconds=205.1,
-        loss=23729174.8,
-        scales=[41029174.8, 19120331.2, 11038018.4],
-        mean_loss=24105220.5,
-        mean_scales=[42105220.5, 19210441.0, 11000000.0],
-        updated_at=_NOW,
+        **{name: value for name, value in example_of(ProgressView).items() if name not in ("fraction", "eta_s")}
     )
 
     attempt: int
@@ -148,7 +111,7 @@ class ProgressPoint(BaseModel):
 class ProgressHistory(BaseModel):
     """Loss history of a job, oldest point first."""
 
-    model_config = _with_example(points=[_example_of(ProgressPoint)])
+    model_config = _with_example(points=[example_of(ProgressPoint)])
 
     points: list[ProgressPoint] = Field(
         max_length=MOST_POINTS,
@@ -211,16 +174,16 @@ class JobView(BaseModel):
         attempt=1,
         queue_position=None,
         preview="previews/step_0000100.jpg",
-        progress=_example_of(ProgressView),
+        progress=example_of(ProgressView),
         result=None,
         error=None,
         parameters={"name": "plush", "preset": "standard"},
         inputs=[
-            _example_of(InputView),
+            example_of(InputView),
             {"role": "style", "name": "style.jpg", "size": 10421, "sha256": SHA256[::-1]},
         ],
         input_counts={"scene": 1, "style": 1},
-        links=_example_of(Links),
+        links=example_of(Links),
     )
 
     id: str
@@ -254,7 +217,7 @@ class JobView(BaseModel):
 class JobDetail(JobView):
     """A job with its attempts."""
 
-    model_config = _with_example(**_example_of(JobView), attempts=[_example_of(AttemptView)])
+    model_config = _with_example(**example_of(JobView), attempts=[example_of(AttemptView)])
 
     attempts: list[AttemptView]
 
@@ -262,7 +225,7 @@ class JobDetail(JobView):
 class JobPage(BaseModel):
     """A page of jobs, newest first."""
 
-    model_config = _with_example(jobs=[_example_of(JobView)], next_cursor=JOB_ID)
+    model_config = _with_example(jobs=[example_of(JobView)], next_cursor=JOB_ID)
 
     jobs: list[JobView]
     next_cursor: str | None = Field(description="`cursor` of the next page; null on the last one.")
@@ -291,7 +254,7 @@ class ArtifactView(BaseModel):
 class ArtifactList(BaseModel):
     """A page of the files that a job has made so far, by name."""
 
-    model_config = _with_example(artifacts=[_example_of(ArtifactView)], next_cursor=None)
+    model_config = _with_example(artifacts=[example_of(ArtifactView)], next_cursor=None)
 
     artifacts: list[ArtifactView]
     next_cursor: str | None = Field(description="`cursor` of the next page; null on the last one.")
@@ -324,7 +287,7 @@ class BlendRequest(BaseModel):
 class InputFileView(InputView):
     """A file that a job was created from, and the address of its content."""
 
-    model_config = _with_example(**_example_of(InputView), url=f"/v1/jobs/{JOB_ID}/inputs/scene")
+    model_config = _with_example(**example_of(InputView), url=f"/v1/jobs/{JOB_ID}/inputs/scene")
 
     url: str
 
@@ -332,7 +295,7 @@ class InputFileView(InputView):
 class InputList(BaseModel):
     """A page of the files that a job was created from, in the order in which they were sent."""
 
-    model_config = _with_example(inputs=[_example_of(InputFileView)], next_cursor="1")
+    model_config = _with_example(inputs=[example_of(InputFileView)], next_cursor="1")
 
     inputs: list[InputFileView]
     next_cursor: str | None = Field(description="`cursor` of the next page; null on the last one.")
@@ -466,7 +429,7 @@ class ShareView(BaseModel):
 class ShareCreated(ShareView):
     """A new link to the result of a job, with its token."""
 
-    model_config = _with_example(**_example_of(ShareView), url=f"/shared#{SHARE_TOKEN}")
+    model_config = _with_example(**example_of(ShareView), url=f"/shared#{SHARE_TOKEN}")
 
     url: str = Field(
         description="Address of the page, on this service. The part after # is the token, which is not stored: "
@@ -477,7 +440,7 @@ class ShareCreated(ShareView):
 class ShareList(BaseModel):
     """Links to the result of a job."""
 
-    model_config = _with_example(shares=[_example_of(ShareView)])
+    model_config = _with_example(shares=[example_of(ShareView)])
 
     shares: list[ShareView]
 
@@ -604,11 +567,6 @@ def input_views(job_id: str, entries: Sequence[tuple[int, dict[str, Any]]]) -> l
         InputFileView(**entry, url=address(f"{path}/{entry['role']}" + (f":{index}" if index else "")))
         for index, entry in entries
     ]
-
-
-def progress_history(points: list[Point]) -> ProgressHistory:
-    """Return the loss history of a job as the API shows it."""
-    return ProgressHistory(points=[ProgressPoint.model_validate(point, from_attributes=True) for point in points])
 
 
 def poll_seconds(job: JobRow) -> int | None:

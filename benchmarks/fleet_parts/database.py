@@ -26,6 +26,7 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import _JOBS, NewJob, _row_of_new_job
 from service.store.leases import Lease, Published
+from sgsst_core.progress import Progress
 from tests.postgres import fresh_database, server
 
 _SHA = "a" * 64
@@ -115,16 +116,7 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
         return own()[0]
 
     submitted = NewJob("key_000", "", 0, {"preset": "paper"}, _INPUTS)
-    progress = {
-        "attempt": 1,
-        "stage": "sos",
-        "step": 7,
-        "total": 20_000,
-        "fraction": 0.1,
-        "eta_s": 100.0,
-        "loss": 0.5,
-        "seconds": 9.0,
-    }
+    progress = Progress(stage="sos", step=7, total=20_000, eta_s=100.0, loss=0.5, seconds=9.0)
     checkpoint = Published(CHECKPOINT, "x", 1, _SHA, step=5)
     what: dict[str, Callable[[], Any]] = {
         "submit": lambda: store.jobs.create(submitted, limit=10**9),

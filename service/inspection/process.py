@@ -51,7 +51,8 @@ from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.survey import PlanningProgress, ShowPlanning
+from sgsst_core.planning.survey import ShowPlanning
+from sgsst_core.progress import Progress
 from sgsst_core.quality.scene_difference import measure_compression
 from sgsst_core.regions.definition import Regions
 from sgsst_core.report.document import plan_json
@@ -81,7 +82,7 @@ MAX_ANSWER = 64 << 20
 #: has read them.
 MAX_REPORTS = 10_000
 #: Fields of a progress message; all but the first are numbers.
-_PROGRESS = ("stage", "step", "total", "fraction", "eta_s")
+_PROGRESS = {"stage", "step", "total", "fraction", "eta_s"}
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
 #: Remaining weight (1 minus the sum of weights) up to which it counts as zero, because floats are rounded.
@@ -313,7 +314,7 @@ def video(staged: Staged, parameters: JobParameters, limits: dict[str, Any], sho
 
     def progress(done: int, total: int) -> None:
         left = (time.monotonic() - started) / done * (total - done)
-        show(PlanningProgress(done, total, left, "video"))
+        show(Progress(stage="video", step=done, total=total, eta_s=left))
 
     cameras = render_video(request, progress, in_place=True)
     return {"width": cameras[0].width, "height": cameras[0].height, "frames": len(cameras)}
@@ -466,10 +467,8 @@ def _run_child(request: dict[str, Any], writing: int) -> NoReturn:
         _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _memory_besides_reading(request))
         with os.fdopen(writing, "w") as file:
 
-            def show(now: PlanningProgress) -> None:
-                values = (now.stage, now.done, now.total, now.fraction, now.seconds_left)
-                progress = dict(zip(_PROGRESS, values, strict=True))
-                print(json.dumps({"planning": progress}), file=file, flush=True)
+            def show(now: Progress) -> None:
+                print(json.dumps({"planning": now.model_dump(include=_PROGRESS)}), file=file, flush=True)
 
             try:
                 uncompiled = _confine(request)

@@ -1,7 +1,7 @@
 """Process of one attempt at a job: `python -m service.scheduling.attempt_process FOLDER`.
 
 The folder contains the staged inputs and `task.json`; results go to its subfolder `out`. The process reports events as
-lines of JSON on stdout (`Message`), and logs for people on stderr. On SIGTERM it finishes the current step and saves a
+lines of JSON on stdout (`Report`), and logs for people on stderr. On SIGTERM it finishes the current step and saves a
 checkpoint; on SIGUSR1 it finishes the current step and ends the job with its present colors as the result. It dies with
 the dispatcher that started it, and so do the processes that it has started.
 """
@@ -16,23 +16,23 @@ import threading
 import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from service.files.staging import Staged
 from service.parameters import JobParameters
-from service.scheduling.endings import OUTAGE, Message, cause_of_error, outage
+from service.scheduling.endings import OUTAGE, Ending, Report, cause_of_error, outage
 from service.scheduling.store_workplace import StoreWorkplace
 from service.store.leases import Published
 from service.store.retries import Cause
+from service.store.states import AttemptOutcome
+from sgsst_core.progress import Progress
 from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
-    from sgsst_core.planning.survey import PlanningProgress
-    from sgsst_core.stylizing.loop import Progress
     from worker.description import Prepared
-    from worker.execute import Result
+    from worker.job import Result
     from worker.request import StylizeRequest
 
 #: Niceness of CPU jobs, which use all cores: the API takes precedence if it runs on the same machine.
@@ -92,20 +92,18 @@ class AttemptProcess:
         """Run the attempt and report how it ended, whatever the reason."""
         signal.signal(signal.SIGTERM, lambda number, frame: self._stopping.set())
         signal.signal(signal.SIGUSR1, lambda number, frame: self._finishing.set())
-        send({"kind": "stage", "stage": "reading"})
+        report_progress(Progress(stage="reading"))
         try:
             result = self._run_on_ranks() if self._task.workers > 1 or self._task.cluster else self._run_alone()
         except Exception as error:
-            send(failure(error))
+            send(Report(ending=failure(error)))
             if cause_of_error(error) != Cause.JOB:
                 log(OUTAGE["message"])  # the details are for the operator only
             else:
                 traceback.print_exc()
             return
-        if result is None or result.stopped == "interrupted":
-            send({"kind": "interrupted"})
-        else:
-            send({"kind": "done", "result": summary(result)})
+        if result is not None and result.stopped != "interrupted":
+            send(Report(ending=Ending(AttemptOutcome.SUCCEEDED, result=result)))
 
     def _request(self) -> StylizeRequest:
         from dataclasses import replace
@@ -122,8 +120,8 @@ class AttemptProcess:
         from worker.request import Resume
 
         resume = Resume(self._task.resume, required=False)
-        preview = Previews(_PREVIEWS, self._task.preview_seconds, report_preview, log)
-        job = prepare(self._request(), resume=resume, warn=log, show_planning=report_planning, preview=preview)
+        preview = Previews(_PREVIEWS, self._task.preview_seconds, log)
+        job = prepare(self._request(), resume=resume, warn=log, show_planning=report_progress, preview=preview)
         report_prepared(describe(job))
 
         return execute(
@@ -142,14 +140,12 @@ class AttemptProcess:
         from worker.ranks.listener import Listener
 
         listener = Listener(
-            planning=report_planning,
             prepared=report_prepared,
             progress=report_progress,
             happened=log,
             warn=log,
             stop=self._stopping.is_set,
             finish=self._finishing.is_set,
-            preview=report_preview,
             left_out=report_left_out,
             stored=report_stored,
         )
@@ -163,17 +159,9 @@ class AttemptProcess:
         return stylize_on_ranks(self._request(), self._task.workers, listener, options=options).result
 
 
-def report_planning(now: PlanningProgress) -> None:
-    """Report the progress of a stage before the steps; one step is one view."""
-    send(
-        {
-            "kind": "stage",
-            "stage": now.stage,
-            "step": now.done,
-            "total": now.total,
-            "seconds_left": now.seconds_left,
-        }
-    )
+def report_progress(now: Progress) -> None:
+    """Report the progress of the job."""
+    send(Report(progress=now))
 
 
 class _VideoReport:
@@ -190,77 +178,40 @@ class _VideoReport:
         if now - self._sent >= 1:
             self._sent = now
             left = (now - self._started) / (done - 1) * (total - done) if done > 1 else None
-            send({"kind": "stage", "stage": "video", "step": done, "total": total, "seconds_left": left})
+            report_progress(Progress(stage="video", step=done, total=total, eta_s=left))
 
 
 def report_prepared(prepared: Prepared) -> None:
-    """Log the decisions of the plan and report the first step."""
+    """Log the decisions of the plan, and report that the first step starts."""
     for heading, line in prepared.lines:
         log(f"{heading}: {line}")
-    send({"kind": "prepared", "step": prepared.step, "total": prepared.total})
-
-
-def report_progress(now: Progress) -> None:
-    """Report a step."""
-    send(
-        {
-            "kind": "progress",
-            "stage": now.stage,
-            "step": now.step,
-            "total": now.total,
-            "loss": now.loss,
-            "seconds": now.seconds,
-            "seconds_left": now.seconds_left,
-            "scales": list(now.scales) or None,
-            "mean_loss": now.mean_loss,
-            "mean_scales": list(now.mean_scales) or None,
-            "views": now.views,
-        }
-    )
+    send(Report(prepared=True))
 
 
 def report_left_out(gpus: Sequence[str]) -> None:
     """Report GPUs that the plan does not use."""
-    send({"kind": "left-out", "gpus": list(gpus)})
+    send(Report(left_out=tuple(gpus)))
 
 
 def report_stored(file: Published) -> None:
     """Report a file that a rank has put into the file store."""
-    send({"kind": "stored", "file": asdict(file)})
+    send(Report(stored=file))
 
 
-def report_preview(path: Path) -> None:
-    """Report a preview image of the running job."""
-    send({"kind": "preview", "path": str(path)})
-
-
-def summary(result: Result) -> dict[str, Any]:
-    """Return a summary of the result for the job's record; the report has the details."""
-    before, after = result.losses
-    return {
-        "stopped": result.stopped,
-        "steps": result.step,
-        "total": result.total,
-        "loss_before": before,
-        "loss_after": after,
-        "report_error": result.report_error,
-    }
-
-
-def failure(error: Exception) -> Message:
-    """Return the message for an error; the error is permanent if a retry would fail in the same way."""
+def failure(error: Exception) -> Ending:
+    """Return the ending for an error; the error is permanent if a retry would fail in the same way."""
     from sgsst_core.errors import DivergedError, InvalidInputError, SgsstError, is_out_of_memory
 
     cause = cause_of_error(error)
     if cause != Cause.JOB:
         detail = "".join(traceback.format_exception(error))
-        return {"kind": "failed", "error": outage(cause), "permanent": False, "detail": detail}
+        return Ending(AttemptOutcome.FAILED, error=outage(cause), detail=detail)
     code = error.code if isinstance(error, SgsstError) else "out-of-memory" if is_out_of_memory(error) else "internal"
     message = (
         str(error) if isinstance(error, SgsstError) or is_out_of_memory(error) else f"{type(error).__name__}: {error}"
     )
     permanent = isinstance(error, InvalidInputError | DivergedError)
-    return {"kind": "failed", "error": {"code": code, "message": message}, "permanent": permanent}
+    return Ending(AttemptOutcome.FAILED, error={"code": code, "message": message}, permanent=permanent)
 
 
 def log(line: str) -> None:
@@ -268,9 +219,9 @@ def log(line: str) -> None:
     print(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}", file=sys.stderr, flush=True)
 
 
-def send(message: Message) -> None:
-    """Send a message to the dispatcher."""
-    _channel.write(json.dumps(message) + "\n")
+def send(report: Report) -> None:
+    """Send a report to the dispatcher."""
+    _channel.write(report.model_dump_json(exclude_defaults=True) + "\n")
     _channel.flush()
 
 

@@ -1,9 +1,8 @@
-"""Process of an attempt as seen by its dispatcher: start, messages, and termination."""
+"""Process of an attempt as seen by its dispatcher: start, reports, and termination."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import queue
@@ -14,7 +13,7 @@ import threading
 import time
 from pathlib import Path
 
-from service.scheduling.endings import Message
+from service.scheduling.endings import Report
 from service.scheduling.packing import Grant
 
 #: Variables that set a process' number of threads; values set by the operator take precedence.
@@ -44,7 +43,7 @@ class ChildProcess:
                 env=environment,
                 start_new_session=True,
             )
-        self._messages: queue.Queue[Message | None] = queue.Queue()
+        self._reports: queue.Queue[Report | None] = queue.Queue()
         self._deadline: float | None = None
         self._finishing = False
         threading.Thread(target=self._listen, name=f"{folder.name}-out", daemon=True).start()
@@ -53,21 +52,21 @@ class ChildProcess:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             with contextlib.suppress(ValueError):
-                self._messages.put(json.loads(line))
-        self._messages.put(None)
+                self._reports.put(Report.model_validate_json(line))
+        self._reports.put(None)
 
-    def receive(self, seconds: float) -> Message | None:
-        """Return the next message; None if the process has closed its output.
+    def receive(self, seconds: float) -> Report | None:
+        """Return the next report; None if the process has closed its output.
 
         Raises:
-            queue.Empty: If no message arrives within this time.
+            queue.Empty: If no report arrives within this time.
         """
-        return self._messages.get(timeout=seconds)
+        return self._reports.get(timeout=seconds)
 
     def finish(self) -> None:
         """Ask the process to end its job after the current step, with the present colors as the result.
 
-        Call this only after the message `prepared`: earlier, the process may not handle the signal yet.
+        Call this only after the report `prepared`: earlier, the process may not handle the signal yet.
         """
         if not self._finishing:
             self._finishing = True

@@ -1,4 +1,4 @@
-"""Messages of an attempt's process, and pure functions that decide from them how the attempt ended."""
+"""Reports of an attempt's process, and pure functions that decide from them how the attempt ended."""
 
 from __future__ import annotations
 
@@ -7,35 +7,17 @@ import re
 import signal
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Literal, TypedDict
+from typing import Any
+
+from pydantic import BaseModel
 
 from service.errors import DatabaseUnavailableError, NoSpaceError, StoreError
+from service.store.leases import Published
 from service.store.retries import Cause
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
-
-
-class Message(TypedDict, total=False):
-    """Message with its `kind` and the fields of that kind."""
-
-    kind: Literal["stage", "prepared", "left-out", "stored", "progress", "preview", "done", "interrupted", "failed"]
-    stage: str
-    step: int
-    total: int
-    loss: float
-    seconds: float
-    seconds_left: float | None
-    scales: list[float | None] | None
-    mean_loss: float | None
-    mean_scales: list[float | None] | None
-    views: tuple[int, int] | None
-    path: str
-    gpus: list[str]
-    file: dict[str, Any]
-    result: dict[str, Any]
-    error: dict[str, Any]
-    permanent: bool
-    detail: str
+from sgsst_core.progress import Progress
+from worker.job import Result
 
 
 class StopRequest(StrEnum):
@@ -91,20 +73,40 @@ class Ending:
 
     Attributes:
         outcome: Outcome for the record: SUCCEEDED, CANCELED, RELEASED or FAILED.
+        result: Result of a success.
         error: Error of a failure: `code`, `message` and further members.
         permanent: Whether another attempt would fail in the same way.
         detail: Details of a failure for the operator only.
     """
 
     outcome: AttemptOutcome
+    result: Result | None = None
     error: dict[str, Any] | None = None
     permanent: bool = False
     detail: str | None = None
 
 
+class Report(BaseModel):
+    """Report of an attempt's process to its dispatcher, a line of JSON; one of its fields is set.
+
+    Attributes:
+        progress: Progress of the job.
+        prepared: Whether the inputs have been read, so that the first step starts.
+        left_out: GPUs that the plan does not use.
+        stored: File that a rank has put into the file store.
+        ending: Success or failure of the attempt. A process that is interrupted reports neither.
+    """
+
+    progress: Progress | None = None
+    prepared: bool = False
+    left_out: tuple[str, ...] = ()
+    stored: Published | None = None
+    ending: Ending | None = None
+
+
 def attempt_ending(
     request: StopRequest | None,
-    last: Message | None,
+    reported: Ending | None,
     exit_code: int,
     log_tail: str | None,
     *,
@@ -115,35 +117,35 @@ def attempt_ending(
 
     Args:
         request: CANCEL or RELEASE if the end was requested, possibly too late; None otherwise.
-        last: Final message of the process, `done`, `failed` or `interrupted`; None if it sent none.
+        reported: Ending that the process has reported; None if it was interrupted or died.
         exit_code: Exit code of the process; negative for the signal that killed it.
         log_tail: Last part of the process' log; None if there is no log.
         has_result: Whether the stylized scene exists.
         cluster: Whether the process only supervises ranks on a Ray cluster. Ray terminates it with an exit code and
-            without a message if the cluster's head or the machine's own node dies; that counts as an outage.
+            without a report if the cluster's head or the machine's own node dies; that counts as an outage.
     """
-    if last is not None and last["kind"] == "done":
+    if reported is not None and reported.outcome == AttemptOutcome.SUCCEEDED:
         if has_result:
-            return Ending(AttemptOutcome.SUCCEEDED)
-        return Ending(AttemptOutcome.FAILED, {"code": "internal", "message": "The job ended without a result."})
+            return reported
+        return Ending(AttemptOutcome.FAILED, error={"code": "internal", "message": "The job ended without a result."})
     if request == StopRequest.CANCEL:
         return Ending(AttemptOutcome.CANCELED)
     if request == StopRequest.RELEASE:
         return Ending(AttemptOutcome.RELEASED)
-    if last is not None and last["kind"] == "failed":
-        return Ending(AttemptOutcome.FAILED, last["error"], last["permanent"], last.get("detail"))
+    if reported is not None:
+        return reported
     crash = _crash_error(exit_code, log_tail)
     if cluster and exit_code > 0:
         return Ending(
             AttemptOutcome.FAILED,
-            outage(Cause.MACHINE),
+            error=outage(Cause.MACHINE),
             detail="\n".join(text for text in (crash["message"], log_tail) if text),
         )
-    return Ending(AttemptOutcome.FAILED, crash)
+    return Ending(AttemptOutcome.FAILED, error=crash)
 
 
 def _crash_error(exit_code: int, log_tail: str | None) -> dict[str, Any]:
-    """Return the error of a process that ended without a final message."""
+    """Return the error of a process that ended without a report."""
     if exit_code == -signal.SIGKILL:
         message = "The process that ran the job was killed; the machine may have run out of memory."
     elif exit_code < 0:

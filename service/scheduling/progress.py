@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
-from service.scheduling.endings import Message
 from service.scheduling.packing import Grant, estimated_seconds
 from service.scheduling.selection import Holding
 from service.store import Store
 from service.store.leases import Lease
+from sgsst_core.progress import Progress
 
 #: Seconds between writes of progress: in the first minute, and for long-running jobs. More frequent writes would go
 #: unnoticed, and on a large fleet they are most of the database's load.
@@ -22,15 +21,14 @@ class ProgressWriter:
     def __init__(self, lease: Lease, store: Store) -> None:
         self._lease, self._store = lease, store
         self._started_at, self._written_at = time.monotonic(), 0.0
-        self._pending: dict[str, Any] | None = None
+        self._pending: Progress | None = None
         self._ends_at: float | None = None
 
-    def update(self, message: Message) -> None:
-        """Take the progress from a message of the attempt's process; messages of other kinds are ignored."""
-        if message["kind"] == "progress" and (left := message.get("seconds_left")) is not None:
-            self._ends_at = time.monotonic() + left
-        if message["kind"] in ("stage", "prepared", "progress"):
-            self._pending = progress_record(message, self._lease.job.attempt)
+    def update(self, progress: Progress) -> None:
+        """Set the progress to be written next."""
+        if progress.is_step and progress.eta_s is not None:
+            self._ends_at = time.monotonic() + progress.eta_s
+        self._pending = progress
 
     def write(self, *, now: bool = False) -> None:
         """Write new progress to the store if a write is due; `now` writes it in any case."""
@@ -41,7 +39,7 @@ class ProgressWriter:
             self._pending, self._written_at = None, time_now
 
     def holding(self, grant: Grant) -> Holding:
-        """Return the capacity of the attempt with its expected end according to the last progress message."""
+        """Return the capacity of the attempt with its expected end according to the last step."""
         ends_at, job = self._ends_at, self._lease.job
         if ends_at is None:
             return Holding(grant)
@@ -56,24 +54,3 @@ def progress_seconds(elapsed: float) -> float:
     """Return the interval between writes of progress, in seconds, for an attempt that has run this long."""
     least, most = _PROGRESS_SECONDS
     return min(max(elapsed / 60, least), most)
-
-
-def progress_record(message: Message, attempt: int) -> dict[str, Any]:
-    """Convert a message to the progress entry of a job's record; before the steps, a step is a view."""
-    step, total = message.get("step", 0), message.get("total", 0)
-    checked, to_check = message.get("views") or (None, None)
-    return {
-        "stage": message.get("stage", "coarse" if message["kind"] == "progress" else "starting"),
-        "step": step,
-        "total": total,
-        "fraction": step / total if total else 0.0,
-        "eta_s": message.get("seconds_left"),
-        "loss": message.get("loss"),
-        "scales": message.get("scales"),
-        "mean_loss": message.get("mean_loss"),
-        "mean_scales": message.get("mean_scales"),
-        "seconds": message.get("seconds"),
-        "views_checked": checked,
-        "views_to_check": to_check,
-        "attempt": attempt,
-    }

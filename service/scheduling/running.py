@@ -1,4 +1,4 @@
-"""Supervision of one attempt by the dispatcher: its folder, its process, its messages, and its ending."""
+"""Supervision of one attempt by the dispatcher: its folder, its process, its reports, and its ending."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import queue
 import shutil
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from functools import partial
@@ -21,7 +21,7 @@ from service.errors import LeaseLostError, ServiceError, StoreError
 from service.files.artifacts import Artifacts
 from service.parameters import stored_parameters
 from service.scheduling.child_process import ChildProcess
-from service.scheduling.endings import Ending, Message, StopRequest, attempt_ending, cause_of_error, outage
+from service.scheduling.endings import Ending, Report, StopRequest, attempt_ending, cause_of_error, outage
 from service.scheduling.packing import Grant
 from service.scheduling.progress import ProgressWriter
 from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
@@ -29,15 +29,15 @@ from service.scheduling.selection import Holding
 from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.leases import Lease, Published
+from service.store.leases import Lease
 from service.store.retries import Cause, cause_of
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import SettingsError
 
 #: Time that a canceled job has to finish its step, in seconds.
 _CANCEL_SECONDS = 8.0
-#: Time to wait for a message before other tasks are done, in seconds.
-_MESSAGE_SECONDS = 0.2
+#: Time to wait for a report before other tasks are done, in seconds.
+_REPORT_SECONDS = 0.2
 #: Time limit of each piece of work on files at the start and the end of an attempt, in seconds; the time for the bytes
 #: of large files comes on top. It is longer than the S3 client's own.
 _FILE_SECONDS = 60.0
@@ -168,7 +168,7 @@ class RunningAttempt:
         self._within(prepare, size=sum(entry["size"] for entry in self.lease.job.inputs))
         self._process = ChildProcess(self._folder, self.grant, cluster=self._stager.cluster)
         _log.info("attempt started", extra=self.lease.log_fields)
-        last = self._watch(self._process)
+        reported = self._watch(self._process)
         if self._stop_request == StopRequest.ABANDON:
             return
         exit_code = self._process.wait()
@@ -177,17 +177,18 @@ class RunningAttempt:
         self._check_published()
         ending = attempt_ending(
             self._stop_request,
-            last,
+            reported,
             exit_code,
             self._within(self._publisher.log_tail),
             has_result=self._within(self._publisher.has_result),
             cluster=self._stager.cluster,
         )
-        self._conclude(ending, {} if last is None else last.get("result", {}))
+        self._conclude(ending)
 
-    def _conclude(self, ending: Ending, result: dict[str, Any]) -> None:
+    def _conclude(self, ending: Ending) -> None:
         """Record the end of an attempt in the store."""
         if ending.outcome == AttemptOutcome.SUCCEEDED:
+            result = {} if ending.result is None else ending.result.model_dump()
             succeed = partial(self._publisher.succeed, result, lambda: self._stop_request == StopRequest.ABANDON)
             self._within(succeed, 2 * PATIENCE_SECONDS)
             self._sweep()
@@ -203,19 +204,17 @@ class RunningAttempt:
             return
         _log.info("attempt ended: outcome=%s", ending.outcome, extra=self.lease.log_fields)
 
-    def _watch(self, process: ChildProcess) -> Message | None:
-        """Handle messages until the process ends or the attempt is abandoned; return the final message, or None."""
-        last: Message | None = None
+    def _watch(self, process: ChildProcess) -> Ending | None:
+        """Handle reports until the process ends or the attempt is abandoned; return the reported ending, or None."""
+        ending: Ending | None = None
         ended = False
         while not ended:
             with contextlib.suppress(queue.Empty):
-                message = process.receive(_MESSAGE_SECONDS)
-                while message is not None:
-                    if message["kind"] in ("done", "failed", "interrupted"):
-                        last = message
-                    else:
-                        self._handle(message)
-                    message = process.receive(0.0)
+                report = process.receive(_REPORT_SECONDS)
+                while report is not None:
+                    ending = report.ending or ending
+                    self._handle(report)
+                    report = process.receive(0.0)
                 ended = True
             if self._stop_request == StopRequest.ABANDON:
                 process.kill()
@@ -230,24 +229,25 @@ class RunningAttempt:
                 process.stop(
                     _CANCEL_SECONDS if self._stop_request == StopRequest.CANCEL else self._settings.stop_seconds
                 )
-        return last
+        return ending
 
-    def _handle(self, message: Message) -> None:
-        """Handle a message other than the final one."""
-        if message["kind"] == "left-out":
-            self._release_gpus(message["gpus"])
-        if message["kind"] == "stored":
-            self._publish_later(partial(self._publisher.publish, [Published(**message["file"])]))
-        if message["kind"] == "prepared":
+    def _handle(self, report: Report) -> None:
+        """Handle a report, except for its ending."""
+        if report.left_out:
+            self._release_gpus(report.left_out)
+        if report.stored is not None:
+            self._publish_later(partial(self._publisher.publish, [report.stored]))
+        if report.prepared:
             self._store.leases.start(self.lease)
-        self._progress.update(message)
+        if report.progress is not None:
+            self._progress.update(report.progress)
 
     def _count_gpus(self) -> None:
         """Record the attempt's GPUs, which are charged to the job's owner."""
         if self.grant.gpus:
             self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
 
-    def _release_gpus(self, gpus: list[str]) -> None:
+    def _release_gpus(self, gpus: Sequence[str]) -> None:
         """Release GPUs that the plan does not use; on a cluster only their number matters."""
         left = len(self.grant.gpus) - len(gpus)
         retained = self.grant.gpus[:left]

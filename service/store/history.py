@@ -7,8 +7,6 @@ job with many attempts has too many points, every second point is deleted.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, delete, func, select
@@ -22,43 +20,14 @@ GROWTH = 1.01
 #: Number of points of a job above which every second one is deleted at the start of an attempt.
 MOST_POINTS = 2000
 
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """Point of a job's loss history.
-
-    Attributes:
-        attempt, step: Attempt and step of the point; points are ordered by both.
-        total: Maximum number of steps.
-        stage: Stage of the job.
-        seconds: Duration of all steps so far.
-        loss: Loss of the step.
-        scales: Loss per scale, full size first; None for scales that the step left out.
-        updated_at: Time of the report in seconds since 1970.
-        mean_loss, mean_scales: Loss of the last round of views, and per scale; None in points of earlier versions.
-    """
-
-    attempt: int
-    step: int
-    total: int
-    stage: str
-    seconds: float
-    loss: float
-    scales: list[float | None] | None
-    updated_at: float
-    mean_loss: float | None = None
-    mean_scales: list[float | None] | None = None
-
+#: Members of a progress that only matter at its time.
+_MOMENTARY = {"fraction", "eta_s", "views_checked", "views_to_check"}
 
 _POINTS = Base.metadata.tables[ProgressPointRow.__tablename__]
 _OF_JOB = _POINTS.c.job_id == bindparam("job_id")
 _OF_ATTEMPT = _POINTS.c.attempt == bindparam("attempt")
 _LAST = select(_POINTS.c.step, _POINTS.c.seconds).where(_OF_JOB, _OF_ATTEMPT).order_by(_POINTS.c.step.desc()).limit(1)
-_ALL = (
-    select(*(_POINTS.c[field.name] for field in fields(Point)))
-    .where(_OF_JOB)
-    .order_by(_POINTS.c.attempt, _POINTS.c.step)
-)
+_ALL = select(_POINTS).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
 _STEPS = select(_POINTS.c.attempt, _POINTS.c.step).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
 _COUNT = select(func.count()).where(_OF_JOB)
 
@@ -69,7 +38,7 @@ def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
     Args:
         progress: Progress as stored by `Leases.report_progress`.
     """
-    if progress.get("loss") is None or progress.get("seconds") is None:
+    if not _is_step(progress):
         return
     attempt, step, seconds = progress["attempt"], progress["step"], progress["seconds"]
     last = session.execute(_LAST, {"job_id": job_id, "attempt": attempt}).one_or_none()
@@ -77,9 +46,9 @@ def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
         _halve(session, job_id)
     elif step <= last.step or seconds < GROWTH * last.seconds:
         return
-    values = {name: progress[name] for name in ("total", "stage", "loss", "updated_at")}
-    values |= {name: progress.get(name) for name in ("mean_loss", "mean_scales")}
-    values |= {"job_id": job_id, "attempt": attempt, "step": step, "seconds": seconds, "scales": progress.get("scales")}
+    point = {name: value for name, value in progress.items() if name not in _MOMENTARY}
+    more = {name: point.pop(name) for name in point.keys() - _POINTS.c.keys()}
+    values = {**point, "job_id": job_id, "more": more or None}
     session.execute(upsert(session)(_POINTS).values(values).on_conflict_do_nothing())
 
 
@@ -92,18 +61,24 @@ def _halve(session: Session, job_id: str) -> None:
     session.execute(one, [{"job_id": job_id, "attempt": attempt, "at": step} for attempt, step in steps[1::2]])
 
 
-def points(connection: Connection, job_id: str, current: dict[str, Any] | None, most: int) -> list[Point]:
-    """Return a job's loss history: its points, and its current progress as the last one.
+def points(connection: Connection, job_id: str, current: dict[str, Any] | None, most: int) -> list[dict[str, Any]]:
+    """Return a job's loss history: its points, and its current progress as the last one, as in `add_point`.
 
     Args:
         current: Current progress of the job; ignored if it is None or has no loss.
         most: Maximum number of points, at least 2; longer histories are sampled evenly, including both ends.
     """
-    rows: list[Sequence[Any]] = list(connection.execute(_ALL, {"job_id": job_id}))
-    if current and current.get("loss") is not None and current.get("seconds") is not None:
-        now = [current.get(field.name) for field in fields(Point)]
-        if not rows or now[:2] > list(rows[-1][:2]):
-            rows.append(now)
-    if len(rows) > most:
-        rows = [rows[number * (len(rows) - 1) // (most - 1)] for number in range(most)]
-    return [Point(*values) for values in rows]
+    known = [{**row, **(row["more"] or {})} for row in connection.execute(_ALL, {"job_id": job_id}).mappings()]
+    if current and _is_step(current) and (not known or _position(current) > _position(known[-1])):
+        known.append(current)
+    if len(known) > most:
+        known = [known[number * (len(known) - 1) // (most - 1)] for number in range(most)]
+    return known
+
+
+def _is_step(progress: dict[str, Any]) -> bool:
+    return progress.get("loss") is not None and progress.get("seconds") is not None
+
+
+def _position(progress: dict[str, Any]) -> tuple[int, int]:
+    return progress["attempt"], progress["step"]

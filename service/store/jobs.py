@@ -14,7 +14,7 @@ from service import problems
 from service.store import job_inputs
 from service.store.changes import add_status_event, end, forget, holder_name, job_of_owner, move
 from service.store.database import Database, count, idempotency_row, new_id
-from service.store.history import Point, points
+from service.store.history import points
 from service.store.inputs import close_receipt
 from service.store.job_inputs import InputSummary
 from service.store.leases import Published
@@ -369,7 +369,7 @@ class Jobs:
             check_bytes(session, owner, quotas)
         return unused
 
-    def loss_history(self, job: JobRow, most: int) -> list[Point]:
+    def loss_history(self, job: JobRow, most: int) -> list[dict[str, Any]]:
         """Return a job's loss history up to its current step, in at most `most` points."""
         with self._database.reading_rows() as connection:
             return points(connection, job.id, job.progress, most)

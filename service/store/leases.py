@@ -35,6 +35,7 @@ from service.store.tables import (
     TurnRow,
 )
 from sgsst_core.errors import InfrastructureError
+from sgsst_core.progress import Progress
 
 #: Expiry of a lease whose dispatcher is known to be dead.
 EXPIRED = 0.0
@@ -237,13 +238,13 @@ class Leases:
                 if job.finish_requested:
                     move(session, job, Transition.FINISH, now)
 
-    def report_progress(self, lease: Lease, progress: dict[str, Any]) -> None:
+    def report_progress(self, lease: Lease, progress: Progress) -> None:
         """Replace the job's progress and add it to the loss history (`history`).
 
         This is by far the most frequent write of dispatchers, so it uses as few statements as possible.
         """
         now = self._database.clock()
-        data = {**progress, "updated_at": now}
+        data = {**progress.model_dump(), "attempt": lease.job.attempt, "updated_at": now}
         held = and_(JobRow.lease_epoch == lease.epoch, JobRow.lease_owner == lease.dispatcher)
         with self._database.writing() as session:
             change = update(JobRow).where(JobRow.id == lease.job_id, held, JobRow.status.in_(ACTIVE))

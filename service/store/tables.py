@@ -141,11 +141,7 @@ class EventRow(Base):
 
 
 class ProgressPointRow(Base):
-    """Point of a job's loss history.
-
-    `scales` has the loss of each scale, None for scales that the step left out; `mean_loss` and `mean_scales` are those
-    of the last round of views.
-    """
+    """Point of a job's loss history: members of its progress; those without a column of their own are in `more`."""
 
     __tablename__ = "progress_points"
 
@@ -160,6 +156,7 @@ class ProgressPointRow(Base):
     updated_at: Mapped[float] = mapped_column(Float)
     mean_loss: Mapped[float | None] = mapped_column(Float)
     mean_scales: Mapped[list[Any] | None]
+    more: Mapped[dict[str, Any] | None]
 
 
 class ArtifactRow(Base):

@@ -20,8 +20,9 @@ from sgsst_core.planning.context import PlanningContext, equip
 from sgsst_core.planning.decide import decide
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.probe import measure, probe_link
-from sgsst_core.planning.survey import PROBING, ShowPlanning, Survey, survey_views
+from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
 from sgsst_core.planning.view_costs import MAP_BYTES, MAPS_PER_RENDER
+from sgsst_core.progress import Progress
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions
@@ -98,7 +99,7 @@ def make_plan(
             maps = len(resolved.active)
         weighted = resolved is not None and resolved.content_weights(settings.content_weight) is not None
         if show:
-            show(PROBING)
+            show(Progress(stage="probing"))
         link = probe_link(collectives, planning_context.network.device)
 
         def decide_here() -> Plan:

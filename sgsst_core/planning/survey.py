@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,6 +16,7 @@ from torch import Tensor
 from sgsst_core.features.partition import Rectangle, covered_region
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.shown import nothing_seen
+from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -25,44 +25,22 @@ from sgsst_core.scene.gaussians import Scene
 SEEN_COVERAGE = 1 / 255
 
 
-@dataclass(frozen=True)
-class PlanningProgress:
-    """Progress of a stage before the steps.
-
-    Attributes:
-        done: Views completed by all ranks together, or frames of a video.
-        total: All views of the stage; 0 if it does not go by views, so that its length is unknown.
-        seconds_left: Remaining seconds of the stage at the current rate; None if unknown.
-        stage: "planning" (survey of the views), "refining" (choice of the Gaussians to split), "probing" (measurement
-            of the speed of the network and the rasterizer) or "video".
-    """
-
-    done: int
-    total: int
-    seconds_left: float | None = None
-    stage: Literal["planning", "refining", "probing", "video"] = "planning"
-
-    @property
-    def fraction(self) -> float:
-        """Fraction of the views, 0 to 1; 0 while the length is unknown."""
-        return self.done / max(self.total, 1)
+#: Callback for the progress of the stages before the steps.
+ShowPlanning = Callable[[Progress], None]
 
 
-ShowPlanning = Callable[[PlanningProgress], None]
-PROBING = PlanningProgress(0, 0, stage="probing")
-
-
-def progress_of(surveyed: int, total: int, ranks: int, seconds: float) -> PlanningProgress:
+def progress_of(surveyed: int, total: int, ranks: int, seconds: float, stage: str = "planning") -> Progress:
     """Return the progress of all ranks, assuming that they are as fast as this one.
 
     Args:
         surveyed: Number of views that this rank has surveyed.
         total: Number of views that all ranks survey.
         ranks: Number of ranks.
-        seconds: Seconds since the survey started.
+        seconds: Seconds since the stage started.
+        stage: Stage in which the views are surveyed.
     """
     done = min(total, surveyed * ranks)
-    return PlanningProgress(done, total, seconds * (total - done) / done if done else None)
+    return Progress(stage=stage, step=done, total=total, eta_s=seconds * (total - done) / done if done else None)
 
 
 def sees_something(coverage: Tensor) -> bool:

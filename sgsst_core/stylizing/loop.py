@@ -13,40 +13,12 @@ from typing import Literal, Protocol
 
 from sgsst_core.loss.convergence import has_converged, has_reached, window_length
 from sgsst_core.planning.plan import Prediction
+from sgsst_core.progress import Progress
 from sgsst_core.stylizing.evaluation import RunningRound, mean_loss
 from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
 
 Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "on-request", "interrupted"]
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a job after a step.
-
-    Attributes:
-        stage: Phase of the completed step, "coarse" or "sos"; "measuring" if a measurement follows it.
-        step: Number of completed steps.
-        total: Total number of steps.
-        loss: Loss of the step.
-        seconds: Time in seconds of all steps so far.
-        seconds_left: Remaining seconds of the job, including measurements and output.
-        scales: Loss of the step by scale, full size first; None for skipped scales.
-        mean_loss: Loss of the last round of views.
-        mean_scales: Loss of the last round of views by scale, as in `scales`.
-        views: Number of completed and of all views of a quality check after this step; None if none has started.
-    """
-
-    stage: str
-    step: int
-    total: int
-    loss: float
-    seconds: float
-    seconds_left: float
-    scales: tuple[float | None, ...] = ()
-    mean_loss: float | None = None
-    mean_scales: tuple[float | None, ...] = ()
-    views: tuple[int, int] | None = None
 
 
 class Measuring(Protocol):
@@ -231,21 +203,21 @@ def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft, runni
     if expected:
         left += expected.ending
     return Progress(
-        stage,
-        record.step,
-        stylizer.job.total_steps,
-        record.loss,
-        stylizer.seconds,
-        left,
-        _by_scale({scale: terms.total for scale, terms in record.terms.items()}),
-        running.loss,
-        _by_scale(running.scales()),
+        stage=stage,
+        step=record.step,
+        total=stylizer.job.total_steps,
+        eta_s=left,
+        loss=record.loss,
+        scales=_by_scale({scale: terms.total for scale, terms in record.terms.items()}),
+        mean_loss=running.loss,
+        mean_scales=_by_scale(running.scales()),
+        seconds=stylizer.seconds,
     )
 
 
-def _by_scale(losses: Mapping[int, float]) -> tuple[float | None, ...]:
-    """Return losses by scale, full size first; None for skipped scales."""
-    return tuple(losses.get(scale) for scale in range(max(losses, default=-1) + 1))
+def _by_scale(losses: Mapping[int, float]) -> list[float | None] | None:
+    """Return losses by scale, full size first and None for skipped scales; None without losses."""
+    return [losses.get(scale) for scale in range(max(losses, default=-1) + 1)] or None
 
 
 def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:

@@ -27,7 +27,8 @@ from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.context import PlanningContext, equip
-from sgsst_core.planning.survey import PlanningProgress, ShowPlanning, progress_of, sees_something
+from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
+from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, finest_size, most_children
 from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split
@@ -152,7 +153,7 @@ class _Refining:
         chosen = int((piece_counts(pieces) > 1).sum())
         fitted = spread_evenly(covered, GRADIENT_VIEWS)
         if self._show:
-            self._show(PlanningProgress(0, 0, stage="refining"))
+            self._show(Progress(stage="refining"))
         pieces, change = self._undo_until_images_are_preserved(pieces, fitted, spread_evenly(covered, MEASURED_VIEWS))
         counts = piece_counts(pieces)
         parents = int((counts > 1).sum())
@@ -284,8 +285,8 @@ class _Refining:
         started = time.perf_counter()
         for done, index in enumerate(self._of_this_rank(views)):
             if self._show:
-                now = progress_of(done, len(views), self._collectives.size, time.perf_counter() - started)
-                self._show(replace(now, stage=stage))
+                seconds = time.perf_counter() - started
+                self._show(progress_of(done, len(views), self._collectives.size, seconds, stage))
             yield index
 
     def _sum(self, values: Tensor) -> Tensor:

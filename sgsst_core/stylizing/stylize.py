@@ -15,11 +15,12 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import F, as_scene, stylized
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.stylized_ply import check_sh_attenuation
+from sgsst_core.progress import Progress
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.loop import Callbacks, Progress, run
+from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.progress_bar import JobBar, job_bar
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -73,7 +74,7 @@ def stylize(
     if isinstance(scene, SceneFile):
         check_sh_attenuation(scene, chosen.sh_attenuation)
     with job_bar(Console(highlight=False, markup=False, emoji=False)) if progress else nullcontext() as bar:
-        show = bar.show_planning if bar else None
+        show = bar.show if bar else None
         given = as_scene(scene)
         given = replace(given, rendering=given.rendering.requested(render_mode, eps2d))
         stylizer = Stylizer.planned(given, cameras, style, chosen, weights=weights, photos=photos, show=show)

@@ -17,16 +17,16 @@ from PIL import Image
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.planning.survey import PlanningProgress
+from sgsst_core.progress import Progress
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint
-from sgsst_core.stylizing.loop import Progress
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.small_scenes import wall
 from tests.worker.ranks.faults import Fault, small_request
-from worker.execute import Result, execute
+from worker.execute import execute
 from worker.inputs import read_inputs
+from worker.job import Result
 from worker.options import JobVideo
 from worker.prepare import Job, prepare
 from worker.previews import Previews
@@ -43,7 +43,7 @@ def run_job(
 
     def count(progress: Progress) -> None:
         nonlocal done
-        done += progress.views is None  # views of a quality check are no steps
+        done += progress.is_step and progress.views_to_check is None  # views of a quality check are no steps
 
     return execute(
         job,
@@ -87,12 +87,12 @@ def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
 def test_planning_is_shown_and_resume_reuses_the_plan(request_: StylizeRequest, tmp_path: Path) -> None:
     whole = small_request(tmp_path / "whole", 8)
     run_job(prepare(whole))
-    planned: list[PlanningProgress] = []
+    planned: list[Progress] = []
     first = prepare(request_, show_planning=planned.append)
-    assert [(now.done, now.total) for now in planned] == [(0, 3), (1, 3), (2, 3), (3, 3), (0, 0)]
-    assert [now.seconds_left is None for now in planned] == [True, False, False, False, True]
+    assert [(now.step, now.total) for now in planned] == [(0, 3), (1, 3), (2, 3), (3, 3), (0, 0)]
+    assert [now.eta_s is None for now in planned] == [True, False, False, False, True]
     assert planned[-2].fraction == 1.0
-    assert planned[-2].seconds_left == 0.0
+    assert planned[-2].eta_s == 0.0
     assert run_job(first, steps=3).stopped == "interrupted"
     second = prepare(request_, resume=Resume(True), show_planning=planned.append)
     assert len(planned) == 5, "nothing is looked at again"
@@ -125,13 +125,17 @@ def test_plan_for_another_device_reuses_the_survey(request_: StylizeRequest) -> 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU writes it after planning")
 def test_first_preview_precedes_planning(request_: StylizeRequest, tmp_path: Path) -> None:
-    happened: list[str | tuple[int, int]] = []
-    previews = Previews(tmp_path / "previews", 3600, lambda path: happened.append(path.name), pytest.fail)
-    job = prepare(request_, preview=previews, show_planning=lambda now: happened.append((now.done, now.total)))
-    assert happened == ["step_0000000.jpg", (0, 3), (1, 3), (2, 3), (3, 3), (0, 0)]
+    happened: list[tuple[int, list[str]]] = []
+    previews, folder = Previews(tmp_path / "previews", 3600, pytest.fail), tmp_path / "previews"
+
+    def names() -> list[str]:
+        return sorted(path.name for path in folder.iterdir())
+
+    job = prepare(request_, preview=previews, show_planning=lambda now: happened.append((now.step, names())))
+    assert happened == [(done, ["step_0000000.jpg"]) for done in (0, 1, 2, 3, 0)]
     first = (tmp_path / "previews" / "step_0000000.jpg").read_bytes()
     execute(job, progress=lambda now: None, stop=lambda: False, warn=pytest.fail, preview=previews)
-    assert happened[6:] == ["thumbnail.jpg"], "the first preview is written once, and the hour is not over"
+    assert names() == ["step_0000000.jpg", "thumbnail.jpg"], "the hour is not over"
     assert (tmp_path / "previews" / "step_0000000.jpg").read_bytes() == first
     without = small_request(tmp_path / "without", 8)
     run_job(prepare(without))
@@ -141,7 +145,7 @@ def test_first_preview_precedes_planning(request_: StylizeRequest, tmp_path: Pat
 def test_watchers_get_the_refined_scene(tmp_path: Path) -> None:
     request = small_request(tmp_path, 2, refine=3.0)
     write_scene(request.source.scene, large_wall())
-    previews = Previews(tmp_path / "previews", 3600, lambda path: None, pytest.fail)
+    previews = Previews(tmp_path / "previews", 3600, pytest.fail)
     execute(prepare(request), progress=lambda now: None, stop=lambda: False, warn=pytest.fail, preview=previews)
     shared, result = (read_scene(path).scene for path in (tmp_path / "live" / "scene.ply", request.out))
     assert torch.equal(shared.means, result.means)
@@ -182,10 +186,10 @@ def test_resume_refines_identically_and_writes_all_gaussians(tmp_path: Path, for
 
 
 def test_planning_is_shown(request_: StylizeRequest) -> None:
-    reports: list[PlanningProgress] = []
+    reports: list[Progress] = []
     job = prepare(request_, show_planning=reports.append)
     views = len(job.stylizer.job.views)
-    assert [progress.done for progress in reports] == [*range(views + 1), 0]
+    assert [progress.step for progress in reports] == [*range(views + 1), 0]
 
 
 def test_report_has_seconds_before_the_first_step(request_: StylizeRequest) -> None:

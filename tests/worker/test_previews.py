@@ -14,9 +14,8 @@ from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.warm_start import warm_start
 from tests.small_scenes import cameras, wall
-from worker import live
-from worker.live import LiveColors
-from worker.previews import Previews
+from worker import previews as previews_module
+from worker.previews import LiveColors, Previews
 
 
 def test_first_preview_shows_warm_start_colors(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
@@ -24,12 +23,12 @@ def test_first_preview_shows_warm_start_colors(tiny_weights: BackboneWeights, tm
     style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.5, 0.1])
     scene = wall()
     stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
-    written: list[tuple[int, Path]] = []
     missing: list[str] = []
-    previews = Previews(tmp_path / "previews", 3600, lambda path: written.append((stylizer.step, path)), missing.append)
+    previews = Previews(tmp_path / "previews", 3600, missing.append)
     run(stylizer, Callbacks(preview=previews, preview_seconds=0))
     assert stylizer.step == 2
-    assert written == [(0, tmp_path / "previews" / "step_0000000.jpg")], "and none before the hour is over"
+    (written,) = (tmp_path / "previews").iterdir()
+    assert written.name == "step_0000000.jpg", "and none before the hour is over"
     assert not missing
 
     index = stylizer.job.evaluation_views[0]
@@ -38,7 +37,7 @@ def test_first_preview_shows_warm_start_colors(tiny_weights: BackboneWeights, tm
     ]
     views = stylizer.job.views
     save_jpg(tmp_path / "wanted.jpg", views.rasterizer.render(views.colors(index, wanted), views.cameras[index]))
-    actual, expected = (np.asarray(Image.open(path)) for path in (written[0][1], tmp_path / "wanted.jpg"))
+    actual, expected = (np.asarray(Image.open(path)) for path in (written, tmp_path / "wanted.jpg"))
     np.testing.assert_array_equal(actual, expected)
     assert actual.std() > 1
 
@@ -51,14 +50,14 @@ def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
     stylizer = Stylizer.planned(wall(), cameras(), style, settings, weights=tiny_weights)
     run(stylizer)
     missing: list[str] = []
-    written: list[Path] = []
-    Previews(tmp_path, 3600, written.append, missing.append).finish(stylizer)
+    Previews(tmp_path, 3600, missing.append).finish(stylizer)
     assert not missing
-    assert written == [tmp_path / "thumbnail.jpg"]
-    assert written[0].name > "step_9999999.jpg", "clients show the last preview by name"
+    (written,) = tmp_path.iterdir()
+    assert written.name == "thumbnail.jpg"
+    assert written.name > "step_9999999.jpg", "clients show the last preview by name"
 
     views, index = stylizer.job.views, stylizer.job.evaluation_views[0]
-    thumbnail = np.asarray(Image.open(written[0]), dtype=np.float64)
+    thumbnail = np.asarray(Image.open(written), dtype=np.float64)
     middle = thumbnail.shape[1] // 2
     for part, colors in ((np.s_[:, :middle], views.scene.sh_dc), (np.s_[:, middle:], stylizer.shown())):
         with torch.no_grad():
@@ -70,9 +69,9 @@ def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
 def test_live_colors_are_those_of_the_step(
     tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("_SECONDS", "_ELAPSED_SHARE"):
-        monkeypatch.setattr(live, name, 0)
-    monkeypatch.setattr(live, "_COST_SHARE", 1e9)
+    for name in ("_COLOR_SECONDS", "_COLOR_SHARE"):
+        monkeypatch.setattr(previews_module, name, 0)
+    monkeypatch.setattr(previews_module, "_COST_SHARE", 1e9)
     settings = make_settings("standard", steps_coarse=0, steps_sos=3, coarsest_side=24)
     style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
     scene = wall()

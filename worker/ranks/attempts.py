@@ -32,7 +32,7 @@ from worker.ranks.rank_group import (
 )
 
 if TYPE_CHECKING:
-    from worker.execute import Result
+    from worker.job import Result
     from worker.request import Resume, StylizeRequest
     from worker.workplace import Workplace
 
@@ -180,7 +180,7 @@ class _Attempts:
                 return self._ended(None)
 
     def _ended(self, result: Result | None) -> RanksResult:
-        step = result.step if result else self._relay.step
+        step = result.steps if result else self._relay.step
         return RanksResult(result, step, self._relay.total, self._relay.saved, self._lost)
 
     def _record(self, failure: Failure, *, progressed: bool) -> None:

@@ -22,10 +22,9 @@ from worker.processes import ProcessId, die_with_parent, listen
 
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
-    from sgsst_core.planning.survey import PlanningProgress
-    from sgsst_core.stylizing.loop import Progress
+    from sgsst_core.progress import Progress
     from worker.description import Prepared
-    from worker.execute import Result
+    from worker.job import Result
     from worker.request import Resume, StylizeRequest
     from worker.workplace import OpenWorkplace, Workplace
 
@@ -117,22 +116,18 @@ class RankStatus:
     """Status of a rank, which it returns when it is polled.
 
     Attributes:
-        planning: Progress of the current stage before the steps; None before the first one.
         prepared: Summary of the prepared job; set on rank 0 only.
-        progress: Progress of the last step; set on rank 0 only.
+        progress: Latest progress; None before the first stage. Steps are reported on rank 0 only.
         saved: Step of the last checkpoint. With a workplace, a checkpoint counts once it is stored.
         warnings: All warnings so far.
-        previews: Paths of all previews so far.
         stored: Descriptions of all files that a workplace has stored so far.
         outcome: Outcome; None while the rank runs.
     """
 
-    planning: PlanningProgress | None = None
     prepared: Prepared | None = None
     progress: Progress | None = None
     saved: int | None = None
     warnings: tuple[str, ...] = ()
-    previews: tuple[Path, ...] = ()
     stored: tuple[Any, ...] = ()
     outcome: Outcome | None = None
 
@@ -240,13 +235,13 @@ class RankProcess:
         started = time.monotonic()
         preview = None
         if task.preview_folder:
-            preview = Previews(task.preview_folder, task.preview_seconds, self._add_preview, self._add_warning)
+            preview = Previews(task.preview_folder, task.preview_seconds, self._add_warning)
         job = prepare(
             task.request,
             collectives=collectives,
             resume=task.resume,
             warn=self._add_warning,
-            show_planning=lambda planning: self._update(planning=planning),
+            show_planning=lambda progress: self._update(progress=progress),
             preview=preview,
         )
         job.workers |= task.workers
@@ -254,7 +249,8 @@ class RankProcess:
             self._update(prepared=describe(job))
 
         def progress(current: Progress) -> None:
-            if self._status.progress is None and job.workers["attempts"]:
+            latest = self._status.progress
+            if current.is_step and not (latest and latest.is_step) and job.workers["attempts"]:
                 since = time.monotonic() - started
                 lost = job.workers["attempts"][-1]
                 lost["seconds_lost"] = round(task.seconds_lost + since, 3)
@@ -272,9 +268,6 @@ class RankProcess:
             checkpoint_seconds=task.checkpoint_seconds,
             run_id=task.run_id,
         )
-
-    def _add_preview(self, path: Path) -> None:
-        self._update(previews=(*self._status.previews, path))
 
     def _add_stored(self, file: Any, step: int | None) -> None:
         with self._lock:

@@ -13,6 +13,7 @@ from api.http.context import CallerDep, ContextDep
 from api.http.documentation import headers
 from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
+from api.http.schemas import ProgressView, example_of
 from service.examples import SHA256
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -29,15 +30,7 @@ _EVENT = {
 }
 _EXAMPLES = {
     "status": {"status": "running", "attempt": 1},
-    "progress": {
-        "stage": "sos",
-        "step": 120,
-        "total": 300,
-        "fraction": 0.4,
-        "eta_s": 310.5,
-        "attempt": 1,
-        "updated_at": "2026-11-21T14:02:11Z",
-    },
+    "progress": example_of(ProgressView),
     "artifact": {"name": "previews/000100.jpg", "size": 41239, "sha256": SHA256},
 }
 

@@ -44,7 +44,6 @@ from api.http.schemas import (
     job_detail,
     job_view,
     poll_seconds,
-    progress_history,
 )
 from api.http.sending import IfNoneMatch, names_etag, send_list
 from api.http.submission import BODY, JobFromUploads
@@ -419,7 +418,8 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Respons
 )
 def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
     """Get the loss history of a job from its first step on, while it runs and after its end."""
-    return progress_history(context.store.jobs.loss_history(find(context, caller, job_id), MOST_POINTS))
+    points = context.store.jobs.loss_history(find(context, caller, job_id), MOST_POINTS)
+    return ProgressHistory.model_validate({"points": points})
 
 
 @router.post(

@@ -32,6 +32,7 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from service.store.jobs import NewJob
 from sgsst_core.options import Declared, declared
+from sgsst_core.progress import Progress
 from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import ball, wall, write_files
 
@@ -1009,7 +1010,7 @@ def test_metrics_count_attempts_by_outcome(tmp_path: Path, files: dict[str, byte
             held = store.leases.take("one")
             assert held is not None
             store.leases.start(held)
-            store.leases.report_progress(held, {"step": step, "seconds": seconds, "total": 100})
+            store.leases.report_progress(held, Progress(stage="sos", step=step, total=100, seconds=seconds))
         text = client.get("/metrics").text
         samples = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
         assert samples["sgsst_lease_expirations_total"] == "1.0"

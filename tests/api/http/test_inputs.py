@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from email.message import Message
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import httpx
@@ -17,6 +18,7 @@ from api.http.sending import disposition
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
+from sgsst_core.progress import Progress
 from tests.api.service import Service, check_documented
 from tests.small_scenes import wall, write_files
 
@@ -221,9 +223,9 @@ def test_previews_and_loss_history(client: httpx.Client, files: dict[str, Path],
     names = ["previews/step_0000000.jpg", "previews/step_0000020.jpg"]
     store.leases.publish(held, [artifacts.put(job_id, held.epoch, name, image_path) for name in names])
     for step in range(1, 31):
-        known = {"stage": "sos", "total": 600, "fraction": step / 600, "eta_s": None, "attempt": held.job.attempt}
-        known |= {"step": step, "seconds": float(step), "loss": 100.0 / step, "scales": [None, 100.0 / step]}
-        store.leases.report_progress(held, known)
+        losses: dict[str, Any] = {"loss": 100.0 / step, "scales": [None, 100.0 / step]}
+        now = Progress(stage="sos", step=step, total=600, seconds=float(step), **losses)
+        store.leases.report_progress(held, now)
 
     (listed,) = [job for job in client.get("/v1/jobs").json()["jobs"] if job["id"] == job_id]
     shown = client.get(f"/v1/jobs/{job_id}").json()

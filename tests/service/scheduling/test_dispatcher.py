@@ -16,6 +16,7 @@ import pytest
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
 from service.scheduling.dispatcher import Dispatcher
+from service.scheduling.endings import Report
 from service.scheduling.machine import Machine, is_dead, own_name
 from service.scheduling.packing import Capacity, Grant, estimated_seconds
 from service.scheduling.running import RunningAttempt
@@ -25,6 +26,7 @@ from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
 from service.store.leases import Lease
+from sgsst_core.progress import Progress
 from tests.api.service import wait_for
 from tests.stores import new_store
 
@@ -108,9 +110,9 @@ def test_attempt_reports_its_expected_end(settings: ServiceSettings, store: Stor
     held = leased(store, "one")
     attempt = attempt_of(held, Grant(1, ("0",)), settings, store, tmp_path)
     for stage in ("planning", "preparing"):  # the remaining seconds of these stages are not the job's
-        attempt._handle({"kind": "stage", "stage": stage, "seconds_left": 3.0})
+        attempt._handle(Report(progress=Progress(stage=stage, eta_s=3.0)))
     assert attempt.holding == Holding(attempt.grant)
-    attempt._handle({"kind": "progress", "step": 1, "total": 2, "seconds_left": 1000.0})
+    attempt._handle(Report(progress=Progress(stage="sos", step=1, total=2, loss=1.0, eta_s=1000.0)))
     holding = attempt.holding
     assert holding.until is not None
     assert holding.until - store.database.clock() == pytest.approx(1000.0, abs=60.0)

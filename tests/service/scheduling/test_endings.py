@@ -10,7 +10,7 @@ import pytest
 
 from service import problems
 from service.scheduling.attempt_process import failure
-from service.scheduling.endings import Ending, Message, StopRequest, attempt_ending, cause_of_error, outage
+from service.scheduling.endings import Ending, StopRequest, attempt_ending, cause_of_error, outage
 from service.store.retries import Cause, cause_of
 from service.store.states import AttemptOutcome
 from sgsst_core.errors import (
@@ -21,23 +21,23 @@ from sgsst_core.errors import (
     RanksFailedError,
     WeightsError,
 )
+from worker.job import Result
 
-DONE: Message = {"kind": "done", "result": {"steps": 3}}
-INTERRUPTED: Message = {"kind": "interrupted"}
+DONE = Ending(AttemptOutcome.SUCCEEDED, Result(stopped="finished", steps=3, total=3))
 ERROR = {"code": "diverged", "message": "The loss is not finite."}
-FAILED: Message = {"kind": "failed", "error": ERROR, "permanent": True}
+FAILED = Ending(AttemptOutcome.FAILED, error=ERROR, permanent=True)
 REQUESTS = [None, StopRequest.CANCEL, StopRequest.RELEASE]
 
 
 def ending(
-    requested: StopRequest | None, last: Message | None, code: int = 0, log: str | None = "the log", **has: bool
+    requested: StopRequest | None, last: Ending | None, code: int = 0, log: str | None = "the log", **has: bool
 ) -> Ending:
     return attempt_ending(requested, last, code, log, **{"has_result": True, **has})
 
 
 @pytest.mark.parametrize("requested", REQUESTS)
 def test_finished_attempt_beats_stop_request(requested: StopRequest | None) -> None:
-    assert ending(requested, DONE) == Ending(AttemptOutcome.SUCCEEDED)
+    assert ending(requested, DONE) == DONE
 
 
 @pytest.mark.parametrize("requested", REQUESTS)
@@ -50,9 +50,9 @@ def test_finished_attempt_without_a_result_fails(requested: StopRequest | None) 
 @pytest.mark.parametrize(
     ("requested", "outcome"), [(StopRequest.CANCEL, "canceled"), (StopRequest.RELEASE, "released")]
 )
-@pytest.mark.parametrize("last", [INTERRUPTED, FAILED, None])
+@pytest.mark.parametrize("last", [FAILED, None])
 @pytest.mark.parametrize("code", [0, 1, -signal.SIGKILL])
-def test_requested_stop_is_not_a_failure(requested: StopRequest, outcome: str, last: Message | None, code: int) -> None:
+def test_requested_stop_is_not_a_failure(requested: StopRequest, outcome: str, last: Ending | None, code: int) -> None:
     assert ending(requested, last, code) == Ending(AttemptOutcome(outcome))
 
 
@@ -69,11 +69,10 @@ def test_process_ended_by_ray_is_an_outage() -> None:
 
 @pytest.mark.parametrize("permanent", [False, True])
 def test_reported_failure_is_recorded_unchanged(permanent: bool) -> None:
-    last: Message = {"kind": "failed", "error": ERROR, "permanent": permanent}
-    assert ending(None, last) == Ending(AttemptOutcome.FAILED, ERROR, permanent)
+    last = Ending(AttemptOutcome.FAILED, error=ERROR, permanent=permanent)
+    assert ending(None, last) == last
 
 
-@pytest.mark.parametrize("last", [INTERRUPTED, None])
 @pytest.mark.parametrize(
     ("code", "text"),
     [
@@ -83,13 +82,13 @@ def test_reported_failure_is_recorded_unchanged(permanent: bool) -> None:
         (0, "ended with code 0"),
     ],
 )
-def test_process_without_a_final_message_has_crashed(last: Message | None, code: int, text: str) -> None:
-    outcome = ending(None, last, code)
+def test_process_without_a_reported_ending_has_crashed(code: int, text: str) -> None:
+    outcome = ending(None, None, code)
     assert (outcome.outcome, outcome.permanent) == (AttemptOutcome.FAILED, False)
     error: dict[str, Any] = outcome.error or {}
     assert (error["code"], error["log"]) == ("crashed", "the log")
     assert text in error["message"]
-    assert "log" not in (ending(None, last, code, None).error or {})
+    assert "log" not in (ending(None, None, code, None).error or {})
 
 
 @pytest.mark.parametrize(
@@ -113,10 +112,9 @@ def test_process_without_a_final_message_has_crashed(last: Message | None, code:
 )
 def test_cause_of_each_error(error: Exception, cause: Cause) -> None:
     assert cause_of_error(error) == cause
-    message, its_own = failure(error), cause == Cause.JOB
-    assert (message["error"] == outage(cause)) == (not its_own)
-    assert cause_of(message["error"]) == cause
-    assert (str(error) in message.get("detail", "")) == (not its_own), "for the operator"
-    outcome = ending(None, message)
-    assert (outcome.outcome, outcome.detail) == (AttemptOutcome.FAILED, message.get("detail"))
-    assert its_own or not outcome.permanent
+    reported, its_own = failure(error), cause == Cause.JOB
+    assert (reported.error == outage(cause)) == (not its_own)
+    assert cause_of(reported.error) == cause
+    assert (str(error) in (reported.detail or "")) == (not its_own), "for the operator"
+    assert reported.outcome == AttemptOutcome.FAILED
+    assert its_own or not reported.permanent

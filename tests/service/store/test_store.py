@@ -32,6 +32,7 @@ from service.store.retries import MAX_LOSSES
 from service.store.states import ACTIVE, FINISHED
 from service.store.tables import Base, JobRow, ProgressPointRow, ShareRow
 from tests.raised import raises_problem
+from sgsst_core.progress import Progress
 from tests.service.store.helpers import (
     ATTEMPTS,
     LEASE,
@@ -179,7 +180,7 @@ def test_lost_lease_cannot_write(store: Store, clock: Clock) -> None:
     file = Published("stylized.ply", "x/1", 1, SHA)
     for write in (
         lambda: store.leases.start(late),
-        lambda: store.leases.report_progress(late, {"step": 1}),
+        lambda: store.leases.report_progress(late, Progress(stage="sos", step=1)),
         lambda: store.leases.publish(late, [file]),
         lambda: store.leases.succeed(late, [file], {}),
         lambda: store.leases.fail(late, {"code": "x", "message": "x"}, permanent=False),
@@ -389,7 +390,7 @@ def test_old_progress_events_are_deleted_but_not_status_events(store: Store) -> 
     queue(store)
     held = lease(store)
     for step in range(MAX_PROGRESS_EVENTS + 20):
-        store.leases.report_progress(held, {"step": step})
+        store.leases.report_progress(held, Progress(stage="sos", step=step))
     events = store.jobs.events(held.job_id, 0, limit=1000)
     assert [event.data["step"] for event in events if event.kind == "progress"] == list(
         range(20, MAX_PROGRESS_EVENTS + 20)
@@ -397,47 +398,48 @@ def test_old_progress_events_are_deleted_but_not_status_events(store: Store) -> 
     assert [event.data["status"] for event in events if event.kind == "status"] == ["queued", "starting"]
 
 
-def step_of(job: Lease, step: int, seconds: float, **more: Any) -> dict[str, Any]:
-    """Return a progress record as a dispatcher reports it."""
-    known = {"stage": "sos", "total": 10_000, "fraction": 0.5, "eta_s": 1.0, "scales": [1.0, None]}
-    return {**known, "step": step, "seconds": seconds, "loss": 1e6 / step, "attempt": job.job.attempt, **more}
+def at_step(step: int, seconds: float, stage: str = "sos") -> Progress:
+    """Return progress as a dispatcher reports it."""
+    return Progress(stage=stage, step=step, total=10_000, seconds=seconds, loss=1e6 / step, scales=[1.0, None])
 
 
 def test_loss_history_covers_the_whole_job(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     held = lease(store)
-    store.leases.report_progress(held, {"stage": "planning", "step": 1, "total": 3, "attempt": 1})
+    store.leases.report_progress(held, Progress(stage="planning", step=1, total=3))
     assert store.jobs.loss_history(store.jobs.get(job_id, None), 10) == []
     with store.database.writing() as session:  # like `report_progress`, without a transaction for each point
         for step in range(1, 5000):
-            add_point(session, job_id, {**step_of(held, step, 0.9 * step), "updated_at": clock.now + step})
+            added = {"attempt": 1, "updated_at": clock.now + step, "new": step}
+            add_point(session, job_id, at_step(step, 0.9 * step).model_dump() | added)
     clock.now += 5000
-    store.leases.report_progress(held, step_of(held, 5000, 4500.0, stage="measuring"))
+    store.leases.report_progress(held, at_step(5000, 4500.0, "measuring"))
     job = store.jobs.get(job_id, None)
     points = store.jobs.loss_history(job, 10_000)
-    assert [point.step for point in points[:5]] == [1, 2, 3, 4, 5]
-    assert (points[-1].step, points[-1].stage, points[-1].updated_at) == (5000, "measuring", clock.now)
-    assert (points[9].loss, points[9].scales, points[9].seconds) == (1e5, [1.0, None], 9.0)
-    ratios = [later.seconds / point.seconds for point, later in itertools.pairwise(points[:-1])]
+    assert [point["step"] for point in points[:5]] == [1, 2, 3, 4, 5]
+    assert (points[-1]["step"], points[-1]["stage"], points[-1]["updated_at"]) == (5000, "measuring", clock.now)
+    assert (points[9]["loss"], points[9]["scales"], points[9]["seconds"]) == (1e5, [1.0, None], 9.0)
+    assert points[9]["new"] == 10, "what has no column is stored too"
+    ratios = [later["seconds"] / point["seconds"] for point, later in itertools.pairwise(points[:-1])]
     assert all(ratio >= GROWTH for ratio in ratios)
     assert all(ratio < GROWTH + 0.01 for ratio in ratios[100:]), "no gaps"
     assert len(points) < 550
     few = store.jobs.loss_history(job, 64)
     assert len(few) == 64
-    assert (few[0].step, few[-1].step) == (1, 5000)
-    assert [point.step for point in few] == sorted({point.step for point in few})
+    assert (few[0]["step"], few[-1]["step"]) == (1, 5000)
+    assert [point["step"] for point in few] == sorted({point["step"] for point in few})
 
 
 def test_loss_history_continues_across_attempts(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     held = lease(store)
     for step in (1, 2, 3, 4):
-        store.leases.report_progress(held, step_of(held, step, float(step)))
+        store.leases.report_progress(held, at_step(step, float(step)))
     store.leases.release(held)
     again = lease(store)
     for step, seconds in ((3, 3.0), (3, 3.0), (2, 2.0), (5, 5.0)):  # from a checkpoint of step 2; ranks were lost once
-        store.leases.report_progress(again, step_of(again, step, seconds))
-    points = [(point.attempt, point.step) for point in store.jobs.loss_history(store.jobs.get(job_id, None), 100)]
+        store.leases.report_progress(again, at_step(step, seconds))
+    points = [(point["attempt"], point["step"]) for point in store.jobs.loss_history(store.jobs.get(job_id, None), 100)]
     assert points == [(1, 1), (1, 2), (1, 3), (1, 4), (2, 3), (2, 5)]
     store.leases.fail(again, {"code": "x", "message": "x"}, permanent=True)
     store.jobs.retry(job_id, None, limit=10)
@@ -456,12 +458,12 @@ def test_long_loss_history_is_thinned(store: Store, monkeypatch: pytest.MonkeyPa
     for _ in range(12):
         held = lease(store)
         for step in range(1, 21):
-            store.leases.report_progress(held, step_of(held, step, float(step)))
+            store.leases.report_progress(held, at_step(step, float(step)))
         store.leases.release(held)
     points = store.jobs.loss_history(store.jobs.get(job_id, None), 1000)
     assert len(points) <= 40 + 20
-    assert (points[0].attempt, points[0].step) == (1, 1)
-    assert (points[-1].attempt, points[-1].step) == (12, 20)
+    assert (points[0]["attempt"], points[0]["step"]) == (1, 1)
+    assert (points[-1]["attempt"], points[-1]["step"]) == (12, 20)
 
 
 def test_newest_preview_of_each_job(store: Store) -> None:

@@ -17,7 +17,8 @@ from sgsst_core.planning.context import PlanningContext, equip
 from sgsst_core.planning.facts import Link, Rate
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.probe import _side, measure, measure_rate
-from sgsst_core.planning.survey import PROBING, PlanningProgress, progress_of, survey_views
+from sgsst_core.planning.survey import progress_of, survey_views
+from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
@@ -125,20 +126,20 @@ def test_survey_counts_the_gaussians_that_a_view_shows() -> None:
 
 
 def test_survey_reports_its_progress() -> None:
-    scene, reports = wall(), list[PlanningProgress]()
+    scene, reports = wall(), list[Progress]()
     survey_views(scene, cameras(3), make_rasterizer("cpu", scene), show=reports.append)
-    assert [(progress.done, progress.total) for progress in reports] == [(0, 3), (1, 3), (2, 3), (3, 3)]
-    assert reports[0].seconds_left is None
-    assert all(progress.seconds_left is not None for progress in reports[1:])
-    assert reports[1].seconds_left > 0  # type: ignore[operator]
-    assert reports[-1].seconds_left == 0
+    assert [(progress.step, progress.total) for progress in reports] == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert reports[0].eta_s is None
+    assert all(progress.eta_s is not None for progress in reports[1:])
+    assert reports[1].eta_s > 0  # type: ignore[operator]
+    assert reports[-1].eta_s == 0
     assert [progress.fraction for progress in reports] == [0, 1 / 3, 2 / 3, 1]
 
 
 def test_progress_assumes_that_other_ranks_are_as_fast() -> None:
-    assert progress_of(0, 5, 2, 0.1) == PlanningProgress(0, 5, None)
-    assert progress_of(2, 5, 2, 4.0) == PlanningProgress(4, 5, 1.0)
-    assert progress_of(3, 5, 2, 6.0) == PlanningProgress(5, 5, 0.0)
+    assert progress_of(0, 5, 2, 0.1) == Progress(stage="planning", step=0, total=5)
+    assert progress_of(2, 5, 2, 4.0) == Progress(stage="planning", step=4, total=5, eta_s=1.0)
+    assert progress_of(3, 5, 2, 6.0) == Progress(stage="planning", step=5, total=5, eta_s=0.0)
 
 
 def test_plan_requires_cameras_that_see_the_scene(tiny_weights: BackboneWeights) -> None:
@@ -148,10 +149,10 @@ def test_plan_requires_cameras_that_see_the_scene(tiny_weights: BackboneWeights)
 
 
 def test_earlier_survey_is_reused(tiny_weights: BackboneWeights) -> None:
-    scene, settings, reports = wall(), make_settings(), list[PlanningProgress]()
+    scene, settings, reports = wall(), make_settings(), list[Progress]()
     first, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
     second, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights, survey=first.survey, show=reports.append)
-    assert reports == [PROBING]
+    assert reports == [Progress(stage="probing")]
     assert second.survey is first.survey
     assert torch.equal(second.seen, first.seen)
 

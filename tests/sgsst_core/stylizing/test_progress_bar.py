@@ -9,10 +9,10 @@ import numba
 import pytest
 from rich.console import Console
 
-from sgsst_core.planning.survey import PROBING, PlanningProgress
+from sgsst_core.number_format import clock
+from sgsst_core.progress import Progress
 from sgsst_core.stylizing import progress_bar
-from sgsst_core.stylizing.loop import Progress
-from sgsst_core.stylizing.progress_bar import clock, job_bar
+from sgsst_core.stylizing.progress_bar import job_bar
 
 
 def shown(*, terminal: bool) -> str:
@@ -20,15 +20,16 @@ def shown(*, terminal: bool) -> str:
     console = Console(file=io.StringIO(), force_terminal=terminal, width=120, color_system=None)
     with job_bar(console) as bar:
         for done, left in [(0, None), (3, 125.0), (8, 0.0)]:
-            bar.show_planning(PlanningProgress(done, 8, left))
+            bar.show(Progress(stage="planning", step=done, total=8, eta_s=left))
             bar._bar.refresh()  # now, instead of within a tenth of a second
-        bar.show_planning(PROBING)
+        bar.show(Progress(stage="probing"))
         bar._bar.refresh()
-        bar.start(0, 50)
+        bar.show(Progress(stage="starting", total=50))
         for step in (1, 2):
-            bar.show(Progress("coarse", step, 50, 123.4, 1.0, 61.0))
+            bar.show(Progress(stage="coarse", step=step, total=50, loss=123.4, eta_s=61.0))
             bar._bar.refresh()
-        bar.show(Progress("measuring", 2, 50, 123.4, 1.0, 0.4, views=(3, 6)))
+        checked = {"views_checked": 3, "views_to_check": 6}
+        bar.show(Progress(stage="measuring", step=2, total=50, loss=123.4, eta_s=0.4, **checked))
         bar._bar.refresh()
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
@@ -36,11 +37,11 @@ def shown(*, terminal: bool) -> str:
 
 def test_terminal_shows_views_then_steps() -> None:
     output = shown(terminal=True)
-    for text in ("Surveying the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123 1:01 left"):
+    for text in ("Surveying the views", "0/8", "3/8 2:05 left", "8/8", "coarsest scale", "2/50 loss 123, 1:01 left"):
         assert text in output
     measuring, checking = output.index("Measuring the speed"), output.index("checking quality")
     assert "8/8" not in output[measuring:], "the survey is over"
-    assert "3/6 loss 123 almost done" in output[checking:]
+    assert "3/6 loss 123, almost done" in output[checking:]
 
 
 def test_terminal_shows_compilation_of_kernels() -> None:
@@ -48,7 +49,7 @@ def test_terminal_shows_compilation_of_kernels() -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
     with job_bar(console) as bar:
         for _ in range(2):
-            bar.show_planning(PlanningProgress(0, 8, None))
+            bar.show(Progress(stage="planning", step=0, total=8))
             add(1, 2)
             bar._bar.refresh()
     assert isinstance(console.file, io.StringIO)
@@ -60,10 +61,11 @@ def test_log_prints_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None
     assert shown(terminal=False).strip() == ""
     monkeypatch.setattr(progress_bar, "LOG_SECONDS", 0.0)
     assert shown(terminal=False).strip().splitlines() == [
-        "Surveying the views: 0 of 8",
-        "Surveying the views: 3 of 8, 2:05 left",
-        "Surveying the views: 8 of 8, almost done",
+        "Surveying the views: view 0 of 8",
+        "Surveying the views: view 3 of 8, 2:05 left",
+        "Surveying the views: view 8 of 8, almost done",
         "Measuring the speed",
+        "starting: step 0 of 50",
         "coarsest scale: step 1 of 50, loss 123, 1:01 left",
         "coarsest scale: step 2 of 50, loss 123, 1:01 left",
         "checking quality: view 3 of 6, loss 123, almost done",

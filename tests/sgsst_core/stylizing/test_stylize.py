@@ -17,7 +17,7 @@ from sgsst_core import Callbacks, Stylizer, load_scene, make_settings, save, sty
 from sgsst_core.errors import CameraError, ImageError, SceneError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import as_scene
-from sgsst_core.planning.survey import PROBING, PlanningProgress
+from sgsst_core.progress import Progress
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import Rendering
@@ -198,11 +198,11 @@ def test_progress_is_shown_on_a_terminal_only_on_request(
 
 
 def test_planning_reports_its_progress(tiny_weights: BackboneWeights) -> None:
-    surveyed: list[PlanningProgress] = []
+    surveyed: list[Progress] = []
     settings = make_settings("preview", steps_sos=1)
     Stylizer.planned(wall(), cameras(3), style(), settings, weights=tiny_weights, show=surveyed.append)
-    assert [(each.done, each.total) for each in surveyed[:-1]] == [(done, 3) for done in range(4)]
-    assert surveyed[-1] == PROBING
+    assert [(each.step, each.total) for each in surveyed[:-1]] == [(done, 3) for done in range(4)]
+    assert surveyed[-1] == Progress(stage="probing")
 
 
 def test_importing_the_package_imports_no_pytorch() -> None:

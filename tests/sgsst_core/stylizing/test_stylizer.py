@@ -16,6 +16,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
 from sgsst_core.planning.planner import make_plan
+from sgsst_core.progress import Progress
 from sgsst_core.rasterizer.tile_intersections import TileIntersections, build_tile_intersections
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
@@ -23,7 +24,7 @@ from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job
-from sgsst_core.stylizing.loop import Callbacks, Progress, run
+from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
 from tests.sgsst_core.synthetic_images import synthetic_image
@@ -203,7 +204,7 @@ def test_stop_request_ends_the_run_between_steps(tiny_weights: BackboneWeights, 
     assert run(stylizer, callbacks) == "interrupted"
     assert saved == [3]
     assert [(p.step, p.total, p.stage) for p in seen] == [(1, 5, "sos"), (2, 5, "sos"), (3, 5, "sos")]
-    assert all(p.seconds_left > 0 for p in seen)
+    assert all((p.eta_s or 0) > 0 for p in seen)
 
 
 def test_style_time_is_not_counted_as_time_of_a_view(
@@ -221,7 +222,7 @@ def test_style_time_is_not_counted_as_time_of_a_view(
     monkeypatch.setattr(stylizer.job.loss.targets, "of_style", slowly)
     run(stylizer, Callbacks(progress=seen.append))
     assert seen[0].seconds > 1000
-    assert all(now.seconds_left < 1000 for now in seen)
+    assert all((now.eta_s or 0) < 1000 for now in seen)
 
 
 def test_result_is_cached_for_the_same_colors(tiny_weights: BackboneWeights, scene: Scene) -> None:

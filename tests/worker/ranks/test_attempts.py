@@ -17,8 +17,7 @@ import pytest
 from PIL import Image
 
 from sgsst_core.errors import SceneError
-from sgsst_core.stylizing.evaluation import mean_loss
-from sgsst_core.stylizing.loop import Progress
+from sgsst_core.progress import Progress
 from tests.api.service import PATIENCE, wait_for
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, name_of, shared_memory, small_request
 from worker.description import Prepared
@@ -59,29 +58,29 @@ class EventRecorder:
 
     stop_at: int | None = None
     finish_at: int | None = None
-    planned: list[float] = field(default_factory=list)
+    planned: list[Progress] = field(default_factory=list)
     prepared: list[Prepared] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
     happened: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    previews: list[Path] = field(default_factory=list)
 
     def listener(self) -> Listener:
         def progress(current: Progress) -> None:
-            self.steps.append(current.step)
+            if current.is_step:
+                self.steps.append(current.step)
+            elif current.total:
+                self.planned.append(current)
 
         def reached(step: int | None) -> bool:
             return step is not None and bool(self.steps) and self.steps[-1] >= step
 
         return Listener(
-            planning=lambda now: self.planned.append(now.fraction),
             prepared=self.prepared.append,
             progress=progress,
             happened=self.happened.append,
             warn=self.warnings.append,
             stop=lambda: reached(self.stop_at),
             finish=lambda: reached(self.finish_at),
-            preview=self.previews.append,
         )
 
 
@@ -108,7 +107,8 @@ def run(
 def loss_of(ended: RanksResult) -> float:
     """Return the final loss on the evaluation views."""
     assert ended.result is not None
-    return mean_loss(ended.result.after)
+    assert ended.result.loss_after is not None
+    return ended.result.loss_after
 
 
 @pytest.fixture(scope="module")
@@ -118,14 +118,16 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
     events = EventRecorder()
     ended = run(request, cluster, events)
     assert ended.attempts == []
-    assert events.planned.pop() == 0.0, "measured speed follows the survey"
-    assert events.planned == sorted(set(events.planned))
+    assert events.planned.pop().stage == "starting"
+    surveyed = [now.step for now in events.planned]
+    assert surveyed == sorted(set(surveyed))
     assert events.steps[-1] == ended.total == STEPS
     report = json.loads(request.out.with_name("s.report.json").read_text())
     assert report["workers"]["used"] == 2
     assert len(report["workers"]["ranks"]) == 2
-    assert events.previews
-    for path in events.previews:
+    previews = list(request.out.with_name("previews").iterdir())
+    assert previews
+    for path in previews:
         with Image.open(path) as image:
             assert image.format == "JPEG"
     return loss_of(ended), request.out.read_bytes()
@@ -135,7 +137,7 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
 def test_two_ranks_reach_the_loss_of_one_rank(undisturbed: tuple[float, bytes], tmp_path: Path) -> None:
     job = prepare(small_request(tmp_path, STEPS))
     alone = execute(job, progress=lambda step: None, stop=lambda: False, warn=pytest.fail)
-    assert undisturbed[0] == pytest.approx(mean_loss(alone.after), rel=TOLERANCE)
+    assert undisturbed[0] == pytest.approx(alone.loss_after, rel=TOLERANCE)
 
 
 @pytest.mark.slow

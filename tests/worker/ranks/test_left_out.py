@@ -12,7 +12,7 @@ from typing import Any
 import psutil
 import pytest
 
-from sgsst_core.stylizing.loop import Progress
+from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, small_request
 from worker.ranks import cluster
 from worker.ranks.attempts import WorkerOptions, stylize_on_ranks
