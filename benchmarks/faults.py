@@ -29,10 +29,9 @@ import psutil
 from benchmarks.machine import write_result
 from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
-from worker.ranks.attempts import RanksResult, WorkerOptions, stylize_on_ranks
+from worker.job import JobSpec
+from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
 from worker.ranks.cluster import Cluster
-from worker.ranks.listener import Listener
-from worker.request import StylizeRequest
 
 STEPS = 250
 #: Number of faults per job. An attempt makes a few dozen steps before its fault.
@@ -73,7 +72,7 @@ class Chaos:
         faults: Queue of faults; a fault that has not occurred when the job ends is put back.
     """
 
-    def __init__(self, request: StylizeRequest, cluster: Cluster, faults: list[Fault | DaemonFault]) -> None:
+    def __init__(self, request: JobSpec, cluster: Cluster, faults: list[Fault | DaemonFault]) -> None:
         self._request = request
         self._cluster = cluster
         self._faults = faults

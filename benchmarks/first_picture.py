@@ -15,9 +15,9 @@ from pathlib import Path
 import psutil
 
 from sgsst_core import make_settings
+from worker.job import JobSpec, SceneRequest
 from worker.prepare import prepare
 from worker.previews import Previews
-from worker.request import SceneRequest, StylizeRequest
 from worker.styles import StyleFile
 
 
@@ -35,7 +35,9 @@ def main() -> None:
     source = SceneRequest(scene=arguments.scene, cameras=arguments.cameras, orbit=None if arguments.cameras else 24)
     settings, styles = make_settings(arguments.preset), (StyleFile(arguments.style),)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    request = StylizeRequest(source, styles, None, arguments.out / "stylized.ply", "vgg16", False, settings)
+    request = JobSpec(
+        source=source, styles=styles, out=arguments.out / "stylized.ply", settings=settings, backbone="vgg16"
+    )
     preview = Previews(arguments.out / "previews", 0.0, print)
     job = prepare(request, preview=preview)
     from worker.execute import execute  # as jobs of the service do: after the first preview

@@ -87,9 +87,9 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
     # Imported here, because the time of imports is part of the job's time.
     from sgsst_core.report.machine import peak_memory
     from worker.execute import execute
+    from worker.job import JobSpec, SceneRequest
     from worker.options import StylizeOptions
     from worker.prepare import prepare
-    from worker.request import SceneRequest, StylizeRequest
     from worker.styles import StyleFile
 
     (case,) = arguments.cases
@@ -111,9 +111,8 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         source = SceneRequest.of(Path(scene), arguments.cameras, options)
         out = Path(folder) / "stylized.ply"
-        request = StylizeRequest(
-            source, (StyleFile(arguments.style),), None, out, options.backbone, False, options.settings()
-        )
+        styles, settings = (StyleFile(arguments.style),), options.settings()
+        request = JobSpec(source=source, styles=styles, out=out, settings=settings, backbone=options.backbone)
         job = prepare(request)
         prepared = time.perf_counter() - started
         begun = peak_memory()

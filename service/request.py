@@ -1,4 +1,4 @@
-"""Conversion of a stored job to a request for the worker."""
+"""Conversion of a stored job to a specification for the worker."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 from service.files.staging import RESULT, Staged, region_mask, region_styles, staged_name
 from service.parameters import JobParameters
+from worker.job import JobSpec, SceneRequest
 from worker.region_requests import RegionRequest
-from worker.request import SceneRequest, StylizeRequest
 from worker.styles import StyleFile
 
 
@@ -39,17 +39,16 @@ def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, 
     return tuple(map(staged_region, parameters.region_requests))
 
 
-def stylize_request(staged: Staged, parameters: JobParameters) -> StylizeRequest:
-    """Return the complete request; its paths are relative to the staging folder."""
-    return StylizeRequest(
-        scene_request(staged, parameters),
-        _styles(staged, parameters),
-        staged.photos,
-        Path("out", RESULT),
-        parameters.backbone,
-        False,
-        parameters.settings(),
-        _regions(staged, parameters),
+def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
+    """Return the specification of a job; its paths are relative to the staging folder."""
+    return JobSpec(
+        source=scene_request(staged, parameters),
+        styles=_styles(staged, parameters),
+        images=staged.photos,
+        out=Path("out", RESULT),
+        settings=parameters.settings(),
+        backbone=parameters.backbone,
+        regions=_regions(staged, parameters),
         colors=True,
         style_background=parameters.style_background,
         video=parameters.video,

@@ -27,7 +27,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.lens import undistorted
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.settings import Settings
-from worker.request import SceneRequest
+from worker.job import SceneRequest
 
 #: Axes of an SPZ scene are those under which a typical view shows this many times as many Gaussians.
 _CLEARLY_MORE = 2.0

@@ -26,9 +26,9 @@ from sgsst_core.stylizing.loop import Callbacks, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.job import Result
 from worker.options import RunOptions
+from worker.outputs import Outputs
 from worker.prepare import Job, Warn
 from worker.previews import Previews
-from worker.request import Outputs
 from worker.video import write_job_video
 
 #: Default seconds between checkpoints. If a rank is lost, at most this much work is repeated.

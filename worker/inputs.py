@@ -35,8 +35,8 @@ from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job_styles import check_style_size
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
+from worker.job import JobSpec, SceneRequest
 from worker.ranks.shared_scene import read_shared_scene
-from worker.request import SceneRequest, StylizeRequest
 from worker.selecting import select_regions
 from worker.styles import StyleFile
 
@@ -83,7 +83,7 @@ class Inputs:
         return (lambda index: load_photo(photos[index], cameras[index], background=background)) if photos else None
 
 
-def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> Inputs:
+def read_inputs(request: JobSpec, collectives: Collectives = ALONE) -> Inputs:
     """Read all inputs of a job. Every rank must call this function.
 
     Raises:
@@ -123,7 +123,7 @@ def read_inputs(request: StylizeRequest, collectives: Collectives = ALONE) -> In
 
 
 def read_regions(
-    request: StylizeRequest, file: SceneFile, cameras: Sequence[Camera], collectives: Collectives = ALONE
+    request: JobSpec, file: SceneFile, cameras: Sequence[Camera], collectives: Collectives = ALONE
 ) -> Regions | None:
     """Return the requested regions of a scene, or None if none are requested. Every rank must call this function.
 

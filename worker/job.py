@@ -1,13 +1,71 @@
-"""A job as data: what came out of it (`Result`); `sgsst_core.progress` has what is happening.
+"""A job as data: what is asked (`JobSpec`) and what came out (`Result`); `sgsst_core.progress` has what is happening.
 
-Neither PyTorch nor Ray is imported.
+They are dumped once and sent, stored and shown unchanged. Neither PyTorch nor Ray is imported.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from sgsst_core.errors import CameraError, SettingsError
+from sgsst_core.settings import Color, Settings
+from worker.options import Backbone, JobVideo, ViewOptions
+from worker.region_requests import RegionRequest
+from worker.styles import StyleFile
+
+
+class SceneRequest(ViewOptions):
+    """Scene and cameras of a request.
+
+    Attributes:
+        scene: Path of the 3DGS scene, in any of `FORMATS`.
+        cameras: Camera file or folder; None for an orbit.
+    """
+
+    scene: Path
+    cameras: Path | None = None
+
+    @staticmethod
+    def of(scene: Path, cameras: Path | None, options: ViewOptions) -> SceneRequest:
+        """Return a request for these files with the view options of `options`, whose other fields are ignored."""
+        seen = options.model_dump(include=set(ViewOptions.model_fields))
+        return SceneRequest(scene=scene, cameras=cameras, **seen)
+
+
+class JobSpec(BaseModel):
+    """Specification of one stylization job.
+
+    Attributes:
+        source: Scene and cameras.
+        styles: Style images and their weights.
+        images: Folder of photos for the content term; None for unstylized renders.
+        out: PLY to write, or compressed file to write beside a PLY; see `Outputs.of`.
+        settings: Settings of the method.
+        backbone: Feature network.
+        resume: Whether to resume from the checkpoint beside `out`.
+        regions: Regions with their own style or frozen colors, from `region_requests`.
+        colors: Whether to also write a file of the stylized colors alone, if nothing else of the scene changes.
+        style_background: sRGB color behind transparent parts of style images, in 0..1.
+        video: Options of a video of the result; None for no video.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    source: SceneRequest
+    styles: tuple[StyleFile, ...]
+    images: Path | None = None
+    out: Path
+    settings: Settings
+    backbone: Backbone = "auto"
+    resume: bool = False
+    regions: tuple[RegionRequest, ...] = ()
+    colors: bool = False
+    style_background: Color = (1.0, 1.0, 1.0)
+    video: JobVideo | None = None
 
 
 class Result(BaseModel):
@@ -34,3 +92,49 @@ class Result(BaseModel):
     report_error: str | None = None
     compressed: str | None = Field(None, exclude=True)
     loss_over_time: dict[str, Any] | None = Field(None, exclude=True)
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Choice of the checkpoint that a job resumes from.
+
+    Attributes:
+        wanted: Whether to resume; False starts from the beginning.
+        required: Whether a missing or unusable checkpoint is an error. If False, the job then starts from the
+            beginning.
+        run: Identifier of the run whose checkpoints are accepted; None accepts all checkpoints of the same job.
+    """
+
+    wanted: bool
+    required: bool = True
+    run: str | None = None
+
+
+def check_choice(source: SceneRequest, images: Path | None = None) -> None:
+    """Check that cameras come from exactly one source, and that photos are given only with camera files.
+
+    Raises:
+        CameraError: If the options contradict each other or no cameras are given.
+    """
+    if source.cameras is None and source.orbit is None:
+        raise CameraError(
+            "There are no cameras. Give a camera file with --cameras, or --orbit N for N views around the scene."
+        )
+    if source.cameras is not None and source.orbit is not None:
+        raise CameraError("Both --cameras and --orbit are given. Use only one of them.")
+    if source.orbit is None and (source.elevation is not None or source.radius is not None):
+        raise CameraError("--elevation and --radius require --orbit. Add it, or omit them.")
+    if images is not None and source.orbit is not None:
+        raise CameraError(
+            "--images requires --cameras, and cannot be combined with --orbit. Use --cameras, or omit --images."
+        )
+
+
+def check_steps(settings: Settings) -> None:
+    """Check that there is at least one step.
+
+    Raises:
+        SettingsError: If both numbers of steps are 0.
+    """
+    if not settings.steps_coarse + settings.steps_sos:
+        raise SettingsError("Both numbers of steps are 0, so that nothing would change. Give some.")

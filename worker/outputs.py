@@ -1,14 +1,21 @@
-"""Checks of the files that a command is asked to write, before any work starts. PyTorch is not imported."""
+"""Output files of jobs and commands, checked before any work starts. PyTorch is not imported."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.formats import RESULT_SUFFIXES, format_of_name
+from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
+from worker.job import JobSpec, check_choice, check_steps
+
+if TYPE_CHECKING:
+    from sgsst_core.stylizing.checkpoint import Checkpoints
 
 
 def result_format(out: Path) -> SceneFormat:
@@ -59,3 +66,113 @@ def check_folder(folder: Path) -> None:
     while not (folder.exists() or folder.is_symlink()) and folder != folder.parent:
         folder = folder.parent
     ensure_writable_folder(folder)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Output files of a job, named after its PLY so that jobs can share a folder.
+
+    Attributes:
+        ply: Stylized scene.
+        compressed: Stylized scene in another format, which the suffix of its name determines; None if not requested.
+    """
+
+    ply: Path
+    compressed: Path | None = None
+
+    @staticmethod
+    def of(out: Path) -> Outputs:
+        """Return the output files of a job, given the name of its PLY or of the compressed file beside it.
+
+        Raises:
+            OutputError: If the name does not end in a suffix of a format that can be written.
+        """
+        format = result_format(out)
+        if format is PLY:
+            return Outputs(out)
+        return Outputs(out.with_name(out.name[: -len(format.suffix)] + PLY.suffix), out)
+
+    @property
+    def compressed_format(self) -> SceneFormat | None:
+        """Return the format of the compressed file; None if there is none."""
+        return None if self.compressed is None else format_of_name(self.compressed.name)
+
+    def _beside(self, suffix: str) -> Path:
+        return self.ply.with_name(self.ply.stem + suffix)
+
+    @property
+    def report(self) -> Path:
+        """Return the path of the JSON report."""
+        return self._beside(".report.json")
+
+    @property
+    def page(self) -> Path:
+        """Return the path of the HTML report."""
+        return self._beside(".report.html")
+
+    @property
+    def plan(self) -> Path:
+        """Return the path of the JSON plan."""
+        return self._beside(".plan.json")
+
+    @property
+    def sheet(self) -> Path:
+        """Return the path of the contact sheet."""
+        return self._beside(".before_after.jpg")
+
+    @property
+    def views(self) -> Path:
+        """Return the path of the unstylized renders of an orbit's views."""
+        return self._beside(".views.jpg")
+
+    @property
+    def curves(self) -> Path:
+        """Return the path of the loss curves."""
+        return self._beside(".loss.png")
+
+    @property
+    def colors(self) -> Path:
+        """Return the path of the stylized colors alone."""
+        return self._beside(".colors.f16")
+
+    @property
+    def video(self) -> Path:
+        """Return the path of the video."""
+        return self._beside(".video.mp4")
+
+    @property
+    def checkpoint(self) -> Path:
+        """Return the path of the newest checkpoint."""
+        return self._beside(".checkpoint.safetensors")
+
+    @property
+    def all(self) -> list[Path]:
+        """Return the paths of all output files except the older checkpoint, which is only created by renaming."""
+        paths = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
+        paths += [self.colors, self.video]
+        return paths if self.compressed is None else [*paths, self.compressed]
+
+    @property
+    def checkpoints(self) -> Checkpoints:
+        """Return the checkpoints from which an unfinished job can resume."""
+        from sgsst_core.stylizing.checkpoint import Checkpoints
+
+        return Checkpoints(self.checkpoint)
+
+
+def check_request(request: JobSpec) -> Outputs:
+    """Check a request as far as possible without reading the inputs, and return the output files. Creates nothing.
+
+    Raises:
+        InvalidInputError: If there are no steps or no cameras, or the outputs cannot be written.
+    """
+    check_steps(request.settings)
+    check_choice(request.source, request.images)
+    out = request.out
+    check_file(out)
+    outputs = Outputs.of(out)
+    for path in (outputs.ply, outputs.compressed):
+        if path is not None:
+            remark = "" if path == out else f" (the PLY beside {out.name})"
+            check_is_not_input(path, request.source.scene, remark=remark)
+    return outputs

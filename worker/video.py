@@ -25,9 +25,9 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.capture import about_notes, about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view
+from worker.job import SceneRequest, check_choice
 from worker.options import DEFAULT_SIDE, JobVideo, VideoOptions
 from worker.outputs import check_folder, check_is_not_input
-from worker.request import SceneRequest, check_choice
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from worker.region_requests import RegionOptions, region_options, region_request
 from worker.styles import parse_styles
 
 if TYPE_CHECKING:
-    from worker.request import StylizeRequest
+    from worker.job import JobSpec
 
 
 def local_path(text: str) -> Path:
@@ -153,18 +153,18 @@ class JobInputs:
             self.region_content_weight or (),
         )
 
-    def request(self, options: StylizeOptions, out: Path, *, resume: bool = False) -> StylizeRequest:
+    def request(self, options: StylizeOptions, out: Path, *, resume: bool = False) -> JobSpec:
         """Return the request of a job on this machine.
 
         Raises:
             SettingsError: If options are malformed or contradict each other, or a file is a URL.
         """
-        from worker.request import SceneRequest, StylizeRequest
+        from worker.job import JobSpec, SceneRequest
 
         for style in self.style:
             local_path(style)
         cameras = None if self.cameras is None else local_path(self.cameras)
-        return StylizeRequest(
+        return JobSpec(
             source=SceneRequest.of(local_path(self.scene), cameras, options),
             styles=parse_styles(self.style),
             images=self.images,

@@ -23,7 +23,7 @@ from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.report.machine import machine
 from sgsst_core.scene.camera import Camera
 from worker.inputs import read_scene_and_capture
-from worker.request import SceneRequest, check_choice
+from worker.job import SceneRequest, check_choice
 
 Result = TypeVar("Result")
 

@@ -39,7 +39,7 @@ class VariantsInputs:
     def request(self, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path) -> VariantsRequest:
         """Return the request for these variants, which are separated by commas."""
         from api.cli.bench import VariantsRequest
-        from worker.request import SceneRequest
+        from worker.job import SceneRequest
 
         source = SceneRequest.of(self.scene, self.cameras, options)
         settings = {**chosen.given_settings(), "near": options.near}

@@ -32,7 +32,7 @@ from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 if TYPE_CHECKING:
     from sgsst_core.planning.plan import Plan
     from sgsst_core.settings import Color
-    from worker.request import SceneRequest
+    from worker.job import SceneRequest
     from worker.video import VideoRequest
 
 #: Number of frames after which the time of a video is estimated.
@@ -92,7 +92,7 @@ def check(
 ) -> None:
     """Report extreme values in a scene, its views and its style, and their consequences."""
     from api.cli.scene_tools import look_for_extremes
-    from worker.request import SceneRequest
+    from worker.job import SceneRequest
 
     source = SceneRequest.of(scene, cameras, options)
     with spinner("Checking the scene and every view"):
@@ -139,7 +139,7 @@ def render(
     chosen: StylizeOptions,
 ) -> None:
     """Render all views of a scene as images, or a video along a camera path."""
-    from worker.request import SceneRequest
+    from worker.job import SceneRequest
 
     source, background = SceneRequest.of(scene, cameras, options), chosen.settings().background
     given = [*video_options.model_fields_set, *(["compare"] if compare else []), *(["transparent"] * transparent)]
@@ -224,7 +224,7 @@ def convert(
 ) -> None:
     """Convert a scene to another format, which the name of OUT determines."""
     from api.cli.scene_tools import convert_scene
-    from worker.request import SceneRequest
+    from worker.job import SceneRequest
 
     converted = convert_scene(SceneRequest.of(scene, cameras, options), out, compare)
     for line in converted.decisions:

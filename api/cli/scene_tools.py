@@ -41,10 +41,10 @@ from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import about_notes, about_rendering, choose_axes, read_capture
-from worker.description import describe_scene
 from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
+from worker.job import JobSpec, SceneRequest, check_choice
 from worker.outputs import check_is_not_input, result_format
-from worker.request import SceneRequest, StylizeRequest, check_choice
+from worker.prepare import describe_scene
 from worker.styles import split_weight
 
 #: Number of views of an orbit that a converted scene is compared in.
@@ -53,7 +53,7 @@ _COMPARED_VIEWS = 3
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 
-def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None, sheet: Path | None = None) -> Plan:
+def make_plan(request: JobSpec, show_planning: ShowPlanning | None = None, sheet: Path | None = None) -> Plan:
     """Plan a job as `sgsst stylize` would, without making a step, and write the plan as JSON.
 
     Args:
@@ -105,7 +105,7 @@ def make_plan(request: StylizeRequest, show_planning: ShowPlanning | None = None
     return plan
 
 
-def _input_images(request: StylizeRequest) -> Iterator[tuple[Path, str]]:
+def _input_images(request: JobSpec) -> Iterator[tuple[Path, str]]:
     """Yield the path and the description of each image that a job may read."""
     for style in (*request.styles, *(each for region in request.regions for each in region.styles)):
         yield style.path, "style image"

@@ -16,7 +16,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from worker.inputs import check_something_seen, read_scene_and_capture
-from worker.request import SceneRequest, check_choice
+from worker.job import SceneRequest, check_choice
 
 #: Longer side in pixels of the views on the page, unless the request has another.
 STUDY_SIDE = 960

@@ -38,7 +38,7 @@ def make(
     The page is one file, works offline and saves the votes as JSON. Keep the key, which is written beside it.
     """
     from api.cli.study import key_path, make_study
-    from worker.request import SceneRequest
+    from worker.job import SceneRequest
 
     source = SceneRequest.of(Path(), cameras, options)
     if options.views is None and options.orbit is None:

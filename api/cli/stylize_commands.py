@@ -22,10 +22,10 @@ from sgsst_core.stylizing.progress_bar import job_bar
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
-    from worker.description import Prepared
-    from worker.job import Result
+    from worker.job import JobSpec, Result
+    from worker.outputs import Outputs
+    from worker.prepare import Prepared
     from worker.ranks.attempts import RanksResult, WorkerOptions
-    from worker.request import Outputs, StylizeRequest
 
 #: Resolution and number of steps of the demo, and seconds after which it stops on a slow machine. The whole demo takes
 #: less than five minutes.
@@ -66,7 +66,7 @@ def demo(
     """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
     from api.cli.demo_scene import build_demo
     from sgsst_core.features.network_weights import load_network_weights
-    from worker.request import SceneRequest, StylizeRequest
+    from worker.job import JobSpec, SceneRequest
     from worker.styles import StyleFile
 
     try:
@@ -77,7 +77,7 @@ def demo(
         files = build_demo(out)
     source = SceneRequest(scene=files.ply, cameras=files.cameras, resolution=DEMO_RESOLUTION)
     settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
-    request = StylizeRequest(source, (StyleFile(files.style),), None, out / "stylized.ply", "auto", False, settings)
+    request = JobSpec(source=source, styles=(StyleFile(files.style),), out=out / "stylized.ply", settings=settings)
     options: dict[str, object] = {"--style": files.style, "--cameras": files.cameras, "--out": request.out}
     options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
     options |= {"--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
@@ -87,7 +87,7 @@ def demo(
 
 
 def _stylize(
-    request: StylizeRequest,
+    request: JobSpec,
     arguments: Sequence[str],
     workers: int | None = None,
     options: WorkerOptions | None = None,
@@ -97,8 +97,8 @@ def _stylize(
     Args:
         arguments: Arguments of this command; the command to resume the job is built from them.
     """
+    from worker.outputs import check_request
     from worker.ranks.attempts import WorkerOptions
-    from worker.request import check_request
 
     outputs = check_request(request)
     command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
@@ -109,11 +109,10 @@ def _stylize(
         _stylize_on_ranks(request, outputs, command, workers, options)
 
 
-def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, checkpoint_seconds: float) -> None:
+def _stylize_here(request: JobSpec, outputs: Outputs, command: str, checkpoint_seconds: float) -> None:
     """Stylize on one rank in this process."""
-    from worker.description import describe
     from worker.execute import execute
-    from worker.prepare import prepare
+    from worker.prepare import describe, prepare
 
     with job_bar(error_console) as bar:
         job = prepare(request, warn=error_console.print, show_planning=bar.show)
@@ -129,12 +128,9 @@ def _stylize_here(request: StylizeRequest, outputs: Outputs, command: str, check
     _print_result(outputs, result, command)
 
 
-def _stylize_on_ranks(
-    request: StylizeRequest, outputs: Outputs, command: str, workers: int, options: WorkerOptions
-) -> None:
+def _stylize_on_ranks(request: JobSpec, outputs: Outputs, command: str, workers: int, options: WorkerOptions) -> None:
     """Stylize on several ranks, each in a process of its own."""
-    from worker.ranks.attempts import stylize_on_ranks
-    from worker.ranks.listener import Listener
+    from worker.ranks.attempts import Listener, stylize_on_ranks
 
     with stop_on_signal(_announce_stop) as stop, job_bar(error_console) as bar:
         notify = error_console.print

@@ -33,7 +33,7 @@ from service.files.staging import ROLES, Staged
 from service.inspection.sandbox import confine, installation
 from service.optional import install_command
 from service.parameters import JobParameters
-from service.request import scene_request, stylize_request
+from service.request import job_spec, scene_request
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.decision import warnings_of
@@ -65,10 +65,10 @@ from sgsst_core.stylizing.job_styles import check_style_size
 from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import Capture, about_notes, about_rendering, choose_axes, read_capture
 from worker.inputs import check_something_in_view, load_styles, read_regions
+from worker.job import check_choice, check_steps
 from worker.options import JobVideo
 from worker.processes import die_with_parent
 from worker.region_requests import RegionRequest
-from worker.request import check_choice, check_steps
 from worker.video import VideoRequest, render_video
 
 with contextlib.suppress(ImportError):
@@ -144,7 +144,7 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     with _errors_of("style"):
         for path in staged.styles:
             _check_pixel_count(path, limits)
-        job = stylize_request(staged, parameters)
+        job = job_spec(staged, parameters)
         style = load_styles(job.styles, job.style_background)
         findings["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
     with _errors_of("cameras"):
@@ -205,7 +205,7 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
     """Return the findings of `validate` and the plan of `sgsst plan`; `show` receives the progress."""
     started = time.perf_counter()
     findings, inputs = _read_inputs(staged, parameters, limits)
-    request = stylize_request(staged, parameters)
+    request = job_spec(staged, parameters)
     weights = load_network_weights(request.backbone)
     settings, regions, cameras = request.settings, inputs.regions, inputs.capture.cameras
     refinement = refine(inputs.scene, cameras, inputs.style, settings, weights=weights, regions=regions, show=show)

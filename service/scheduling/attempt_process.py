@@ -8,7 +8,6 @@ the dispatcher that started it, and so do the processes that it has started.
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
@@ -16,24 +15,23 @@ import threading
 import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.files.staging import Staged
-from service.parameters import JobParameters
+from pydantic import BaseModel
+
 from service.scheduling.endings import OUTAGE, Ending, Report, cause_of_error, outage
 from service.scheduling.store_workplace import StoreWorkplace
 from service.store.leases import Published
 from service.store.retries import Cause
 from service.store.states import AttemptOutcome
 from sgsst_core.progress import Progress
+from worker.job import JobSpec, Resume
 from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
-    from worker.description import Prepared
     from worker.job import Result
-    from worker.request import StylizeRequest
+    from worker.prepare import Prepared
 
 #: Niceness of CPU jobs, which use all cores: the API takes precedence if it runs on the same machine.
 _NICENESS = 5
@@ -41,44 +39,25 @@ _NICENESS = 5
 _PREVIEWS = Path("out", "previews")
 
 
-@dataclass(frozen=True)
-class Task:
+class Task(BaseModel):
     """Content of `task.json`.
 
     Attributes:
-        staged: Paths of the inputs, relative to the folder.
-        parameters: Parameters of the job.
+        spec: Specification of the job, with paths relative to the folder. Whether it resumes depends on a checkpoint,
+            which is in `out` or in the workplace and may turn out to be unusable.
         workers: Maximum number of ranks; 1 runs the job in this process alone.
         cluster: Whether to run even a single rank on the Ray cluster.
-        resume: Whether to resume from the checkpoint in `out` or in the workplace if it is usable.
         checkpoint_seconds, preview_seconds: Intervals of checkpoints and previews, as in `ServiceSettings`.
         workplace: Description of the job's files for ranks on machines that share no folder with this one; None if all
             ranks share the folder.
     """
 
-    staged: Staged
-    parameters: JobParameters
+    spec: JobSpec
     workers: int
     cluster: bool
-    resume: bool
     checkpoint_seconds: float
     preview_seconds: float
     workplace: StoreWorkplace | None = None
-
-    def save(self, folder: Path) -> None:
-        """Write the task for `load`."""
-        values = {**vars(self), "staged": self.staged.as_json(), "parameters": self.parameters.model_dump(mode="json")}
-        values["workplace"] = self.workplace and self.workplace.as_json()
-        (folder / "task.json").write_text(json.dumps(values))
-
-    @staticmethod
-    def load(folder: Path) -> Task:
-        """Read a task written by `save`."""
-        values = json.loads((folder / "task.json").read_text())
-        staged = Staged.of_json(values.pop("staged"))
-        if values["workplace"] is not None:
-            values["workplace"] = StoreWorkplace.from_json(values["workplace"])
-        return Task(staged, JobParameters(**values.pop("parameters")), **values)
 
 
 class AttemptProcess:
@@ -105,23 +84,14 @@ class AttemptProcess:
         if result is not None and result.stopped != "interrupted":
             send(Report(ending=Ending(AttemptOutcome.SUCCEEDED, result=result)))
 
-    def _request(self) -> StylizeRequest:
-        from dataclasses import replace
-
-        from service.request import stylize_request
-
-        return replace(stylize_request(self._task.staged, self._task.parameters), resume=self._task.resume)
-
     def _run_alone(self) -> Result:
-        from worker.description import describe
         from worker.execute import execute
-        from worker.prepare import prepare
+        from worker.prepare import describe, prepare
         from worker.previews import Previews
-        from worker.request import Resume
 
-        resume = Resume(self._task.resume, required=False)
+        resume = Resume(self._task.spec.resume, required=False)
         preview = Previews(_PREVIEWS, self._task.preview_seconds, log)
-        job = prepare(self._request(), resume=resume, warn=log, show_planning=report_progress, preview=preview)
+        job = prepare(self._task.spec, resume=resume, warn=log, show_planning=report_progress, preview=preview)
         report_prepared(describe(job))
 
         return execute(
@@ -136,8 +106,7 @@ class AttemptProcess:
         )
 
     def _run_on_ranks(self) -> Result | None:
-        from worker.ranks.attempts import WorkerOptions, stylize_on_ranks
-        from worker.ranks.listener import Listener
+        from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
 
         listener = Listener(
             prepared=report_prepared,
@@ -156,7 +125,7 @@ class AttemptProcess:
             resume_required=False,
             workplace=self._task.workplace,
         )
-        return stylize_on_ranks(self._request(), self._task.workers, listener, options=options).result
+        return stylize_on_ranks(self._task.spec, self._task.workers, listener, options=options).result
 
 
 def report_progress(now: Progress) -> None:
@@ -238,7 +207,7 @@ def main() -> None:
     _channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     os.chdir(sys.argv[1])
-    AttemptProcess(Task.load(Path())).run()
+    AttemptProcess(Task.model_validate_json(Path("task.json").read_bytes())).run()
 
 
 if __name__ == "__main__":

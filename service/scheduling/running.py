@@ -19,7 +19,9 @@ from service import problems
 from service.deadlines import LEAST_RATE
 from service.errors import LeaseLostError, ServiceError, StoreError
 from service.files.artifacts import Artifacts
+from service.files.staging import layout
 from service.parameters import stored_parameters
+from service.request import job_spec
 from service.scheduling.child_process import ChildProcess
 from service.scheduling.endings import Ending, Report, StopRequest, attempt_ending, cause_of_error, outage
 from service.scheduling.packing import Grant
@@ -159,12 +161,12 @@ class RunningAttempt:
 
     def _attempt(self) -> None:
         try:
-            parameters = stored_parameters(self.lease.job.parameters)
+            spec = job_spec(layout(self.lease.job.inputs)[0], stored_parameters(self.lease.job.parameters))
         except SettingsError as error:
             self._fail({"code": error.code, "message": str(error)}, permanent=True)
             return
         self._count_gpus()
-        prepare = partial(self._stager.prepare, self._folder, self.lease, self.grant, parameters)
+        prepare = partial(self._stager.prepare, self._folder, self.lease, self.grant, spec)
         self._within(prepare, size=sum(entry["size"] for entry in self.lease.job.inputs))
         self._process = ChildProcess(self._folder, self.grant, cluster=self._stager.cluster)
         _log.info("attempt started", extra=self.lease.log_fields)

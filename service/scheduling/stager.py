@@ -8,8 +8,7 @@ from pathlib import Path
 from service.errors import DamagedFileError, LostFileError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BLOBS, Blobs
-from service.files.staging import CHECKPOINT, RESULT, Staged, layout, stage
-from service.parameters import JobParameters
+from service.files.staging import CHECKPOINT, RESULT, stage
 from service.scheduling.attempt_process import Task
 from service.scheduling.packing import Grant
 from service.scheduling.store_workplace import StoredFile, StoreWorkplace, store_weights
@@ -17,6 +16,7 @@ from service.settings import ServiceSettings
 from service.store import Store
 from service.store.leases import Lease
 from service.store.tables import ArtifactRow, BlobRow
+from worker.job import JobSpec
 
 _log = logging.getLogger(__name__)
 
@@ -34,8 +34,8 @@ class Stager:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
         self.cluster = cluster
 
-    def prepare(self, folder: Path, lease: Lease, grant: Grant, parameters: JobParameters) -> None:
-        """Create the folder of an attempt.
+    def prepare(self, folder: Path, lease: Lease, grant: Grant, spec: JobSpec) -> None:
+        """Create the folder of an attempt at a job.
 
         Raises:
             LostFileError, DamagedFileError: If an input cannot be used.
@@ -45,14 +45,22 @@ class Stager:
         job = lease.job
         checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)
         workplace = self._workplace(lease, checkpoint) if self.cluster and not self._artifacts.local else None
-        staged = layout(job.inputs)[0] if workplace else self._stage(folder, lease, checkpoint)
+        if workplace is None:
+            self._stage(folder, lease, checkpoint)
+        settings = spec.settings
         if grant.memory is not None:
-            parameters = parameters.model_copy(update={"memory_limit": grant.memory})
-        seconds = self._settings.checkpoint_seconds, self._settings.preview_seconds
-        resume = checkpoint is not None
-        Task(staged, parameters, grant.ranks, self.cluster, resume, *seconds, workplace).save(folder)
+            settings = settings.model_copy(update={"memory_limit": grant.memory})
+        task = Task(
+            spec=spec.model_copy(update={"settings": settings, "resume": checkpoint is not None}),
+            workers=grant.ranks,
+            cluster=self.cluster,
+            checkpoint_seconds=self._settings.checkpoint_seconds,
+            preview_seconds=self._settings.preview_seconds,
+            workplace=workplace,
+        )
+        (folder / "task.json").write_text(task.model_dump_json())
 
-    def _stage(self, folder: Path, lease: Lease, checkpoint: ArtifactRow | None) -> Staged:
+    def _stage(self, folder: Path, lease: Lease, checkpoint: ArtifactRow | None) -> None:
         """Stage the job's files in the attempt's folder."""
         if checkpoint is not None:
             target = folder / "out" / f"{Path(RESULT).stem}.checkpoint.safetensors"
@@ -60,7 +68,7 @@ class Stager:
                 self._artifacts.fetch(checkpoint.location, target, checkpoint.sha256)
             except (LostFileError, DamagedFileError) as error:
                 _log.warning("checkpoint not usable, job restarts: %s", error, extra=lease.log_fields)
-        return stage(folder, lease.job.inputs, self._blobs.fetch(self._input_rows(lease), folder))
+        stage(folder, lease.job.inputs, self._blobs.fetch(self._input_rows(lease), folder))
 
     def _input_rows(self, lease: Lease) -> dict[str, BlobRow]:
         return self._store.inputs.blobs(sorted({entry["sha256"] for entry in lease.job.inputs}))

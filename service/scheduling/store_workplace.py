@@ -1,4 +1,4 @@
-"""Staging of a job's files on a machine that shares only the file store with the dispatcher (`worker.workplace`).
+"""Staging of a job's files on a machine that shares only the file store with the dispatcher (`Workplace`).
 
 Settings come from the machine itself: the environment of its Ray node defines the data folder (`SGSST_DATA`, a
 temporary folder by default), the size of the cache, and the credentials of the store.
@@ -15,8 +15,8 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,8 @@ from service.settings import ServiceSettings
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.files.cache_folder import cache_folder
-from worker.ranks import sweeper
-from worker.ranks.host_memory import scene_bytes
-from worker.workplace import Stored
+from worker.ranks.cluster import scene_bytes
+from worker.ranks.rank import Stored
 
 #: Interval between checks for new files to upload, in seconds.
 _SCAN_SECONDS = 0.5
@@ -83,24 +82,6 @@ class StoreWorkplace:
     checkpoint: StoredFile | None
     weights: dict[str, StoredFile]
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the description as JSON for `from_json`."""
-        return asdict(self)
-
-    @staticmethod
-    def from_json(values: Mapping[str, Any]) -> StoreWorkplace:
-        """Return the description from the JSON of `as_json`."""
-        checkpoint = values["checkpoint"]
-        return StoreWorkplace(
-            values["url"],
-            values["job_id"],
-            values["epoch"],
-            tuple(values["inputs"]),
-            tuple(StoredFile(**file) for file in values["files"]),
-            StoredFile(**checkpoint) if checkpoint else None,
-            {name: StoredFile(**file) for name, file in values["weights"].items()},
-        )
-
     @property
     def scene_bytes(self) -> int:
         """Size of the scene in bytes, once it is read."""
@@ -135,7 +116,7 @@ class StoreWorkplace:
 class RankFolder:
     """Folder of a rank, locked while the rank lives, so that other ranks can recognize leftover folders.
 
-    A helper process removes the folder if the rank is killed. If the helper is killed too, other ranks do.
+    Folders of killed ranks are removed by the driver and by later ranks.
     """
 
     def __init__(self, workplace: StoreWorkplace, rank: int, stored: Stored) -> None:
@@ -149,7 +130,6 @@ class RankFolder:
             self._root.mkdir()
             self._lock = (self._root / "lock").open("w")
             fcntl.flock(self._lock, fcntl.LOCK_EX)
-        self._sweeper = sweeper.beside(self._root)
         self.folder = self._root / "job"
         self._uploader: _Uploader | None = None
         try:
@@ -198,7 +178,6 @@ class RankFolder:
             self._uploader.stop()
         shutil.rmtree(self._root, ignore_errors=True)
         self._lock.close()
-        sweeper.dismiss(self._sweeper)
 
 
 class _Uploader:

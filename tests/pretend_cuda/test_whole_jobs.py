@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,9 @@ from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall, write_files
 from worker.execute import Result, execute
+from worker.job import JobSpec, Resume, SceneRequest
 from worker.prepare import Job, prepare
 from worker.region_requests import region_options, region_requests
-from worker.request import Resume, SceneRequest, StylizeRequest
 from worker.styles import StyleFile
 
 pytest.importorskip("triton")
@@ -43,7 +42,7 @@ def counts() -> Iterator[Counts]:
 
 def request_(
     folder: Path, *, scan: bool = False, gray: bool = False, size: tuple[int, int] = (32, 32), **settings: Any
-) -> StylizeRequest:
+) -> JobSpec:
     """Write the inputs of a job with two tiny views, at least two scales and a few steps; return the request.
 
     With a gray style, colors stay in a subspace.
@@ -57,9 +56,8 @@ def request_(
             image.convert("L").save(style)
     options = {"steps_coarse": 2, "steps_sos": 2, "coarsest_side": 16, "early_stop": False, **settings}
     source = SceneRequest(scene=ply, cameras=file)
-    return StylizeRequest(
-        source, (StyleFile(style),), None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options)
-    )
+    chosen, out = make_settings(**options), folder / "out" / "s.ply"
+    return JobSpec(source=source, styles=(StyleFile(style),), out=out, settings=chosen, backbone="vgg16")
 
 
 def run_job(job: Job, steps: int | None = None) -> Result:
@@ -125,12 +123,12 @@ def test_steady_step_synchronizes_once_and_copies_scalars(
     assert (record.stage, first) == ("sos", False)
 
 
-def in_regions(asked: StylizeRequest) -> StylizeRequest:
+def in_regions(asked: JobSpec) -> JobSpec:
     """Return the job's request with two additional regions: one with its own style, one frozen."""
     options = region_options(
         ["right:half-space=1,0,0,0", "low:half-space=0,1,0,1"], [f"right={asked.styles[0].path}"], ["right=3"], ["low"]
     )
-    return replace(asked, regions=region_requests(options))
+    return asked.model_copy(update={"regions": region_requests(options)})
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from tests.sgsst_core.orbit.objects import figure, ground, joined
 from tests.small_scenes import ball, cameras, wall, write_files
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.inputs import read_scene_and_capture
-from worker.request import SceneRequest
+from worker.job import SceneRequest
 
 SCENE = wall()
 

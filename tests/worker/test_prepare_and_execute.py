@@ -26,11 +26,10 @@ from tests.small_scenes import wall
 from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import execute
 from worker.inputs import read_inputs
-from worker.job import Result
+from worker.job import JobSpec, Result, Resume
 from worker.options import JobVideo
 from worker.prepare import Job, prepare
 from worker.previews import Previews
-from worker.request import Resume, StylizeRequest
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
@@ -56,7 +55,7 @@ def run_job(
 
 
 @pytest.fixture
-def request_(tmp_path: Path) -> StylizeRequest:
+def request_(tmp_path: Path) -> JobSpec:
     return small_request(tmp_path, 8)
 
 
@@ -71,7 +70,7 @@ def test_transparent_parts_of_photos_get_the_background_of_the_job(
         image = Image.new("RGBA", (64, 48), (0, 255, 0, 255))
         image.paste((9, 9, 9, 0), (0, 0, 32, 48))
         image.save(photos / f"{name}.png")
-    load = read_inputs(replace(request, images=photos)).photo_loader(request.settings.background)
+    load = read_inputs(request.model_copy(update={"images": photos})).photo_loader(request.settings.background)
     assert load is not None
     assert load(1)[:, :32].unique(dim=0).unique(dim=1).flatten().tolist() == pytest.approx(list(background))
     assert load(1)[0, 40].tolist() == [0, 1, 0]
@@ -84,7 +83,7 @@ def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
 
 
 @pytest.mark.slow
-def test_planning_is_shown_and_resume_reuses_the_plan(request_: StylizeRequest, tmp_path: Path) -> None:
+def test_planning_is_shown_and_resume_reuses_the_plan(request_: JobSpec, tmp_path: Path) -> None:
     whole = small_request(tmp_path / "whole", 8)
     run_job(prepare(whole))
     planned: list[Progress] = []
@@ -106,7 +105,7 @@ def test_planning_is_shown_and_resume_reuses_the_plan(request_: StylizeRequest, 
     assert not Path(request_.out).with_name("s.checkpoint.previous.safetensors").exists()
 
 
-def test_plan_for_another_device_reuses_the_survey(request_: StylizeRequest) -> None:
+def test_plan_for_another_device_reuses_the_survey(request_: JobSpec) -> None:
     """The checkpoint is that of a job on a GPU that no longer exists."""
     first = prepare(request_)
     run_job(first, steps=3)
@@ -124,7 +123,7 @@ def test_plan_for_another_device_reuses_the_survey(request_: StylizeRequest) -> 
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU writes it after planning")
-def test_first_preview_precedes_planning(request_: StylizeRequest, tmp_path: Path) -> None:
+def test_first_preview_precedes_planning(request_: JobSpec, tmp_path: Path) -> None:
     happened: list[tuple[int, list[str]]] = []
     previews, folder = Previews(tmp_path / "previews", 3600, pytest.fail), tmp_path / "previews"
 
@@ -164,7 +163,8 @@ def test_resume_refines_identically_and_writes_all_gaussians(tmp_path: Path, for
             source = request.source.scene.with_name(f"scene.{form}")
             write_scene(source, scene, by_name(form))
             out = request.out.with_name(f"s.{form}")
-            request = replace(request, source=request.source.model_copy(update={"scene": source}), out=out)
+            moved = request.source.model_copy(update={"scene": source})
+            request = request.model_copy(update={"source": moved, "out": out})
         jobs.append(request)
     whole, resumed = jobs
     run_job(prepare(whole))
@@ -185,14 +185,14 @@ def test_resume_refines_identically_and_writes_all_gaussians(tmp_path: Path, for
     assert "splitting large Gaussians" in resumed.out.with_name("s.report.html").read_text()
 
 
-def test_planning_is_shown(request_: StylizeRequest) -> None:
+def test_planning_is_shown(request_: JobSpec) -> None:
     reports: list[Progress] = []
     job = prepare(request_, show_planning=reports.append)
     views = len(job.stylizer.job.views)
     assert [progress.step for progress in reports] == [*range(views + 1), 0]
 
 
-def test_report_has_seconds_before_the_first_step(request_: StylizeRequest) -> None:
+def test_report_has_seconds_before_the_first_step(request_: JobSpec) -> None:
     names = ("reading", "survey", "planning", "preparing")
     first = prepare(request_)
     before = dict(first.stylizer.seconds_by_part)
@@ -209,7 +209,7 @@ def test_report_has_seconds_before_the_first_step(request_: StylizeRequest) -> N
     assert "survey of the views, before the steps" in Path(request_.out).with_name("s.report.html").read_text()
 
 
-def test_damaged_checkpoint_falls_back_to_previous(request_: StylizeRequest) -> None:
+def test_damaged_checkpoint_falls_back_to_previous(request_: JobSpec) -> None:
     job = prepare(request_)
     run_job(job, steps=4, checkpoint_seconds=0)
     job.outputs.checkpoint.write_bytes(job.outputs.checkpoint.read_bytes()[:-100])
@@ -222,7 +222,7 @@ def test_damaged_checkpoint_falls_back_to_previous(request_: StylizeRequest) -> 
     assert "not a readable checkpoint" in warnings[0]
 
 
-def test_unusable_rasterizer_in_checkpoint_is_replanned(request_: StylizeRequest) -> None:
+def test_unusable_rasterizer_in_checkpoint_is_replanned(request_: JobSpec) -> None:
     """The checkpoint is that of a machine with another GPU, or with a compiler."""
     if drawing_problem("cuda") is None:
         pytest.skip("it works")
@@ -239,7 +239,7 @@ def test_unusable_rasterizer_in_checkpoint_is_replanned(request_: StylizeRequest
     assert run_job(again).stopped == "finished"
 
 
-def test_optional_resume_starts_without_checkpoint(request_: StylizeRequest) -> None:
+def test_optional_resume_starts_without_checkpoint(request_: JobSpec) -> None:
     with pytest.raises(CheckpointError, match="no checkpoint to resume from"):
         prepare(request_, resume=Resume(True))
     assert prepare(request_, resume=Resume(True, required=False)).resumed is None
@@ -250,7 +250,7 @@ def test_optional_resume_starts_without_checkpoint(request_: StylizeRequest) -> 
     assert resumed.state.step == 2
 
 
-def test_temporarily_full_disk_is_a_warning(request_: StylizeRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_temporarily_full_disk_is_a_warning(request_: JobSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     from sgsst_core.stylizing import checkpoint
 
     monkeypatch.setattr(checkpoint, "_write", checkpoint._write)  # undone after the test, unlike the fault's own change
@@ -270,13 +270,13 @@ def test_temporarily_full_disk_is_a_warning(request_: StylizeRequest, monkeypatc
     assert report["seconds_by_part"]["reading"] > 0
 
 
-def with_scene(request: StylizeRequest, scene: Scene, **options: object) -> StylizeRequest:
+def with_scene(request: JobSpec, scene: Scene, **options: object) -> JobSpec:
     """Return the same job with another scene, and with a colors file as additional output."""
     write_scene(request.source.scene, scene)
-    return replace(request, source=request.source.model_copy(update=options), colors=True)
+    return request.model_copy(update={"source": request.source.model_copy(update=options), "colors": True})
 
 
-def test_colors_file_matches_the_result(request_: StylizeRequest, tmp_path: Path) -> None:
+def test_colors_file_matches_the_result(request_: JobSpec, tmp_path: Path) -> None:
     for request in (with_scene(request_, wall(sh_degree=1)), small_request(tmp_path / "not", 1)):
         run_job(prepare(request))
         alone = request.out.with_name("s.colors.f16")
@@ -289,9 +289,9 @@ def test_colors_file_matches_the_result(request_: StylizeRequest, tmp_path: Path
 
 
 @pytest.mark.parametrize("stop_at", [None, 3])
-def test_video_is_made_at_the_end_unless_the_job_is_stopped(request_: StylizeRequest, stop_at: int | None) -> None:
+def test_video_is_made_at_the_end_unless_the_job_is_stopped(request_: JobSpec, stop_at: int | None) -> None:
     """A stop during the video leaves the result, and no part of the video."""
-    job = prepare(replace(request_, video=JobVideo(fps=4, seconds=2, resolution=64, compare=True)))
+    job = prepare(request_.model_copy(update={"video": JobVideo(fps=4, seconds=2, resolution=64, compare=True)}))
     warnings: list[str] = []
     shown: list[tuple[int, int]] = []
     result = execute(

@@ -12,10 +12,11 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from sgsst_core.errors import InfrastructureError
 from worker.processes import ProcessId, die_with_parent, listen
@@ -23,14 +24,65 @@ from worker.processes import ProcessId, die_with_parent, listen
 if TYPE_CHECKING:
     from sgsst_core.parallel.collectives import Collectives
     from sgsst_core.progress import Progress
-    from worker.description import Prepared
-    from worker.job import Result
-    from worker.request import Resume, StylizeRequest
-    from worker.workplace import OpenWorkplace, Workplace
+    from worker.job import JobSpec, Result, Resume
+    from worker.prepare import Prepared
 
 #: Seconds by which the timeout of an exchange between ranks exceeds the driver's. The driver should time out first,
 #: because it knows which rank does not respond.
 _PATIENCE = 15.0
+
+
+#: Callback for each file that was stored outside this machine. It receives a description of the file, whose type the
+#: implementation chooses, and the step if the file is a checkpoint (else None).
+Stored = Callable[[Any, int | None], None]
+
+
+class OpenWorkplace(Protocol):
+    """Open folder on this machine that holds the files of a job; see `Workplace`."""
+
+    folder: Path
+
+    def finish(self, *, done: bool) -> None:
+        """Store the files that have not been stored yet. Only rank 0 stores files.
+
+        Args:
+            done: Whether the job has written its results.
+
+        Raises:
+            InfrastructureError: If they cannot be stored.
+        """
+
+    def close(self) -> None:
+        """Delete the folder."""
+
+
+class Workplace(Protocol):
+    """Factory of folders with the files of a job whose ranks run on machines without a shared folder.
+
+    It is pickled and sent to every rank. The program that starts the job implements it: only it knows where the files
+    come from and where results are stored.
+    """
+
+    @property
+    def scene_bytes(self) -> int:
+        """Return the bytes that the job's scene needs in memory, estimated from its file."""
+
+    def open(self, rank: int, stored: Stored) -> OpenWorkplace:
+        """Create the folder with the job's files. On rank 0, also start to store new output files.
+
+        Args:
+            rank: Rank that opens the folder.
+            stored: Callback for each stored file.
+
+        Raises:
+            InfrastructureError: If the files cannot be fetched, or the disk is full.
+        """
+
+    def after(self, stored: Sequence[Any]) -> Workplace:
+        """Return the workplace of the next attempt, which resumes from the stored files."""
+
+    def tidy(self) -> None:
+        """Delete folders that killed ranks have left on this machine."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +125,7 @@ class RankTask:
         workplace: Workplace for machines without a shared folder; None if they share one.
     """
 
-    request: StylizeRequest
+    request: JobSpec
     rank: int
     size: int
     address: str
@@ -227,9 +279,8 @@ class RankProcess:
                 self._update(outcome=_failure(error))
 
     def _job(self, task: RankTask, collectives: Collectives) -> Result:
-        from worker.description import describe
         from worker.execute import execute
-        from worker.prepare import prepare
+        from worker.prepare import describe, prepare
         from worker.previews import Previews
 
         started = time.monotonic()
@@ -302,7 +353,7 @@ def _enter_folder(task: RankTask) -> None:
         )
 
 
-def _paths(request: StylizeRequest) -> list[Path]:
+def _paths(request: JobSpec) -> list[Path]:
     """Return all paths of a request that are not None."""
     styles = [*request.styles, *(style for region in request.regions for style in region.styles)]
     masks = [region.selection.path for region in request.regions if region.selection]

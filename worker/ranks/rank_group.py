@@ -12,8 +12,7 @@ from sgsst_core.errors import ClusterAwayError, InfrastructureError
 from worker.processes import ProcessId, home, kill
 from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, give_back, reserve
 from worker.ranks.failure_policy import Failure, failure_of, first_line
-from worker.ranks.rank import Outcome, RankPlace, RankProcess, RankStatus, RankTask
-from worker.workplace import Workplace
+from worker.ranks.rank import Outcome, RankPlace, RankProcess, RankStatus, RankTask, Workplace
 
 
 class AttemptFailedError(Exception):

@@ -1,4 +1,4 @@
-"""Watchdog process that deletes the folder of a local Ray instance or of a rank if its owner is killed.
+"""Watchdog process that deletes the folder of a local Ray instance if its owner is killed.
 
 The owner is the process that starts the watchdog. The watchdog reads from a pipe: if the pipe closes without a message,
 the owner was killed. It imports the standard library only, so that it starts quickly and needs little memory.
@@ -20,15 +20,10 @@ DONE = b"done"
 _PATIENCE, _LIMIT = 1.0, 20.0
 
 
-def beside(folder: Path, *, users: bool = False) -> subprocess.Popen[bytes]:
-    """Start a sweeper that deletes a folder if this process is killed; `dismiss` ends it.
-
-    Args:
-        folder: Folder to delete.
-        users: Whether to end processes that still use the folder before it is deleted.
-    """
+def beside(folder: Path) -> subprocess.Popen[bytes]:
+    """Start a sweeper that sweeps a folder if this process is killed; `dismiss` ends it."""
     return subprocess.Popen(
-        [sys.executable, "-I", "-S", __file__, str(folder), *(["users"] if users else [])],
+        [sys.executable, "-I", "-S", __file__, str(folder)],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -86,6 +81,4 @@ def _uses(process: Path, folder: str) -> bool:
 
 if __name__ == "__main__":
     if sys.stdin.buffer.read() != DONE:
-        if sys.argv[2:] == ["users"]:
-            sweep(Path(sys.argv[1]))
-        shutil.rmtree(sys.argv[1], ignore_errors=True)
+        sweep(Path(sys.argv[1]))

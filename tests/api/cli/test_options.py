@@ -19,8 +19,8 @@ from service.parameters import JobParameters
 from sgsst_core.errors import SettingsError
 from sgsst_core.options import Declared, declared, parse_strength
 from sgsst_core.settings import Settings, checked, make_settings
+from worker.job import SceneRequest
 from worker.options import GROUPS, RunOptions, StylizeOptions, ViewOptions
-from worker.request import SceneRequest
 
 ROOT = Path(__file__).resolve().parents[3]
 OPTIONS = declared(StylizeOptions)

@@ -11,7 +11,7 @@ from service.scheduling.attempt_process import report_prepared, report_progress
 from service.scheduling.endings import Report
 from service.scheduling.progress import progress_seconds
 from sgsst_core.progress import Progress
-from worker.description import Prepared
+from worker.prepare import Prepared
 
 
 @pytest.fixture

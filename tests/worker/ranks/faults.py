@@ -18,10 +18,9 @@ import psutil
 
 from sgsst_core.settings import make_settings
 from tests.small_scenes import wall, write_files
-from worker.ranks.rank import RankProcess, RankTask
-from worker.request import SceneRequest, StylizeRequest
+from worker.job import JobSpec, SceneRequest
+from worker.ranks.rank import OpenWorkplace, RankProcess, RankTask
 from worker.styles import StyleFile
-from worker.workplace import OpenWorkplace
 
 Place = Literal[
     "render",
@@ -54,12 +53,12 @@ class Fault:
     what: Literal["SIGKILL", "SIGSTOP", "full"]
     delay: float = 0.0
 
-    def write(self, request: StylizeRequest) -> None:
+    def write(self, request: JobSpec) -> None:
         """Write the fault to the file that `FaultyRank` reads."""
         _file(request).parent.mkdir(parents=True, exist_ok=True)
         _file(request).write_text(json.dumps(asdict(self)))
 
-    def arm(self, request: StylizeRequest) -> None:
+    def arm(self, request: JobSpec) -> None:
         """Install the fault in this process."""
         owner, name = _places()[self.place]
         original: Callable[..., Any] = getattr(owner, name)
@@ -97,27 +96,26 @@ class FaultyRank(RankProcess):
         super()._work(task, place)
 
 
-def fired(request: StylizeRequest) -> float | None:
+def fired(request: JobSpec) -> float | None:
     """Return the time of the fault in seconds since the epoch; None if it has not occurred."""
     path = _fired(request)
     return path.stat().st_mtime if path.exists() else None
 
 
-def forget(request: StylizeRequest) -> None:
+def forget(request: JobSpec) -> None:
     """Delete the record that the fault occurred."""
     _fired(request).unlink(missing_ok=True)
 
 
-def small_request(folder: Path, steps: int, **settings: Any) -> StylizeRequest:
+def small_request(folder: Path, steps: int, **settings: Any) -> JobSpec:
     """Write the inputs of a job with tiny views that uses all ranks, and return its request."""
     inputs = folder / "inputs"
     inputs.mkdir(parents=True, exist_ok=True)
     ply, cameras, style = write_files(inputs, wall())
     options = {"steps_sos": steps, "early_stop": False, "rebalance": False, **settings}
     source = SceneRequest(scene=ply, cameras=cameras)
-    return StylizeRequest(
-        source, (StyleFile(style),), None, folder / "out" / "s.ply", "vgg16", False, make_settings(**options)
-    )
+    chosen, out = make_settings(**options), folder / "out" / "s.ply"
+    return JobSpec(source=source, styles=(StyleFile(style),), out=out, settings=chosen, backbone="vgg16")
 
 
 def name_of(process: psutil.Process) -> str:
@@ -146,11 +144,11 @@ def folders(processes: Iterable[psutil.Process]) -> set[Path]:
     return {Path("/", *Path(word).parts[1:3]) for word in words if word.startswith("/tmp/sgsst-ray-")}
 
 
-def _file(request: StylizeRequest) -> Path:
+def _file(request: JobSpec) -> Path:
     return request.out.with_suffix(".fault")
 
 
-def _fired(request: StylizeRequest) -> Path:
+def _fired(request: JobSpec) -> Path:
     return request.out.with_suffix(".fired")
 
 

@@ -20,13 +20,11 @@ from sgsst_core.errors import SceneError
 from sgsst_core.progress import Progress
 from tests.api.service import PATIENCE, wait_for
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, name_of, shared_memory, small_request
-from worker.description import Prepared
 from worker.execute import execute
-from worker.prepare import prepare
-from worker.ranks.attempts import RanksResult, WorkerOptions, stylize_on_ranks
+from worker.job import JobSpec
+from worker.prepare import Prepared, prepare
+from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
 from worker.ranks.cluster import Cluster
-from worker.ranks.listener import Listener
-from worker.request import StylizeRequest
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "vgg16_weights"),
@@ -85,7 +83,7 @@ class EventRecorder:
 
 
 def run(
-    request: StylizeRequest,
+    request: JobSpec,
     cluster: Cluster,
     events: EventRecorder | None = None,
     fault: Fault | None = None,
@@ -202,7 +200,7 @@ def test_full_disk_skips_checkpoint_and_canceled_job_resumes(
     assert ended.saved == ended.step
     assert not request.out.exists()
     events = EventRecorder()
-    ended = run(replace(request, resume=True), cluster, events)
+    ended = run(request.model_copy(update={"resume": True}), cluster, events)
     assert events.prepared[0].step > 0
     assert loss_of(ended) == pytest.approx(undisturbed[0], rel=TOLERANCE)
 
@@ -233,7 +231,7 @@ def test_bad_input_is_reported_at_once_and_not_retried(cluster: Cluster, tmp_pat
 # --- the command ---------------------------------------------------------------------------------------------------
 
 
-def command(request: StylizeRequest, *options: str) -> list[str]:
+def command(request: JobSpec, *options: str) -> list[str]:
     """Return the arguments of `sgsst stylize` for the same job."""
     source = request.source
     files = [str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]

@@ -15,8 +15,7 @@ import pytest
 from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, small_request
 from worker.ranks import cluster
-from worker.ranks.attempts import WorkerOptions, stylize_on_ranks
-from worker.ranks.listener import Listener
+from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "tiny_installed"),

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from sgsst_core.progress import Progress
-from worker.description import Prepared
-from worker.ranks.listener import Listener, Relay
+from worker.prepare import Prepared
+from worker.ranks.attempts import Listener, Relay
 from worker.ranks.rank import RankStatus
 
 

@@ -22,8 +22,8 @@ from sgsst_core.planning.plan import Prediction
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import radial_lens
 from worker.capture import Capture
+from worker.outputs import Outputs
 from worker.ranks.messages import decode, encode
-from worker.request import Outputs
 
 VALUES = [
     None,
