@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path, PureWindowsPath
@@ -29,6 +29,7 @@ from api.cli.options import with_arguments, with_options
 from api.cli.progress_bars import transfer_bar
 from api.client.inputs import different_names, path_or_url
 from service.parameters import JobParameters
+from service.states import ACTIONS, STEPPING, Transition
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import (
     EXTRA_FORMATS,
@@ -261,22 +262,15 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def finish(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-    """End a running job after its current step, and keep its result so far."""
-    with _client(url, key) as client:
-        _print_job(client.finish(job), as_json)
+def _command_of(action: Transition) -> Callable[..., None]:
+    """Return the command that requests an action on a job."""
 
+    def command(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
+        with _client(url, key) as client:
+            _print_job(client.act(job, action), as_json)
 
-def cancel(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Cancel a job."""
-    with _client(url, key) as client:
-        _print_job(client.cancel(job), as_json)
-
-
-def retry(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-    """Queue a failed or canceled job again."""
-    with _client(url, key) as client:
-        _print_job(client.retry(job), as_json)
+    command.__name__, command.__doc__ = action.value, ACTIONS[action].help
+    return command
 
 
 def delete(job: JobArgument, url: UrlOption = None, key: KeyOption = None) -> None:
@@ -318,7 +312,7 @@ def mcp(url: UrlOption = None, key: KeyOption = None) -> None:
     serve(url, key)
 
 
-COMMANDS = (submit, status, watch, download, finish, cancel, retry, delete, jobs, mcp)
+COMMANDS = (submit, status, watch, download, *map(_command_of, ACTIONS), delete, jobs, mcp)
 
 # --- shared --------------------------------------------------------------------------------------------------------
 
@@ -459,7 +453,7 @@ def _short_status(job: Job) -> str:
     """Return the status of a job with its position in the queue or its progress, in at most 13 characters."""
     if job.status == "queued" and job.data.get("queue_position"):
         return f"queued, #{job.data['queue_position']}"
-    if job.progress and job.status in ("running", "finishing") and job.progress["total"]:
+    if job.progress and job.status in STEPPING and job.progress["total"]:
         return f"{job.status} {job.progress['fraction']:.0%}"
     return job.status
 

@@ -10,9 +10,9 @@ from typing import Any
 import httpx
 from httpx_sse import ServerSentEvent
 
+from service.states import ENDED
 from sgsst_core.errors import InvalidInputError, SgsstError
 
-_ENDED = ("succeeded", "failed", "canceled", "expired")
 #: Statuses of temporary failures: locked by another request, damaged in transit, overloaded, starting.
 _TEMPORARY = (423, 460, 502, 503, 504)
 
@@ -52,7 +52,7 @@ class Job:
     @property
     def finished(self) -> bool:
         """Whether the job has ended."""
-        return self.status in _ENDED
+        return self.status in ENDED
 
     @staticmethod
     def of(data: Mapping[str, Any]) -> Job:

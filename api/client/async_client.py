@@ -17,6 +17,7 @@ from api.client.answers import Event, Job, RequestError, checked
 from api.client.downloads import Download, Progress
 from api.client.inputs import JobFiles, path_or_url
 from api.client.transport import TRIES, Transport, in_thread
+from service.states import Transition
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import ensure_writable_folder
 
@@ -254,17 +255,21 @@ class AsyncClient:
         """Change the display name of a job; an empty name restores the names of scene and style."""
         return Job.of((await self._transport.call("PATCH", _job_path(job_id), json={"name": name})).json())
 
+    async def act(self, job_id: str, action: str) -> Job:
+        """Request an action on a job by its name in `service.states.ACTIONS`."""
+        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/{action}")).json())
+
     async def finish(self, job_id: str) -> Job:
         """End a running job after its current step, and keep its result so far."""
-        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/finish")).json())
+        return await self.act(job_id, Transition.FINISH)
 
     async def cancel(self, job_id: str) -> Job:
         """Cancel a job."""
-        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/cancel")).json())
+        return await self.act(job_id, Transition.CANCEL)
 
     async def retry(self, job_id: str) -> Job:
         """Queue a failed or canceled job again."""
-        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/retry")).json())
+        return await self.act(job_id, Transition.RETRY)
 
     async def share(self, job_id: str, days: float = 7.0) -> dict[str, Any]:
         """Create a read-only link to a result; `url` is its address.

@@ -116,6 +116,7 @@ class Client:
     blend = _blocking(AsyncClient.blend)
     video = _blocking(AsyncClient.video)
     rename = _blocking(AsyncClient.rename)
+    act = _blocking(AsyncClient.act)
     finish = _blocking(AsyncClient.finish)
     cancel = _blocking(AsyncClient.cancel)
     retry = _blocking(AsyncClient.retry)

@@ -13,8 +13,8 @@ from pydantic_core import to_jsonable_python
 
 from api.http.schemas import utc
 from service.errors import DatabaseUnavailableError
+from service.states import ENDED
 from service.store import Store
-from service.store.states import ENDED
 from service.store.tables import EventRow
 
 #: Seconds between polls of the database. On average, watchers receive an event after half of this time.

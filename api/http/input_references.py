@@ -8,8 +8,8 @@ from typing import Any
 
 from api.http.addresses import subpath
 from service import problems
+from service.states import JobStatus
 from service.store.jobs import Jobs
-from service.store.states import JobStatus
 from service.store.tables import JobRow
 
 #: Path of an input, as in the API. The groups are the id of the job, and the input.

@@ -12,10 +12,10 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from service.states import AttemptOutcome, JobStatus
 from service.store import Store
 from service.store.database import BUCKETS
 from service.store.retries import Cause
-from service.store.states import AttemptOutcome, JobStatus
 
 
 class _Counter(NamedTuple):

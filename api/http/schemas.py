@@ -12,8 +12,8 @@ from api.http.addresses import address
 from service.examples import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.files.artifacts import media_type
 from service.parameters import JobName, JobParameters
+from service.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.jobs import ShownJob
-from service.store.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
 from sgsst_core.files.formats import ResultName
 from sgsst_core.files.formats.ply import PLY

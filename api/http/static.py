@@ -23,7 +23,7 @@ from api.http.addresses import path_of
 from api.http.sending import names_etag
 from service import problems
 from service.optional import installed_extras
-from service.store.states import ACTIONS, TITLES, UNFINISHED
+from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import FORMATS, RESULT_FORMATS
 from sgsst_core.options import STRENGTHS
 
@@ -116,8 +116,11 @@ def _filled_modules() -> dict[str, tuple[bytes, object]]:
         }
         for each in FORMATS
     ]
-    actions = [{"name": name, "title": name.capitalize(), "statuses": statuses} for name, statuses in ACTIONS.items()]
-    states = {"titles": TITLES, "unfinished": UNFINISHED, "actions": actions}
+    actions = [
+        {"name": name, "title": name.capitalize(), "statuses": action.statuses} for name, action in ACTIONS.items()
+    ]
+    groups = {"unfinished": UNFINISHED, "working": WORKING, "stepping": STEPPING}
+    states = {"titles": TITLES, **groups, "actions": actions}
     return {
         "scene_formats.js": (b'"{{scene_formats}}"', formats),
         "installed.js": (b'"{{installed_extras}}"', installed_extras()),

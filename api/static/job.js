@@ -11,7 +11,7 @@ import { ResultStage } from "./result_stage.js";
 import { ShareCard } from "./share_card.js";
 import { titleOf, valueText } from "./options.js";
 import { resultFormats } from "./scene_formats.js";
-import { actionsOf, titles, UNFINISHED } from "./statuses.js";
+import { actionsOf, titles, UNFINISHED, WORKING } from "./statuses.js";
 import { VideoCard } from "./video_card.js";
 import { size, time, words } from "./words.js";
 
@@ -34,7 +34,7 @@ function outcomeOf(result) {
 }
 
 /** @param {string} status */
-export const badge = (status) => h(`span.badge.${status}`, titles[status] ?? status);
+export const badge = (status) => h(`span.badge.${status}${WORKING.has(status) ? ".working" : ""}`, titles[status] ?? status);
 
 export class JobView {
   /** @param {string} id */

@@ -22,9 +22,9 @@ from pydantic import BaseModel
 
 from service.scheduling.endings import OUTAGE, Ending, Report, cause_of_error, outage
 from service.scheduling.store_workplace import StoreWorkplace
+from service.states import AttemptOutcome
 from service.store.leases import Published
 from service.store.retries import Cause
-from service.store.states import AttemptOutcome
 from sgsst_core.progress import Progress
 from worker.job import JobSpec, Resume
 from worker.processes import die_with_parent

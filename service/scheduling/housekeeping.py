@@ -15,8 +15,8 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.publishing import sweep
+from service.states import UNFINISHED
 from service.store import Store
-from service.store.states import UNFINISHED
 
 #: Interval between rounds of housekeeping, and between searches for stray files, in seconds.
 _ROUND_SECONDS, _STRAY_SEARCH_SECONDS = 60.0, 3600.0

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 
 from service.scheduling.running import RunningAttempt
 from service.store import Store
-from service.store.states import JobStatus
 
 #: Fractions of a lease's duration: the age at which a lease is renewed, and the age at which its job is killed if
 #: renewing has failed. The latter is below 1, because other dispatchers may take an expired lease and clocks differ.
@@ -44,7 +43,7 @@ class LeaseKeeper:
         self._thread.join(_JOIN_SECONDS)
 
     def update(self) -> None:
-        """Renew all leases if that is due, and end the attempts of canceled and lost jobs."""
+        """Renew all leases if that is due, and pass the statuses of the jobs to their attempts; abandon lost jobs."""
         now = time.monotonic()  # taken before the request, so that a lease is never assumed to last too long
         if not self._running:
             self._renewed_at = now
@@ -57,12 +56,10 @@ class LeaseKeeper:
             statuses = self._store.leases.statuses(leases)
         for job_id, status in statuses.items():
             attempt = self._running[job_id]
-            if status is None and attempt.alive:
+            if status is not None:
+                attempt.obey(status)
+            elif attempt.alive:
                 attempt.abandon()
-            elif status == JobStatus.CANCELING:
-                attempt.cancel()
-            elif status == JobStatus.FINISHING:
-                attempt.finish()
 
     def _abandon_late(self) -> None:
         """Abandon jobs whose leases could not be renewed, before the leases expire.

@@ -30,10 +30,10 @@ from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
 from service.scheduling.selection import Holding
 from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
+from service.states import AttemptOutcome, JobStatus
 from service.store import Store
 from service.store.leases import Lease
 from service.store.retries import Cause, cause_of
-from service.store.states import AttemptOutcome
 from sgsst_core.errors import SettingsError
 
 #: Time that a canceled job has to finish its step, in seconds.
@@ -95,13 +95,12 @@ class RunningAttempt:
         """Start the attempt."""
         self._thread.start()
 
-    def cancel(self) -> None:
-        """Cancel the job on behalf of its user."""
-        self._stop_request = self._stop_request or StopRequest.CANCEL
-
-    def finish(self) -> None:
-        """End the job after its current step, with its present colors as the result, on behalf of its user."""
-        self._finish_requested = True
+    def obey(self, status: JobStatus) -> None:
+        """Do what the job's status asks for on behalf of its user: stop, or end with the present colors as result."""
+        if status == JobStatus.CANCELING:
+            self._stop_request = self._stop_request or StopRequest.CANCEL
+        elif status == JobStatus.FINISHING:
+            self._finish_requested = True
 
     def release(self) -> None:
         """Save the job's state and return it to the queue, because the dispatcher is shutting down."""

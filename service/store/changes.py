@@ -12,9 +12,9 @@ from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
 from service import problems
+from service.states import JobStatus, Transition, next_status
 from service.store.clocks import retained_until
 from service.store.database import count, new_id
-from service.store.states import JobStatus, Transition, next_status
 from service.store.tables import Base, BlobRow, BlobUseRow, DeliveryRow, EventRow, JobRow
 
 _EVENTS = Base.metadata.tables[EventRow.__tablename__]

@@ -11,6 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service import problems
+from service.states import ACTIONS, ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
 from service.store import job_inputs
 from service.store.changes import add_status_event, end, forget, holder_name, job_of_owner, move
 from service.store.database import Database, count, idempotency_row, new_id
@@ -19,7 +20,6 @@ from service.store.inputs import close_receipt
 from service.store.job_inputs import InputSummary
 from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job, lock_owner
-from service.store.states import ACTIONS, ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
 from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 
 _JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
@@ -235,7 +235,7 @@ class Jobs:
             job = job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.FINISH):
                 raise problems.NOT_RUNNING(job_status=job.status)
-            if job.status in ACTIONS[Transition.FINISH]:
+            if job.status in ACTIONS[Transition.FINISH].statuses:
                 job.finish_requested = True
                 move(session, job, Transition.FINISH, now)
         return job
@@ -253,7 +253,7 @@ class Jobs:
             job = job_of_owner(session, job_id, owner, lock=True)
             if not allowed(job.status, Transition.CANCEL):
                 raise problems.NOT_CANCELABLE(job_status=job.status)
-            if job.status in ACTIONS[Transition.CANCEL]:
+            if job.status in ACTIONS[Transition.CANCEL].statuses:
                 if next_status(job.status, Transition.CANCEL) in ENDED:
                     end(session, job, Transition.CANCEL, now, self._retention)
                 else:

@@ -17,13 +17,13 @@ from sqlalchemy.orm import Session
 
 from service import problems
 from service.errors import LeaseLostError
+from service.states import ACTIVE, AttemptOutcome, JobStatus, Transition
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, observe, upsert
 from service.store.history import add_point
 from service.store.queue import LOST, WAITING, next_job, next_jobs, reserve, reserved_by
 from service.store.quotas import count_gpu_seconds
 from service.store.retries import DISPATCHER_LOST, MAX_LOSSES, Cause, FailureCount, RetryPolicy, Verdict, cause_of
-from service.store.states import ACTIVE, AttemptOutcome, JobStatus, Transition
 from service.store.tables import (
     ArtifactRow,
     AttemptRow,

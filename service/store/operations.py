@@ -11,8 +11,8 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, SQLColumnExpression, bindparam, case, delete, func, literal, select
 
+from service.states import JobStatus
 from service.store.database import Database, upsert
-from service.store.states import JobStatus
 from service.store.tables import CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
 
 #: Live dispatchers: those with a heartbeat within a lease duration. A heartbeat far in the future comes from a wrong

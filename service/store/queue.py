@@ -30,8 +30,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Session, aliased, undefer
 
+from service.states import ACTIVE, JobStatus
 from service.store.database import upsert
-from service.store.states import ACTIVE, JobStatus
 from service.store.tables import JobRow, ReservationRow, TurnRow
 
 #: Upper bound of lease durations and retry delays in seconds; a time further in the future comes from a wrong clock.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from sqlalchemy import and_, delete, select, update
 
+from service.states import FINISHED, JobStatus, Transition
 from service.store.changes import forget, move, release_inputs
 from service.store.clocks import advance_expiry_time, expiry_time, retained_until
 from service.store.database import IDEMPOTENCY_SECONDS, Database
-from service.store.states import FINISHED, JobStatus, Transition
 from service.store.tables import ArtifactRow, DispatcherRow, IdempotencyRow, JobRow
 
 #: Time in seconds after which a dispatcher without heartbeat is forgotten.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from service.store.states import AttemptOutcome, JobStatus, Transition
+from service.states import AttemptOutcome, JobStatus, Transition
 from sgsst_core.errors import InfrastructureError
 
 #: Maximum delay between attempts in seconds; the delay doubles up to this limit.

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from sqlalchemy import delete, func, select
 
 from service import problems
+from service.states import JobStatus
 from service.store.changes import job_of_owner
 from service.store.clocks import expiry_time
 from service.store.database import Database, new_id
 from service.store.keys import digest
-from service.store.states import JobStatus
 from service.store.tables import JobRow, KeyRow, ShareRow
 
 #: Maximum number of shares of a job that have not expired.

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.fleet import simulate
 from benchmarks.fleet_parts.demand import KINDS, Demand, SimulatedJob
 from benchmarks.fleet_parts.simulation import Fleet
-from service.store.states import JobStatus
+from service.states import JobStatus
 
 
 def job(at: float, owner: str, factor: float = 1.0, **parameters: Any) -> SimulatedJob:

@@ -55,8 +55,8 @@ from service.files.staging import check_roles, default_job_name, staged_name
 from service.inspection.inspector import Show
 from service.parameters import JobParameters, stored_parameters
 from service.scheduling.webhooks import check_url
+from service.states import JobStatus
 from service.store.jobs import Idempotency, NewJob
-from service.store.states import JobStatus
 from service.store.tables import BlobRow, JobRow, UploadRow
 from service.weights import check_weights
 

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
-from service.store.states import ACTIONS, TITLES, UNFINISHED
+from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import FORMATS
 from sgsst_core.options import STRENGTHS
 from tests.api.service import Service
@@ -89,8 +89,11 @@ def test_page_knows_the_states_of_jobs(client: httpx.Client, files: StaticFiles)
     assert json.loads(states[1]) == {
         "titles": dict(TITLES),
         "unfinished": list(UNFINISHED),
+        "working": list(WORKING),
+        "stepping": list(STEPPING),
         "actions": [
-            {"name": name, "title": name.capitalize(), "statuses": list(statuses)} for name, statuses in ACTIONS.items()
+            {"name": name, "title": name.capitalize(), "statuses": list(action.statuses)}
+            for name, action in ACTIONS.items()
         ],
     }
 

@@ -11,8 +11,8 @@ import pytest
 from service import problems
 from service.scheduling.attempt_process import failure
 from service.scheduling.endings import Ending, StopRequest, attempt_ending, cause_of_error, outage
+from service.states import AttemptOutcome
 from service.store.retries import Cause, cause_of
-from service.store.states import AttemptOutcome
 from sgsst_core.errors import (
     ClusterAwayError,
     ImageError,

@@ -6,8 +6,8 @@ import random
 
 import pytest
 
+from service.states import JobStatus
 from service.store import Store
-from service.store.states import JobStatus
 from service.store.tables import JobRow
 from tests.service.store.helpers import ATTEMPTS, LEASE, Clock, lease, queue
 

@@ -23,13 +23,13 @@ from service.errors import (
     LeaseLostError,
     NotFoundError,
 )
+from service.states import ACTIVE, FINISHED
 from service.store import Store, open_store
 from service.store.history import GROWTH, add_point
 from service.store.inputs import GRACE_SECONDS
 from service.store.jobs import Idempotency
 from service.store.leases import MAX_PROGRESS_EVENTS, Lease, Published
 from service.store.retries import MAX_LOSSES
-from service.store.states import ACTIVE, FINISHED
 from service.store.tables import Base, JobRow, ProgressPointRow, ShareRow
 from tests.raised import raises_problem
 from sgsst_core.progress import Progress

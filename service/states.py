@@ -1,8 +1,9 @@
-"""States of a job, and the table of all transitions between them."""
+"""States of a job, and the table of all transitions between them, from which API, clients and page derive theirs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -57,8 +58,12 @@ class Transition(StrEnum):
 
 
 _S = JobStatus
-#: States in which a dispatcher works on the job.
-ACTIVE = (_S.STARTING, _S.RUNNING, _S.FINISHING, _S.CANCELING)
+#: States in which a dispatcher works toward the job's result.
+WORKING = (_S.STARTING, _S.RUNNING, _S.FINISHING)
+#: States in which a job makes steps.
+STEPPING = (_S.RUNNING, _S.FINISHING)
+#: States in which a dispatcher holds the job.
+ACTIVE = (*WORKING, _S.CANCELING)
 UNFINISHED = (_S.QUEUED, *ACTIVE)
 #: States of an ended job that still has its files.
 FINISHED = (_S.SUCCEEDED, _S.FAILED, _S.CANCELED)
@@ -73,30 +78,43 @@ TITLES: Mapping[JobStatus, str] = {
 #: Target state per transition and initial state; other combinations are not allowed. A job that is being canceled is
 #: stopped however its attempt ends, unless the attempt succeeds first.
 TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
-    Transition.TAKE: dict.fromkeys((_S.QUEUED, _S.STARTING, _S.RUNNING, _S.FINISHING), _S.STARTING),
+    Transition.TAKE: dict.fromkeys((_S.QUEUED, *WORKING), _S.STARTING),
     Transition.START: {_S.STARTING: _S.RUNNING, _S.RUNNING: _S.RUNNING, _S.CANCELING: _S.CANCELING},
     Transition.SUCCEED: dict.fromkeys(ACTIVE, _S.SUCCEEDED),
-    Transition.FAIL: dict.fromkeys((_S.STARTING, _S.RUNNING, _S.FINISHING), _S.FAILED),
-    Transition.REQUEUE: dict.fromkeys((_S.STARTING, _S.RUNNING, _S.FINISHING), _S.QUEUED),
+    Transition.FAIL: dict.fromkeys(WORKING, _S.FAILED),
+    Transition.REQUEUE: dict.fromkeys(WORKING, _S.QUEUED),
     Transition.STOP: dict.fromkeys(ACTIVE, _S.CANCELED),
     Transition.FINISH: {_S.RUNNING: _S.FINISHING, _S.FINISHING: _S.FINISHING},
     Transition.CANCEL: {
-        _S.QUEUED: _S.CANCELED,
-        _S.STARTING: _S.CANCELING,
-        _S.RUNNING: _S.CANCELING,
-        _S.FINISHING: _S.CANCELING,
-        _S.CANCELING: _S.CANCELING,
-        _S.CANCELED: _S.CANCELED,
+        **dict.fromkeys((_S.QUEUED, _S.CANCELED), _S.CANCELED),
+        **dict.fromkeys(ACTIVE, _S.CANCELING),
     },
     Transition.RETRY: dict.fromkeys((_S.FAILED, _S.CANCELED), _S.QUEUED),
     Transition.EXPIRE: dict.fromkeys(FINISHED, _S.EXPIRED),
 }
 
-#: Transitions that users request with `POST /v1/jobs/{id}/{transition}`, and the statuses that each one changes. The
-#: page has a button for each.
-ACTIONS: Mapping[Transition, tuple[JobStatus, ...]] = {
-    action: tuple(status for status, target in TRANSITIONS[action].items() if target is not status)
-    for action in (Transition.FINISH, Transition.CANCEL, Transition.RETRY)
+
+@dataclass(frozen=True)
+class Action:
+    """Transition that users request with `POST /v1/jobs/{id}/{transition}`.
+
+    Attributes:
+        help: Description for users.
+        statuses: Statuses that the transition changes.
+    """
+
+    help: str
+    statuses: tuple[JobStatus, ...]
+
+
+#: Actions of users. Each one is a command, and a button of the page.
+ACTIONS: Mapping[Transition, Action] = {
+    action: Action(text, tuple(status for status, target in TRANSITIONS[action].items() if target is not status))
+    for action, text in {
+        Transition.FINISH: "End a running job after its current step, and keep its result so far.",
+        Transition.CANCEL: "Cancel a job.",
+        Transition.RETRY: "Queue a failed or canceled job again.",
+    }.items()
 }
 
 

@@ -6,14 +6,16 @@ from itertools import product
 
 import pytest
 
-from service.store.states import (
+from service.states import (
     ACTIONS,
     ACTIVE,
     ENDED,
     FINISHED,
+    STEPPING,
     TITLES,
     TRANSITIONS,
     UNFINISHED,
+    WORKING,
     JobStatus,
     Transition,
     TransitionError,
@@ -59,6 +61,7 @@ def test_every_transition_of_every_state(status: JobStatus, transition: Transiti
 def test_every_state_is_in_one_group() -> None:
     assert sorted([JobStatus.QUEUED, *ACTIVE, *ENDED]) == sorted(JobStatus)
     assert set(UNFINISHED) == set(JobStatus) - set(ENDED)
+    assert set(STEPPING) < set(WORKING) < set(ACTIVE)
     assert set(FINISHED) == set(ENDED) - {JobStatus.EXPIRED}
 
 
@@ -76,7 +79,7 @@ def test_canceling_job_can_only_end() -> None:
 
 
 def test_actions_apply_to_states_that_they_change() -> None:
-    assert ACTIONS == {
+    assert {name: action.statuses for name, action in ACTIONS.items()} == {
         Transition.FINISH: (JobStatus.RUNNING,),
         Transition.CANCEL: (JobStatus.QUEUED, JobStatus.STARTING, JobStatus.RUNNING, JobStatus.FINISHING),
         Transition.RETRY: (JobStatus.FAILED, JobStatus.CANCELED),
