@@ -24,9 +24,9 @@ from api.cli.console import (
     error_console,
     loss_text,
     out_console,
+    transfer_bar,
 )
 from api.cli.options import with_arguments, with_options
-from api.cli.progress_bars import transfer_bar
 from api.client.inputs import different_names, path_or_url
 from service.parameters import JobParameters
 from service.states import ACTIONS, STEPPING, Transition

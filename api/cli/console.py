@@ -1,14 +1,16 @@
-"""Consoles of the command line, and exit codes."""
+"""Consoles of the command line, what is printed there by several commands, and exit codes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 
 from sgsst_core.loss.convergence import ratio
+from sgsst_core.stylizing.progress_bar import live_bar
 
 #: Exit codes: an unusable input or option, and any other failure.
 BAD_INPUT, FAILURE = 2, 1
@@ -66,3 +68,12 @@ def spinner(text: str) -> Iterator[None]:
         return
     with error_console.status(text):
         yield
+
+
+@contextmanager
+def transfer_bar(console: Console, description: str) -> Iterator[Callable[[int, int], None]]:
+    """Show the progress of a transfer; yield a function that receives the transferred and the total bytes."""
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with live_bar(console, *columns) as bar:
+        task = bar.add_task(description, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total or None)

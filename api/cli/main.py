@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, requires
 from typing import Annotated, Any
 
 import typer
@@ -13,17 +15,16 @@ import typer
 from api.cli import client_commands, operator_commands
 from api.cli.bench_commands import bench_app
 from api.cli.console import BAD_INPUT, CONFLICT, FAILURE, INTERRUPTED, NOT_FOUND, error_console, out_console
-from api.cli.doctor_command import doctor
-from api.cli.extras import missing_extra
+from api.cli.machine_commands import doctor, weights_app
 from api.cli.scene_commands import blend, check, convert, plan, render
 from api.cli.study_commands import study_app
 from api.cli.stylize_commands import demo, stylize
-from api.cli.weights_commands import weights_app
 from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import DISK_FULL
 from sgsst_core.files.camera_folder import CameraWarning
 from worker.options import EXPERT, GROUPS
 
+_DISTRIBUTION = "sgsst-service"
 #: Base of errors in the arguments, which typer does not export.
 _UsageError: Any = typer.BadParameter.__base__
 _formatted = warnings.formatwarning
@@ -118,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             error_console.print(f"error: {error}")
         return _exit_code(error)
     except ModuleNotFoundError as error:
-        problem = missing_extra(error)
+        problem = _missing_extra(error)
         if problem is None:
             raise
         error_console.print(f"error: {problem}")
@@ -144,6 +145,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         error_console.print("error: out of memory. Use a smaller --resolution, fewer --views or a --memory-limit.")
         return FAILURE
+
+
+def _missing_extra(error: ModuleNotFoundError) -> str | None:
+    """Return a message about the extra of this project that installs a missing module; None if none does.
+
+    Modules are named like their packages, with underscores.
+    """
+    module = (error.name or "").partition(".")[0]
+    try:
+        requirements = requires(_DISTRIBUTION) or ()
+    except PackageNotFoundError:
+        return None
+    for requirement in requirements:
+        matched = re.match(r"([\w.-]+).*\bextra == ['\"](\w+)['\"]", requirement)
+        if matched and matched[1].lower().replace("-", "_") == module:
+            return (
+                f"this command needs {matched[1]}, which the extra `{matched[2]}` installs. "
+                f"Run `pip install '{_DISTRIBUTION}[{matched[2]}]'`."
+            )
+    return None
 
 
 def _format_warning(

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from api.cli.arguments import JobInputs, file_to_write, folder_to_write
 from api.cli.console import EARLY_ENDS, FAILURE, error_console, loss_text, out_console, print_field, spinner
-from api.cli.interrupt import stop_on_signal
+from api.cli.machine_commands import fetch
 from api.cli.options import with_arguments, with_options
-from api.cli.weights_commands import fetch
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.number_format import clock
@@ -215,3 +218,47 @@ def _loss_over_time(result: Result) -> list[str]:
     if last:
         lines.append(f"from {last['from']:.2%} to {last['to']:.2%} in the last tenth of the time")
     return lines
+
+
+class StopFlag:
+    """Flag that records whether a signal has asked the program to stop after its step, and which."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    def __call__(self) -> bool:
+        """Return whether a signal has arrived."""
+        return self.signal is not None
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of a program that was ended by the signal: 130 for Ctrl-C."""
+        return 128 + (self.signal or signal.SIGINT)
+
+
+@contextmanager
+def stop_on_signal(announce: Callable[[], None]) -> Iterator[StopFlag]:
+    """Turn the first SIGINT or SIGTERM into a flag, and call `announce` when it arrives.
+
+    The second signal has its usual effect. Outside the main thread, Python allows no signal handlers, so the flag stays
+    unset.
+    """
+    flag = StopFlag()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        flag.signal = number
+        for other, handler in before.items():
+            signal.signal(other, handler)
+        announce()
+
+    try:
+        for number in before:
+            signal.signal(number, handle)
+        yield flag
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

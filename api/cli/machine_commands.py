@@ -1,16 +1,43 @@
-"""Commands for the weights of the feature network: `weights list`, `fetch` and `path`."""
+"""Commands for this machine: `doctor` says what works, `weights list`, `fetch` and `path` install feature networks."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from api.cli.console import FAILURE, error_console, out_console
-from api.cli.progress_bars import transfer_bar
+from api.cli.arguments import JsonOption
+from api.cli.console import FAILURE, error_console, out_console, transfer_bar
+
+#: Exit code if jobs run, but slower than they could.
+WARNING = 3
+_MARKS = {"works": "ok", "warning": "WARNING", "problem": "PROBLEM"}
 
 weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_help=True)
+
+
+def doctor(as_json: JsonOption = False) -> None:
+    """Examine this machine within 30 seconds: GPU, driver, precision, memory, weights, caches, and correct results.
+
+    Exit code: 0 if everything works, 3 if jobs run but slower than they could, 1 if they fail or are wrong.
+    """
+    from sgsst_core.bench.doctor import examine
+
+    findings = []
+    for finding in examine():
+        findings.append(finding)
+        if not as_json:
+            out_console.print(f"{_MARKS[finding.state]:<9}{finding.topic:<12}{finding.text}")
+    if as_json:
+        out_console.print(json.dumps([asdict(finding) for finding in findings], indent=2))
+    states = {finding.state for finding in findings}
+    if "problem" in states:
+        raise typer.Exit(FAILURE)
+    if "warning" in states:
+        raise typer.Exit(WARNING)
 
 
 @weights_app.command("list")
