@@ -30,8 +30,9 @@ from benchmarks.machine import write_result
 from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
 from worker.job import JobSpec
-from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
+from worker.ranks.attempts import Listener, RanksResult, stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.ranks.rank import WorkerOptions
 
 STEPS = 250
 #: Number of faults per job. An attempt makes a few dozen steps before its fault.

@@ -6,7 +6,7 @@ import json
 import re
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, requires
 from typing import Annotated, Any
 
@@ -67,7 +67,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (
+_COMMANDS: tuple[Callable[..., Any], ...] = (
     stylize,
     plan,
     check,
@@ -78,7 +78,8 @@ for command in (
     doctor,
     *client_commands.COMMANDS,
     *operator_commands.COMMANDS,
-):
+)
+for command in _COMMANDS:
     app.command(cls=_Command)(command)
 app.add_typer(weights_app, name="weights")
 app.add_typer(bench_app, name="bench")

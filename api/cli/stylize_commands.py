@@ -28,7 +28,8 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command i
     from worker.job import JobSpec, Result
     from worker.outputs import Outputs
     from worker.prepare import Prepared
-    from worker.ranks.attempts import RanksResult, WorkerOptions
+    from worker.ranks.attempts import RanksResult
+    from worker.ranks.rank import WorkerOptions
 
 #: Resolution and number of steps of the demo, and seconds after which it stops on a slow machine. The whole demo takes
 #: less than five minutes.
@@ -56,7 +57,7 @@ def stylize(
 ) -> None:
     """Stylize a scene with one or several style images."""
     request = inputs.request(options, out, resume=run.resume)
-    from worker.ranks.attempts import WorkerOptions
+    from worker.ranks.rank import WorkerOptions
 
     _stylize(request, context.obj, options.workers, WorkerOptions(run.rank_timeout, run.checkpoint_seconds))
 
@@ -101,7 +102,7 @@ def _stylize(
         arguments: Arguments of this command; the command to resume the job is built from them.
     """
     from worker.outputs import check_request
-    from worker.ranks.attempts import WorkerOptions
+    from worker.ranks.rank import WorkerOptions
 
     outputs = check_request(request)
     command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])

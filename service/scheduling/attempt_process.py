@@ -106,7 +106,8 @@ class AttemptProcess:
         )
 
     def _run_on_ranks(self) -> Result | None:
-        from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
+        from worker.ranks.attempts import Listener, stylize_on_ranks
+        from worker.ranks.rank import WorkerOptions
 
         listener = Listener(
             prepared=report_prepared,

@@ -20,9 +20,6 @@ GROWTH = 1.01
 #: Number of points of a job above which every second one is deleted at the start of an attempt.
 MOST_POINTS = 2000
 
-#: Members of a progress that only matter at its time.
-_MOMENTARY = {"fraction", "eta_s", "views_checked", "views_to_check"}
-
 _POINTS = Base.metadata.tables[ProgressPointRow.__tablename__]
 _OF_JOB = _POINTS.c.job_id == bindparam("job_id")
 _OF_ATTEMPT = _POINTS.c.attempt == bindparam("attempt")
@@ -46,9 +43,7 @@ def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
         _halve(session, job_id)
     elif step <= last.step or seconds < GROWTH * last.seconds:
         return
-    point = {name: value for name, value in progress.items() if name not in _MOMENTARY}
-    more = {name: point.pop(name) for name in point.keys() - _POINTS.c.keys()}
-    values = {**point, "job_id": job_id, "more": more or None}
+    values = {column.name: progress.get(column.name) for column in _POINTS.c} | {"job_id": job_id}
     session.execute(upsert(session)(_POINTS).values(values).on_conflict_do_nothing())
 
 
@@ -68,7 +63,7 @@ def points(connection: Connection, job_id: str, current: dict[str, Any] | None, 
         current: Current progress of the job; ignored if it is None or has no loss.
         most: Maximum number of points, at least 2; longer histories are sampled evenly, including both ends.
     """
-    known = [{**row, **(row["more"] or {})} for row in connection.execute(_ALL, {"job_id": job_id}).mappings()]
+    known = [dict(row) for row in connection.execute(_ALL, {"job_id": job_id}).mappings()]
     if current and _is_step(current) and (not known or _position(current) > _position(known[-1])):
         known.append(current)
     if len(known) > most:

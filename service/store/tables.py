@@ -141,7 +141,7 @@ class EventRow(Base):
 
 
 class ProgressPointRow(Base):
-    """Point of a job's loss history: members of its progress; those without a column of their own are in `more`."""
+    """Point of a job's loss history: members of its progress, as in `sgsst_core.progress`."""
 
     __tablename__ = "progress_points"
 
@@ -156,7 +156,6 @@ class ProgressPointRow(Base):
     updated_at: Mapped[float] = mapped_column(Float)
     mean_loss: Mapped[float | None] = mapped_column(Float)
     mean_scales: Mapped[list[Any] | None]
-    more: Mapped[dict[str, Any] | None]
 
 
 class ArtifactRow(Base):

@@ -21,8 +21,8 @@ from tests import networks
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall, write_files
-from worker.execute import Result, execute
-from worker.job import JobSpec, Resume, SceneRequest
+from worker.execute import execute
+from worker.job import JobSpec, Result, Resume, SceneRequest
 from worker.prepare import Job, prepare
 from worker.region_requests import region_options, region_requests
 from worker.styles import StyleFile
@@ -94,7 +94,7 @@ def test_job_runs_resumes_and_reports(
     second = prepare(asked, resume=Resume(True))
     assert second.stylizer.job.plan.rasterizer == plan.rasterizer
     result = run_job(second)
-    assert (result.stopped, result.step, result.report_error) == ("finished", 4, None)
+    assert (result.stopped, result.steps, result.report_error) == ("finished", 4, None)
     assert result.loss_over_time is not None
     before, after = (read_scene(path).scene for path in (asked.source.scene, asked.out))
     assert not torch.equal(before.sh_dc, after.sh_dc)

@@ -10,15 +10,14 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from sgsst_core.errors import ClusterAwayError, RanksFailedError
-from worker.options import RunOptions
 from worker.ranks.cluster import Cluster, scene_bytes
 from worker.ranks.failure_policy import FailedAttempt, Failure, GiveUp, RaiseError, decide, first_line
-from worker.ranks.rank import RankProcess, RankStatus, RankTask, Workplace
+from worker.ranks.rank import RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
 from worker.ranks.rank_group import (
     AttemptFailedError,
     RankGroup,
@@ -67,29 +66,6 @@ class Listener:
     finish: Callable[[], bool] = lambda: False
     left_out: Callable[[Sequence[str]], None] = lambda gpus: None
     stored: Callable[[Any], None] = lambda file: None
-
-
-@dataclass(frozen=True)
-class WorkerOptions:
-    """Options of running and watching ranks.
-
-    Attributes:
-        rank_timeout: Seconds without a response to a poll after which a rank counts as lost.
-        checkpoint_seconds: Seconds between checkpoints.
-        preview_folder: Folder of preview images on rank 0's machine; None writes no previews.
-        preview_seconds: Minimum seconds between two previews.
-        actor: Class of the Ray actor that runs a rank.
-        resume_required: Whether resuming a job fails if no checkpoint can be used.
-        workplace: Workplace for ranks on machines without a shared folder; None for this process's working folder.
-    """
-
-    rank_timeout: float = RunOptions().rank_timeout
-    checkpoint_seconds: float = RunOptions().checkpoint_seconds
-    preview_folder: Path | None = None
-    preview_seconds: float = 20.0
-    actor: type[RankProcess] = RankProcess
-    resume_required: bool = True
-    workplace: Workplace | None = None
 
 
 @dataclass
@@ -233,7 +209,7 @@ class _Attempts:
                 self._cluster.close()
                 self._cluster.open()
                 self._let_go = False
-            start_ranks(self._group, self._workers, self._scene_bytes(), self._options.actor, self._task)
+            start_ranks(self._group, self._workers, self._scene_bytes(), self._options.actor or RankProcess, self._task)
             return self._watch()
         except (ray.exceptions.RayError, ConnectionError) as error:
             own = isinstance(error, ray.exceptions.RayTaskError | ray.exceptions.OutOfMemoryError)
@@ -275,17 +251,13 @@ class _Attempts:
             size=len(self._group.handles),
             address=address,
             threads=reservation.threads,
-            timeout=self._options.rank_timeout,
+            options=replace(self._options, workplace=self._workplace()),
             folder=Path.cwd(),
             resume=self._resume(),
             run_id=self._run_id,
-            checkpoint_seconds=self._options.checkpoint_seconds,
-            preview_folder=self._options.preview_folder,
-            preview_seconds=self._options.preview_seconds,
             workers={"requested": self._requested, "attempts": [asdict(attempt) for attempt in self._lost]},
             seconds_lost=time.monotonic() - self._relay.safe_at,
             seconds_since_loss=time.monotonic() - self._lost_at,
-            workplace=self._workplace(),
         )
 
     def _scene_bytes(self) -> int:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from sgsst_core.errors import InfrastructureError
+from worker.options import RunOptions
 from worker.processes import ProcessId, die_with_parent, listen
 
 if TYPE_CHECKING:
@@ -86,6 +87,29 @@ class Workplace(Protocol):
 
 
 @dataclass(frozen=True)
+class WorkerOptions:
+    """Options of running and watching ranks.
+
+    Attributes:
+        rank_timeout: Seconds without a response to a poll after which a rank counts as lost.
+        checkpoint_seconds: Seconds between checkpoints.
+        preview_folder: Folder of preview images on rank 0's machine; None writes no previews.
+        preview_seconds: Minimum seconds between two previews.
+        actor: Class of the Ray actor that runs a rank; None for `RankProcess`.
+        resume_required: Whether resuming a job fails if no checkpoint can be used.
+        workplace: Workplace for ranks on machines without a shared folder; None for this process's working folder.
+    """
+
+    rank_timeout: float = RunOptions().rank_timeout
+    checkpoint_seconds: float = RunOptions().checkpoint_seconds
+    preview_folder: Path | None = None
+    preview_seconds: float = 20.0
+    actor: type[RankProcess] | None = None
+    resume_required: bool = True
+    workplace: Workplace | None = None
+
+
+@dataclass(frozen=True)
 class RankPlace:
     """Location of a rank's process.
 
@@ -113,16 +137,13 @@ class RankTask:
         rank, size: Number of this rank, and number of ranks.
         address: Address "host:port" at which rank 0 listens.
         threads: Number of threads for computation.
-        timeout: Seconds without a response after which a rank counts as lost.
+        options: Options of the job's ranks.
         folder: Base folder of relative paths on every machine; unused with a workplace.
         resume: Choice of the checkpoint to resume from.
         run_id: Identifier of this run of the program.
-        checkpoint_seconds: Seconds between checkpoints.
-        preview_folder, preview_seconds: Options of previews; see `attempts.WorkerOptions`.
         workers: Requested ranks and lost attempts, for the report.
         seconds_lost, seconds_since_loss: Costs of the last lost attempt until this task was created; see
             `attempts.LostAttempt`.
-        workplace: Workplace for machines without a shared folder; None if they share one.
     """
 
     request: JobSpec
@@ -130,17 +151,13 @@ class RankTask:
     size: int
     address: str
     threads: int
-    timeout: float
+    options: WorkerOptions
     folder: Path
     resume: Resume
     run_id: str
-    checkpoint_seconds: float
-    preview_folder: Path | None
-    preview_seconds: float
     workers: dict[str, Any]
     seconds_lost: float
     seconds_since_loss: float
-    workplace: Workplace | None = None
 
 
 @dataclass(frozen=True)
@@ -236,10 +253,10 @@ class RankProcess:
         place: OpenWorkplace | None = None
         try:
             _set_environment(task)
-            if task.workplace is None:
+            if task.options.workplace is None:
                 _enter_folder(task)
             else:
-                place = task.workplace.open(task.rank, self._add_stored)
+                place = task.options.workplace.open(task.rank, self._add_stored)
                 os.chdir(place.folder)
             self._work(task, place)
         except BaseException as error:
@@ -262,7 +279,7 @@ class RankProcess:
 
         torch.set_num_threads(task.threads)
         device = torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else "cpu"
-        timeout = timedelta(seconds=task.timeout + _PATIENCE)
+        timeout = timedelta(seconds=task.options.rank_timeout + _PATIENCE)
         with process_group(
             task.rank, task.size, task.address, device=device, timeout=timeout, listener=self._listener
         ) as collectives:
@@ -283,10 +300,10 @@ class RankProcess:
         from worker.prepare import describe, prepare
         from worker.previews import Previews
 
-        started = time.monotonic()
+        started, options = time.monotonic(), task.options
         preview = None
-        if task.preview_folder:
-            preview = Previews(task.preview_folder, task.preview_seconds, self._add_warning)
+        if options.preview_folder:
+            preview = Previews(options.preview_folder, options.preview_seconds, self._add_warning)
         job = prepare(
             task.request,
             collectives=collectives,
@@ -315,8 +332,8 @@ class RankProcess:
             finish=self._finish.is_set,
             warn=self._add_warning,
             preview=preview,
-            saved=lambda step: self._update(saved=step) if task.workplace is None else None,
-            checkpoint_seconds=task.checkpoint_seconds,
+            saved=lambda step: self._update(saved=step) if task.options.workplace is None else None,
+            checkpoint_seconds=options.checkpoint_seconds,
             run_id=task.run_id,
         )
 

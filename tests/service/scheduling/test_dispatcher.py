@@ -129,7 +129,7 @@ def test_released_gpus_are_free_for_other_jobs(settings: ServiceSettings, store:
     capacity = Capacity(Machine(grant.gpus, 2, 10**11), None)
     assert capacity.free([attempt.grant]) == 0
     for gpu in ("7", "5"):
-        attempt._handle({"kind": "left-out", "gpus": [gpu]})
+        attempt._handle(Report(left_out=(gpu,)))
     assert attempt.grant == Grant(1, ("6",))
     following = capacity.grant(held.job, [attempt.grant], 1)
     assert following is not None

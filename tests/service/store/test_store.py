@@ -410,7 +410,7 @@ def test_loss_history_covers_the_whole_job(store: Store, clock: Clock) -> None:
     assert store.jobs.loss_history(store.jobs.get(job_id, None), 10) == []
     with store.database.writing() as session:  # like `report_progress`, without a transaction for each point
         for step in range(1, 5000):
-            added = {"attempt": 1, "updated_at": clock.now + step, "new": step}
+            added = {"attempt": 1, "updated_at": clock.now + step}
             add_point(session, job_id, at_step(step, 0.9 * step).model_dump() | added)
     clock.now += 5000
     store.leases.report_progress(held, at_step(5000, 4500.0, "measuring"))
@@ -419,7 +419,6 @@ def test_loss_history_covers_the_whole_job(store: Store, clock: Clock) -> None:
     assert [point["step"] for point in points[:5]] == [1, 2, 3, 4, 5]
     assert (points[-1]["step"], points[-1]["stage"], points[-1]["updated_at"]) == (5000, "measuring", clock.now)
     assert (points[9]["loss"], points[9]["scales"], points[9]["seconds"]) == (1e5, [1.0, None], 9.0)
-    assert points[9]["new"] == 10, "what has no column is stored too"
     ratios = [later["seconds"] / point["seconds"] for point, later in itertools.pairwise(points[:-1])]
     assert all(ratio >= GROWTH for ratio in ratios)
     assert all(ratio < GROWTH + 0.01 for ratio in ratios[100:]), "no gaps"

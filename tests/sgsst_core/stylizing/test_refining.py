@@ -131,7 +131,7 @@ def test_auto_computes_no_gradient_if_no_gaussian_is_large(tiny_weights: Backbon
         style(),
         settings(refine="auto"),
         weights=tiny_weights,
-        show=lambda now: reports.append(now.done),
+        show=lambda now: reports.append(now.step),
     )
     assert refinement is not None
     assert (refinement.split, refinement.gaussians) == (0, len(small))
@@ -189,7 +189,7 @@ def test_refinement_reports_its_progress(tiny_weights: BackboneWeights) -> None:
         style(),
         settings(refine=2.0),
         weights=tiny_weights,
-        show=lambda now: reports.append((now.stage, now.done, now.total)),
+        show=lambda now: reports.append((now.stage, now.step, now.total)),
     )
     stages = [(stage, done, 3) for stage in ("planning", "refining") for done in range(3)]
     assert reports == [*stages, ("refining", 0, 0)]

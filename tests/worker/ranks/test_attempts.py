@@ -23,8 +23,9 @@ from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, name_of
 from worker.execute import execute
 from worker.job import JobSpec
 from worker.prepare import Prepared, prepare
-from worker.ranks.attempts import Listener, RanksResult, WorkerOptions, stylize_on_ranks
+from worker.ranks.attempts import Listener, RanksResult, stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.ranks.rank import WorkerOptions
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "vgg16_weights"),

@@ -15,7 +15,8 @@ import pytest
 from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, small_request
 from worker.ranks import cluster
-from worker.ranks.attempts import Listener, WorkerOptions, stylize_on_ranks
+from worker.ranks.attempts import Listener, stylize_on_ranks
+from worker.ranks.rank import WorkerOptions
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "tiny_installed"),
