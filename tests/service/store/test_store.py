@@ -31,8 +31,8 @@ from service.store.jobs import Idempotency
 from service.store.leases import MAX_PROGRESS_EVENTS, Lease, Published
 from service.store.retries import MAX_LOSSES
 from service.store.tables import Base, JobRow, ProgressPointRow, ShareRow
-from tests.raised import raises_problem
 from sgsst_core.progress import Progress
+from tests.raised import raises_problem
 from tests.service.store.helpers import (
     ATTEMPTS,
     LEASE,
