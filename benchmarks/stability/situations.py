@@ -204,7 +204,7 @@ def reference_error(job: Stylizer) -> tuple[float, float, int]:
     gradient = gradient_error(actual, exact)
     if not math.isfinite(gradient):
         return math.inf, REFERENCE_BOUND, double.flips
-    rounding = nearest_weight(job.job.loss.style_loss, job.job.loss.network.unit) * _ROUNDING_OF_COSINES
+    rounding = nearest_weight(job.job.settings.style_loss, job.job.loss.network.unit) * _ROUNDING_OF_COSINES
     error = max(abs(actual.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
     if job.job.loss.style_loss == "sos":
         error = max(error, gradient)

@@ -24,7 +24,7 @@ _POINTS = Base.metadata.tables[ProgressPointRow.__tablename__]
 _OF_JOB = _POINTS.c.job_id == bindparam("job_id")
 _OF_ATTEMPT = _POINTS.c.attempt == bindparam("attempt")
 _LAST = select(_POINTS.c.step, _POINTS.c.seconds).where(_OF_JOB, _OF_ATTEMPT).order_by(_POINTS.c.step.desc()).limit(1)
-_ALL = select(_POINTS).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
+_ALL = select(_POINTS.c.progress).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
 _STEPS = select(_POINTS.c.attempt, _POINTS.c.step).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
 _COUNT = select(func.count()).where(_OF_JOB)
 
@@ -43,7 +43,7 @@ def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
         _halve(session, job_id)
     elif step <= last.step or seconds < GROWTH * last.seconds:
         return
-    values = {column.name: progress.get(column.name) for column in _POINTS.c} | {"job_id": job_id}
+    values = {"job_id": job_id, "attempt": attempt, "step": step, "seconds": seconds, "progress": progress}
     session.execute(upsert(session)(_POINTS).values(values).on_conflict_do_nothing())
 
 
@@ -63,7 +63,7 @@ def points(connection: Connection, job_id: str, current: dict[str, Any] | None, 
         current: Current progress of the job; ignored if it is None or has no loss.
         most: Maximum number of points, at least 2; longer histories are sampled evenly, including both ends.
     """
-    known = [dict(row) for row in connection.execute(_ALL, {"job_id": job_id}).mappings()]
+    known: list[dict[str, Any]] = list(connection.execute(_ALL, {"job_id": job_id}).scalars())
     if current and _is_step(current) and (not known or _position(current) > _position(known[-1])):
         known.append(current)
     if len(known) > most:

@@ -141,21 +141,15 @@ class EventRow(Base):
 
 
 class ProgressPointRow(Base):
-    """Point of a job's loss history: members of its progress, as in `sgsst_core.progress`."""
+    """Point of a job's loss history: its progress at one moment, with a column for each member that queries use."""
 
     __tablename__ = "progress_points"
 
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
     attempt: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
     step: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    total: Mapped[int] = mapped_column(Integer)
-    stage: Mapped[str] = mapped_column(String(20))
     seconds: Mapped[float] = mapped_column(Float)
-    loss: Mapped[float] = mapped_column(Float)
-    scales: Mapped[list[Any] | None]
-    updated_at: Mapped[float] = mapped_column(Float)
-    mean_loss: Mapped[float | None] = mapped_column(Float)
-    mean_scales: Mapped[list[Any] | None]
+    progress: Mapped[dict[str, Any]]
 
 
 class ArtifactRow(Base):

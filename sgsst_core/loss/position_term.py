@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple, Self
 
 import torch
@@ -14,7 +14,7 @@ from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.vgg import FeatureNetwork, layer_stride
 from sgsst_core.loss.targets import ContentFeatures, StyleTarget
 from sgsst_core.parallel.division import Size
-from sgsst_core.settings import StyleLossName
+from sgsst_core.settings import Settings, StyleLossName, make_settings
 from sgsst_core.timing import Timer
 
 #: Position weights [H >> k, W >> k] for each power of two 2^k; None for equal weights.
@@ -71,11 +71,13 @@ class Objective:
         network: Feature network, "vgg16" or "vgg19".
         style_loss: Style loss; see `terms`.
         content_weight: lambda_c; 0 for no content term.
+        settings: Settings with the weights of other terms.
     """
 
     network: str
     style_loss: StyleLossName = "sos"
     content_weight: float = 1.0
+    settings: Settings = field(default_factory=make_settings)
 
 
 class StyledRegion(NamedTuple):

@@ -27,7 +27,7 @@ from sgsst_core.loss.tiling import RENDERING, Divider, Division, Tiling
 from sgsst_core.loss.view_images import ViewImages
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Size, rounds
-from sgsst_core.settings import Settings, StyleLossName
+from sgsst_core.settings import Settings, StyleLossName, make_settings
 from sgsst_core.timing import Timer
 
 #: Default memory budget for activations in bytes; leaves most of a laptop's memory free.
@@ -70,6 +70,7 @@ class SosLoss:
             `PIXELS` are compared only if the network reports them.
         content_weight: lambda_c; 0 disables the content term.
         style_loss: Style loss; see `terms`.
+        settings: Settings with the weights of other terms; None for the defaults.
         memory: Memory budget for activations in bytes.
         tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
@@ -89,6 +90,7 @@ class SosLoss:
         *,
         content_weight: float = 1.0,
         style_loss: StyleLossName = "sos",
+        settings: Settings | None = None,
         memory: int = DEFAULT_MEMORY,
         tile_size: int | None = None,
         coarsest: int = COARSEST_SHORTER_SIDE,
@@ -99,7 +101,7 @@ class SosLoss:
     ) -> None:
         self.network = network
         self.content_weight = content_weight
-        self.style_loss: StyleLossName = style_loss
+        self._objective = Objective(network.name, style_loss, content_weight, settings or make_settings())
         self.memory = memory
         self.weights = scales
         self.timer = timer or Timer()
@@ -182,7 +184,7 @@ class SosLoss:
         inputs = TermInputs(
             scaled,
             self.network,
-            Objective(self.network.name, self.style_loss, self.content_weight),
+            self._objective,
             _styled_regions(style, view),
             self._content(view, scaled.scale, tiles),
             view.coverage,
@@ -315,6 +317,7 @@ def make_loss(
         network,
         content_weight=settings.content_weight if content_weight is None else content_weight,
         style_loss=settings.style_loss,
+        settings=settings,
         memory=memory,
         coarsest=settings.coarsest_side,
         style_scale=settings.style_scale,

@@ -18,7 +18,7 @@ from sgsst_core.loss.content import ContentTerm
 from sgsst_core.loss.nearest import NearestTerm
 from sgsst_core.loss.position_term import Objective, PositionTerm
 from sgsst_core.loss.statistics_terms import STATISTICS_TERMS, statistics_layers
-from sgsst_core.settings import StyleLossName
+from sgsst_core.settings import Settings, StyleLossName, make_settings
 
 #: Terms that are sums over positions.
 POSITION_TERMS: tuple[type[PositionTerm], ...] = (ContentTerm, NearestTerm)
@@ -27,9 +27,11 @@ POSITION_TERMS: tuple[type[PositionTerm], ...] = (ContentTerm, NearestTerm)
 TERMS = STATISTICS_TERMS | {term.name: term.label for term in POSITION_TERMS}
 
 
-def layers_of(style_loss: StyleLossName, weights: BackboneWeights, *, content: bool) -> tuple[str, ...]:
-    """Return every layer that a loss reads from a network."""
-    objective = Objective(weights.name, style_loss, float(content))
+def layers_of(
+    style_loss: StyleLossName, weights: BackboneWeights, *, content: bool, settings: Settings | None = None
+) -> tuple[str, ...]:
+    """Return every layer that a loss reads from a network; settings other than the defaults may add terms."""
+    objective = Objective(weights.name, style_loss, float(content), settings or make_settings())
     read = [term.layers(objective) for term in POSITION_TERMS]
     layers = (*statistics_layers(style_loss, weights), *(layer for every in read for layer in every))
     return tuple(dict.fromkeys(layers))

@@ -135,7 +135,7 @@ def sharing_memory(collectives: Collectives, device: Device) -> int:
 
 def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
     """Create the feature network with layers up to the deepest one used."""
-    layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0)
+    layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0, settings=settings)
     use_whole_float32()
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 

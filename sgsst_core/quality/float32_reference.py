@@ -83,7 +83,9 @@ class ExactLoss:
         self._stylizer = stylizer
         settings = stylizer.job.settings
         settings = settings.model_copy(update={"style_loss": style_loss or settings.style_loss})
-        layers = layers_of(settings.style_loss, stylizer.job.weights, content=settings.content_weight > 0)
+        layers = layers_of(
+            settings.style_loss, stylizer.job.weights, content=settings.content_weight > 0, settings=settings
+        )
         network = FeatureNetwork(stylizer.job.weights, layers, torch.float32, stylizer.job.network.device)
         own = stylizer.job.loss
         self.loss = make_loss(network, settings, own.memory, content_weight=own.content_weight)

@@ -178,14 +178,8 @@ def upgrade() -> None:
         sa.Column("job_id", sa.String(40), sa.ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True),
         sa.Column("attempt", sa.Integer(), primary_key=True, autoincrement=False),
         sa.Column("step", sa.Integer(), primary_key=True, autoincrement=False),
-        sa.Column("total", sa.Integer(), nullable=False),
-        sa.Column("stage", sa.String(20), nullable=False),
         sa.Column("seconds", sa.Float(), nullable=False),
-        sa.Column("loss", sa.Float(), nullable=False),
-        sa.Column("scales", sa.JSON(), nullable=True),
-        sa.Column("updated_at", sa.Float(), nullable=False),
-        sa.Column("mean_loss", sa.Float(), nullable=True),
-        sa.Column("mean_scales", sa.JSON(), nullable=True),
+        sa.Column("progress", sa.JSON(), nullable=False),
     )
     op.create_table(
         "reservations",
