@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 
 from benchmarks.machine import RESULTS
 from sgsst_core.bench.error_time import MOMENTS, SLICES
-from sgsst_core.files.json_files import write_json
+from sgsst_core.files.atomic import write_json
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.report.charts import draw_legend, draw_points, png_chart, set_log_x, set_log_y

@@ -10,8 +10,7 @@ from dataclasses import replace
 import torch
 
 from sgsst_core.errors import OutputError
-from sgsst_core.files.atomic import remove_leftovers
-from sgsst_core.files.json_files import write_json
+from sgsst_core.files.atomic import remove_leftovers, write_json
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.files.stylized_ply import write_colors, write_stylized
 from sgsst_core.progress import Progress

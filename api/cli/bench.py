@@ -15,9 +15,8 @@ from sgsst_core.bench.error_time import Curve, Variant, as_dict, choose_variants
 from sgsst_core.bench.quality import Quality, compare_quality, write_sheet
 from sgsst_core.bench.quality import write_plot as write_quality_plot
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
-from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.atomic import ensure_writable_folder, write_json
 from sgsst_core.files.images import load_image
-from sgsst_core.files.json_files import write_json
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.report.machine import machine

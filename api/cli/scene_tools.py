@@ -15,13 +15,12 @@ from api.cli.arguments import local_path
 from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import load_network_weights
-from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.atomic import ensure_writable_folder, write_json
 from sgsst_core.files.blending import blend_scenes, normalized
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.sog import META_NAME
 from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.images import load_image, save_png
-from sgsst_core.files.json_files import write_json
 from sgsst_core.files.library import load_scene, save
 from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
 from sgsst_core.files.stylized_ply import check_sh_attenuation

@@ -11,7 +11,7 @@ from typing import Any
 
 from service import problems
 from service.parameters import MAX_JOB_NAME
-from sgsst_core.files.camera_advice import advice_for_name
+from sgsst_core.files.advice import advice_for_name
 from sgsst_core.files.formats import format_of_name
 from worker.region_requests import MOST_REGIONS, RegionRequest
 from worker.styles import MOST_STYLE_IMAGES

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from sgsst_core.errors import CameraError, ImageError
-from sgsst_core.files.camera_advice import refuse_json
+from sgsst_core.files.advice import refuse_camera_json
 from sgsst_core.files.camera_folder import FORMATS, find_cameras, issue_warning, load_json
 from sgsst_core.files.colmap_model import COMPARE, QUATERNION_TOLERANCE, ColmapCamera, Warn, read_model
 from sgsst_core.files.images import image_size
@@ -78,7 +78,7 @@ def read_cameras(path: Path, photos: Path | None = None, warn: Warn | None = Non
     if file.is_dir():
         return _read_colmap(file, warn)
     content = load_json(file)
-    refuse_json(file, content)
+    refuse_camera_json(file, content)
     if isinstance(content, list):
         return _convert_entries(file, content, _inria_camera)
     if isinstance(content, dict) and isinstance(content.get("frames"), list):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sgsst_core.errors import CameraError
-from sgsst_core.files.camera_advice import refuse_file, refuse_folder
+from sgsst_core.files.advice import CAMERAS, refuse_camera_folder, refuse_known
 from sgsst_core.files.colmap_model import Warn, read_model
 
 FORMATS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
@@ -68,7 +68,7 @@ def load_json(path: Path) -> Any:
         CameraError: If the file cannot be read, is not JSON, or is in a known format that cannot be read.
     """
     try:
-        refuse_file(path)
+        refuse_known(path, CAMERAS, CameraError)
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise CameraError(f"{path}: cannot be read: {error.strerror}. Check the path, or give {FORMATS}.") from error
@@ -124,7 +124,7 @@ def _only_json(folder: Path) -> Path:
     models = _models_below(folder)
     if models:
         raise CameraError(f"{folder}: holds no cameras, but {_largest(models)} has a COLMAP model. Give that folder.")
-    refuse_folder(folder)
+    refuse_camera_folder(folder)
     if len(files) == 1:
         return files[0]  # its reader says what is wrong with it
     looked_at = f" (looked at {', '.join(path.name for path in files)})" if files else ""

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from sgsst_core.errors import CameraError
-from sgsst_core.files.lfs_pointers import refuse_pointer
+from sgsst_core.files.advice import POINTER, refuse_known
 
 T = TypeVar("T")
 Warn = Callable[[str], None]
@@ -120,7 +120,7 @@ def read_model(folder: Path, warn: Warn) -> tuple[dict[int, ColmapCamera], list[
 def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
     by_id: dict[int, T] = {}
     try:
-        refuse_pointer(path, CameraError)
+        refuse_known(path, [POINTER], CameraError)
         for number, entry in entries:
             if number in by_id:
                 raise CameraError(f"{path}: has id {number} twice. Export the model again.")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.errors import MaskError
-from sgsst_core.files.lfs_pointers import refuse_pointer
+from sgsst_core.files.advice import POINTER, refuse_known
 from sgsst_core.files.scene_file import SceneFile
 
 #: Suffix of masks of packed bits; every other file is read as .npy.
@@ -31,7 +31,7 @@ def read_mask(path: Path, file: SceneFile) -> Tensor:
         MaskError: If the file cannot be read, has another length, or has values other than 0 and 1.
     """
     try:
-        refuse_pointer(path, MaskError)
+        refuse_known(path, [POINTER], MaskError)
     except OSError as error:
         raise MaskError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
     rows = len(file.scene) if file.retained is None else len(file.retained)

@@ -18,9 +18,9 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from sgsst_core.errors import ImageError
+from sgsst_core.files.advice import POINTER, refuse_known
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.color_profiles import ColorProfile
-from sgsst_core.files.lfs_pointers import refuse_pointer
 from sgsst_core.files.png_metadata import SIGNATURE, open_png
 
 #: Maximum number of pixels: Pillow's limit against decompression bombs, which is twice its warning threshold. These 179
@@ -196,7 +196,7 @@ def _opened(path: Path, *, pixels: bool = True) -> Iterator[Image.Image]:
             f"{path}: has more than {MAX_PIXELS // 10**6} megapixels; refused before decoding. Scale it down first."
         ) from error
     except UnidentifiedImageError as error:
-        refuse_pointer(path, ImageError)
+        refuse_known(path, [POINTER], ImageError)
         raise ImageError(f"{path}: is not an image that can be read. Give a PNG or JPEG.") from error
     except Exception as error:  # Pillow's decoders raise many types
         if isinstance(error, OSError) and error.strerror:

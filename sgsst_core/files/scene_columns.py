@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.ply import PROPERTIES, RGB
+from sgsst_core.files.formats.ply_header import FILTER_3D, is_flat
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS
-from sgsst_core.files.formats.render_tag import FILTER_3D, is_flat
 from sgsst_core.scene.stored_harmonics import RowLayout
 
 #: Order of the properties in messages; f_rest_* follow.

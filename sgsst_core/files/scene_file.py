@@ -24,9 +24,8 @@ from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
-from sgsst_core.files.formats.ply_header import PlyHeader, element_offsets, surplus
-from sgsst_core.files.formats.render_tag import FILTER_3D, UNTAGGED, RenderTag
-from sgsst_core.files.formats.scene_format import Arrays, SceneFormat, SceneHeader
+from sgsst_core.files.formats.ply_header import FILTER_3D, PlyHeader, element_offsets, surplus
+from sgsst_core.files.formats.scene_format import UNTAGGED, Arrays, RenderTag, SceneFormat, SceneHeader
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.formats.units import check_units

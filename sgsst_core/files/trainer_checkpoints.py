@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.files.advice import is_checkpoint, refuse_changed_meaning
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import HEAD_BYTES
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS
-from sgsst_core.files.formats.unsupported import is_checkpoint, refuse_changed_meaning
 from sgsst_core.files.scene_file import SceneFile, file_stamp
 from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import Scene, attenuation_factor, checked_scene

@@ -23,8 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from sgsst_core.errors import InvalidInputError, SettingsError
-from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.json_files import write_json
+from sgsst_core.files.atomic import atomic_path, write_json
 from sgsst_core.options import reason
 from sgsst_core.scene.pyramid import resize_area
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from sgsst_core.errors import SceneError
+from sgsst_core.files.advice import SCENES, refuse_known, refuse_scene_folder
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.glb import GLB
 from sgsst_core.files.formats.ksplat import KSPLAT
@@ -19,7 +20,6 @@ from sgsst_core.files.formats.scene_format import FileStart, SceneFormat, SceneH
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.splat import SPLAT
 from sgsst_core.files.formats.spz import SPZ, SPZ_3
-from sgsst_core.files.formats.unsupported import refuse_folder, refuse_unsupported
 
 #: All scene formats, in the order in which they are tried and listed. Formats without a magic number come last.
 FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_3, SOG, GLB, KSPLAT, SPLAT)
@@ -74,7 +74,7 @@ def read_scene_header(path: Path) -> SceneHeader:
         SceneError: If the file cannot be read, is truncated, has a wrong header, or has an unsupported format.
     """
     if path.is_dir():
-        refuse_folder(path)
+        refuse_scene_folder(path)
     try:
         with path.open("rb") as file:
             start = FileStart(path, file.read(HEAD_BYTES), path.stat().st_size)
@@ -83,5 +83,5 @@ def read_scene_header(path: Path) -> SceneHeader:
     for each in FORMATS:
         if each.matches(start):
             return each.read_header(start)
-    refuse_unsupported(start)
+    refuse_known(path, SCENES, SceneError)
     raise SceneError(f"{path}: is not a scene file: expected {TITLES}. Export the scene in one of these formats.")

@@ -17,7 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.ply_header import PlyElement, PlyHeader, element_offsets, read_header, surplus
+from sgsst_core.files.advice import refuse_changed_meaning
+from sgsst_core.files.formats.ply_header import (
+    PlyElement,
+    PlyHeader,
+    comment_lines,
+    element_offsets,
+    ply_tag,
+    read_header,
+    surplus,
+)
 from sgsst_core.files.formats.quantized import (
     OPACITY_LOGITS,
     SH_C0,
@@ -28,9 +37,7 @@ from sgsst_core.files.formats.quantized import (
     with_largest,
     without_largest,
 )
-from sgsst_core.files.formats.render_tag import comment_lines, ply_tag
 from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
-from sgsst_core.files.formats.unsupported import refuse_changed_meaning
 from sgsst_core.scene.rendering import Rendering
 
 #: Number of Gaussians per chunk. Each chunk has its own quantization bounds.

@@ -27,14 +27,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.files.advice import refuse_changed_meaning
 from sgsst_core.files.formats.frame import Y_UP, Frame
 from sgsst_core.files.formats.quantized import SH_C0
-from sgsst_core.files.formats.render_tag import RenderTag, extras_of, extras_tag
-from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
-from sgsst_core.files.formats.surplus import surplus_note
+from sgsst_core.files.formats.scene_format import (
+    COEFFICIENTS,
+    Arrays,
+    FileStart,
+    OpenScene,
+    RenderTag,
+    SceneFormat,
+    SceneHeader,
+    extras_of,
+    extras_tag,
+    json_numbers,
+    surplus_note,
+)
 from sgsst_core.files.formats.units import logarithms, logits
-from sgsst_core.files.formats.unsupported import refuse_changed_meaning
-from sgsst_core.files.json_files import json_numbers
 from sgsst_core.scene.rendering import Rendering
 
 _MAGIC = b"glTF"

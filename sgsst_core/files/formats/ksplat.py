@@ -18,8 +18,15 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, SH_C0
-from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
-from sgsst_core.files.formats.surplus import surplus_note
+from sgsst_core.files.formats.scene_format import (
+    COEFFICIENTS,
+    Arrays,
+    FileStart,
+    OpenScene,
+    SceneFormat,
+    SceneHeader,
+    surplus_note,
+)
 from sgsst_core.files.formats.units import logarithms
 
 #: Version 0.1, the only one.

@@ -16,11 +16,10 @@ from typing import BinaryIO
 import numpy as np
 
 from sgsst_core.errors import SceneError
+from sgsst_core.files.advice import refuse_changed_meaning
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
-from sgsst_core.files.formats.ply_header import PlyHeader, check_length, read_header
-from sgsst_core.files.formats.render_tag import comment_lines, is_flat, ply_tag
+from sgsst_core.files.formats.ply_header import PlyHeader, check_length, comment_lines, is_flat, ply_tag, read_header
 from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, SceneFormat, SceneHeader
-from sgsst_core.files.formats.unsupported import refuse_changed_meaning
 from sgsst_core.scene.rendering import Rendering
 
 #: Properties of the scene's tensors; opacity and f_rest_* follow.

@@ -2,6 +2,9 @@
 
 The format is that of Greg Turk, "The PLY Polygon File Format" (1994). The newer type names (`float32`, `int8`, ...) are
 accepted too, as are LF, CR LF and CR line ends.
+
+Comments state render modes: Brush's `SplatRenderMode: mip` (also of splat-transform and gsplat), Postshot's
+`antialiased 1`, fVDB's `fvdb_ply_af_8198767135antialias|int64|1` and `...eps2d|double|0.3`, and our own `eps2d 0.1`.
 """
 
 from __future__ import annotations
@@ -9,13 +12,24 @@ from __future__ import annotations
 import mmap
 import re
 import struct
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from sgsst_core.constants import EPS2D
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.surplus import about_surplus, number_of, refuse_text_transfer, surplus_note
+from sgsst_core.files.formats.scene_format import (
+    RenderTag,
+    about_surplus,
+    number_of,
+    refuse_text_transfer,
+    stated,
+    surplus_note,
+    usable_eps2d,
+)
+from sgsst_core.scene.rendering import Rendering
 
 #: Maximum size of a header. A 3DGS header takes 2 kB; a megabyte allows long comments. The limit avoids searching a
 #: whole file that is not a PLY for `end_header`.
@@ -27,6 +41,16 @@ _TYPES = {
     **{"float32": "f4", "float64": "f8"},
 }
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+#: Property of Mip-Splatting: deviation of the 3D filter of each Gaussian, in world units.
+FILTER_3D = "filter_3D"
+#: Blur of Mip-Splatting and of Brush's antialiased scenes.
+_MIP_EPS2D = 0.1
+
+_MODES = {"mip": "antialiased", "default": "classic", "2dgs": "2dgs"}
+_MODE = re.compile(r"splatrendermode:\s*(\S+)\s*", re.IGNORECASE)
+_FLAG = re.compile(r"(?:antialiased\s+|fvdb_ply_\w+antialias\|int64\|)([01])\s*", re.IGNORECASE)
+_EPS2D = re.compile(r"(?:eps2d\s+|fvdb_ply_\w+eps2d\|double\|)([\d.eE+-]+)\s*", re.IGNORECASE)
+_UNSCENTED = re.compile(r"\b3dgr?ut\b|\b3dgrt\b|\bunscented", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -280,3 +304,81 @@ def _truncated(path: Path, element: PlyElement) -> SceneError:
         f"{path}: ends within element {element.name!r}: the file is truncated or its header is wrong. "
         "Copy or export it again."
     )
+
+
+def ply_tag(header: PlyHeader) -> RenderTag:
+    """Return the render mode that the comments and properties of a PLY state; the last comment counts."""
+    names = {prop.name for prop in header.vertex.properties}
+    mode, eps2d, reasons, warnings = None, None, [], []
+    for comment in header.comments:
+        if match := _MODE.fullmatch(comment):
+            mode = _MODES.get(match[1].lower(), mode)
+            if match[1].lower() not in _MODES:
+                warnings.append(("classic unless stated otherwise", f"the comment {comment!r} is unknown"))
+                continue
+        elif match := _FLAG.fullmatch(comment):
+            mode = "antialiased" if match[1] == "1" else "classic"
+        elif match := _EPS2D.fullmatch(comment):
+            eps2d = usable_eps2d(match[1])
+        elif _UNSCENTED.search(comment):
+            warnings.append(_unscented(f"the comment {comment!r}"))
+            continue
+        else:
+            continue
+        reasons.append(f"the comment {comment!r}")
+    if mode is None and FILTER_3D in names:
+        mode = "antialiased"
+        reasons.append(f"the property {FILTER_3D} of Mip-Splatting")
+    if is_flat(names):
+        mode = "2dgs"
+        reasons.append("the missing property scale_2")
+    usual = _MIP_EPS2D if FILTER_3D in names or "Exported from Brush" in header.comments else EPS2D
+    if eps2d is None:
+        eps2d = usual if mode == "antialiased" else EPS2D
+    return stated(mode or "classic", ", ".join(reasons), eps2d, tuple(warnings))
+
+
+def is_flat(names: Collection[str]) -> bool:
+    """Return whether properties are those of 2D Gaussian Splatting, whose Gaussians have no third axis."""
+    return "scale_1" in names and "scale_2" not in names and "scale" not in names
+
+
+def _unscented(where: str) -> tuple[str, str]:
+    return (
+        "by linearized projection (EWA)",
+        f"{where} names another projection; renders differ where Gaussians are large or lenses were distorted",
+    )
+
+
+def comment_lines(rendering: Rendering) -> list[str]:
+    """Return the lines of a PLY header that state a render mode; empty for the default mode."""
+    mode, eps2d = _stating(rendering)
+    return [*([] if rendering.mode == "classic" else [mode]), *([] if rendering.eps2d == EPS2D else [eps2d])]
+
+
+def retagged(raw: bytes, header: PlyHeader, rendering: Rendering) -> bytes:
+    """Add comments that state a render mode to the bytes of a PLY header, unless the header already states that mode.
+
+    Args:
+        raw: Bytes of the header, which may differ from those of `header` in the number of Gaussians.
+        header: Parsed header.
+        rendering: Render mode to state.
+    """
+    if ply_tag(header).rendering == rendering:
+        return raw
+    lines = [line for line in raw.split(header.newline) if not _states_mode(line)]
+    after_format = next(i for i, line in enumerate(lines) if line.startswith(b"format")) + 1
+    lines[after_format:after_format] = [line.encode() for line in _stating(rendering)]
+    return header.newline.join(lines)
+
+
+def _stating(rendering: Rendering) -> tuple[str, str]:
+    """Return the lines of a PLY header that state mode and blur."""
+    name = next(name for name, mode in _MODES.items() if mode == rendering.mode)
+    return f"comment SplatRenderMode: {name}", f"comment eps2d {rendering.eps2d!r}"
+
+
+def _states_mode(line: bytes) -> bool:
+    """Return whether a line of a PLY header is a comment that states mode or blur."""
+    comment = comment_of(line)
+    return comment is not None and any(pattern.fullmatch(comment) for pattern in (_MODE, _FLAG, _EPS2D))

@@ -1,17 +1,23 @@
-"""Registry entry of a scene format, and the types of its functions' arguments."""
+"""Registry entry of a scene format, the types of its functions' arguments, and what several formats need.
+
+A file may state its render mode, and may hold content beyond what its header declares, which is counted and reported.
+"""
 
 from __future__ import annotations
 
+import codecs
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sgsst_core.files.formats.render_tag import UNTAGGED, RenderTag
-from sgsst_core.scene.rendering import Rendering
+from sgsst_core.constants import EPS2D
+from sgsst_core.errors import SceneError
+from sgsst_core.scene.rendering import CLASSIC, MAX_EPS2D, Rendering
 
 #: SH coefficients per color channel above degree 0, by SH degree.
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
@@ -19,6 +25,31 @@ COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 #: float32 arrays of N Gaussians by the names of `Scene`'s tensors: means, scales and sh_dc [N, 3], quats [N, 4] (wxyz),
 #: opacities [N] (logits), sh_rest [N, coefficients, 3].
 Arrays = dict[str, NDArray[np.float32]]
+#: Padding that programs leave after the data: zeros, blanks, and the end-of-file mark of DOS.
+_BLANKS, _PADDING = b" \t\r\n\x1a", b"\0 \t\r\n\x1a"
+#: Maximum bytes of padding, and of data that are searched for traces of a transfer as text.
+_MAX_PADDING, _SAMPLE_BYTES = 1 << 16, 1 << 20
+#: Least number of line ends that show a transfer as text if all of them are CR LF.
+_LEAST_LINE_ENDS = 8
+
+
+@dataclass(frozen=True)
+class RenderTag:
+    """Render mode that a scene file states.
+
+    Attributes:
+        rendering: Stated render mode, else classic.
+        reason: Part of the file that states it, such as "the file's flag"; empty if none does.
+        warnings: Pairs of texts: how the scene is drawn, and why renders may differ from those of its trainer.
+    """
+
+    rendering: Rendering = CLASSIC
+    reason: str = ""
+    warnings: tuple[tuple[str, str], ...] = ()
+
+
+#: Tag of files that state nothing.
+UNTAGGED = RenderTag()
 
 
 @dataclass(frozen=True)
@@ -103,3 +134,135 @@ class SceneFormat:
     def suffix(self) -> str:
         """Return the file name suffix, with its dot."""
         return f".{self.name}"
+
+
+def stated(mode: str, reason: str, eps2d: float | None = None, warnings: tuple[tuple[str, str], ...] = ()) -> RenderTag:
+    """Return the tag of a file that states a render mode, with a warning if the scene can only be approximated.
+
+    Args:
+        mode: Stated mode, one of `Rendering.mode`. Any other is read as classic, with a warning.
+        reason: Part of the file that states it.
+        eps2d: Stated blur; None for the default.
+        warnings: Further warnings.
+    """
+    if mode not in ("classic", "antialiased", "2dgs"):
+        warnings = (*warnings, ("classic", f"{reason} is unknown"))
+        mode = "classic"
+    if mode == "2dgs":
+        flat = "projected Gaussians of 2D Gaussian Splatting are approximated; its trainer intersects them with rays"
+        warnings = (*warnings, ("as Gaussians without thickness", f"{reason}; {flat}"))
+    return RenderTag(Rendering(mode, eps2d or EPS2D), reason, warnings)  # type: ignore[arg-type]
+
+
+def extras_tag(extras: object, where: str) -> RenderTag:
+    """Return the render mode that a JSON document states in the fields that `extras_of` writes.
+
+    Args:
+        extras: Value that should be a JSON object.
+        where: Name of the document in messages.
+    """
+    members = extras if isinstance(extras, dict) else {}
+    model, eps2d = members.get("model", "default"), members.get("eps2d")
+    eps2d = usable_eps2d(eps2d) if type(eps2d) in (int, float) else None
+    if model == "default" and eps2d is None:
+        return UNTAGGED
+    return stated("classic" if model == "default" else str(model), f"the model {str(model)[:40]!r} in {where}", eps2d)
+
+
+def extras_of(rendering: Rendering) -> dict[str, Any]:
+    """Return the fields of a JSON document that state a render mode; empty for the default mode."""
+    model = {} if rendering.mode == CLASSIC.mode else {"model": rendering.mode}
+    return model if rendering.eps2d == EPS2D else {**model, "eps2d": rendering.eps2d}
+
+
+def usable_eps2d(value: Any) -> float | None:
+    """Return a stated blur as a float; None if it is not a number or out of range."""
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) and 0 < number <= MAX_EPS2D else None
+
+
+def json_numbers(values: Any, count: int) -> NDArray[np.float64]:
+    """Return `count` numbers of a parsed JSON list, or a single number, as float64. null becomes NaN.
+
+    Raises:
+        ValueError: If there are more or fewer, or any is a text, a truth value or a list.
+        OverflowError: If an integer is too large.
+    """
+    numbers = values if isinstance(values, list) else [values]
+    if len(numbers) != count or not all(type(value) in (int, float, type(None)) for value in numbers):
+        raise ValueError(f"{len(numbers)} values in place of {count} numbers, or values that are not numbers")
+    return np.array(numbers, np.float64)
+
+
+def is_padding(data: bytes) -> bool:
+    """Return whether bytes after the data of a scene mean nothing."""
+    return len(data) <= _MAX_PADDING and not data.strip(_PADDING)
+
+
+def number_of(count: int, unit: str) -> str:
+    """Return a number with its unit, such as "1 byte"."""
+    return f"{count} {unit}" + "s" * (count != 1)
+
+
+def about_surplus(surplus: str) -> str:
+    """Return the note on content that a header does not declare, such as "12 bytes"."""
+    return f"the file has {surplus} more than its header declares, which are not read; copy or export it again"
+
+
+def surplus_note(path: Path, start: int, end: int, row_bytes: int | None = None) -> str:
+    """Return the note on a part of a file that its header does not declare; empty if there is only padding.
+
+    Args:
+        path: Path of the file.
+        start: Byte offset of the part.
+        end: Byte offset of its end.
+        row_bytes: Size of a row before the part; None if rows differ in size.
+    """
+    if start >= end or is_padding(_bytes(path, start, min(end, start + _MAX_PADDING + 1))):
+        return ""
+    surplus = number_of(end - start, "byte")
+    if row_bytes and (end - start) % row_bytes == 0:
+        surplus += f" ({number_of((end - start) // row_bytes, 'row')})"
+    return about_surplus(surplus)
+
+
+def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: int, end: int) -> None:
+    """Raise a SceneError if a binary file looks as if a transfer as text made it longer than declared.
+
+    Args:
+        path: Path of the file.
+        header_bytes: Size of its header.
+        newline: Line end of its header.
+        start: Byte offset of the end of the declared data.
+        end: Size of the file.
+    """
+    if start >= end:
+        return
+    data = _bytes(path, header_bytes, min(start, header_bytes + _SAMPLE_BYTES))
+    line_ends = data.count(b"\n")
+    changed = newline == b"\r\n" or (line_ends == data.count(b"\r\n") and line_ends >= _LEAST_LINE_ENDS)
+    blank = not _bytes(path, start, min(end, start + _MAX_PADDING)).strip(_BLANKS)
+    if (changed and not blank) or _is_utf8(data):
+        surplus = number_of(end - start, "byte")
+        raise SceneError(
+            f"{path}: has {surplus} more than its header declares. Was it transferred as text, which changes line ends "
+            "and other bytes? Copy it again in binary mode."
+        )
+
+
+def _is_utf8(data: bytes) -> bool:
+    """Return whether data is UTF-8 beyond ASCII, which binary numbers never are; its end may cut off a character."""
+    try:
+        return not codecs.getincrementaldecoder("utf-8")().decode(data).isascii()
+    except UnicodeDecodeError:
+        return False
+
+
+def _bytes(path: Path, start: int, end: int) -> bytes:
+    """Return the bytes of a part of a file."""
+    with path.open("rb") as file:
+        file.seek(start)
+        return file.read(end - start)

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.files.advice import converted, is_checkpoint, is_usdz
 from sgsst_core.files.formats.codebooks import VALUES, nearest_entries, palette, value_codebook
 from sgsst_core.files.formats.quantized import (
     OPACITY_LOGITS,
@@ -37,11 +38,21 @@ from sgsst_core.files.formats.quantized import (
     with_largest,
     without_largest,
 )
-from sgsst_core.files.formats.render_tag import RenderTag, extras_of, extras_tag
-from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
-from sgsst_core.files.formats.surplus import about_surplus, is_padding, number_of
-from sgsst_core.files.formats.unsupported import advice, is_checkpoint, is_usdz
-from sgsst_core.files.json_files import json_numbers
+from sgsst_core.files.formats.scene_format import (
+    COEFFICIENTS,
+    Arrays,
+    FileStart,
+    OpenScene,
+    RenderTag,
+    SceneFormat,
+    SceneHeader,
+    about_surplus,
+    extras_of,
+    extras_tag,
+    is_padding,
+    json_numbers,
+    number_of,
+)
 from sgsst_core.scene.rendering import Rendering
 
 #: Name of the file that describes a scene, in an archive or a folder.
@@ -214,7 +225,9 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
     """Parse meta.json. Errors of `_WRONG_META` mean that a value is missing or wrong."""
     version = meta.get("version", 1)
     if version not in (1, 2):
-        raise SceneError(f"{path}: is SOG of version {str(version)[:20]}, which cannot be read. {advice('scene.sog')}")
+        raise SceneError(
+            f"{path}: is SOG of version {str(version)[:20]}, which cannot be read. {converted('scene.sog')}"
+        )
     names = {name: meta[name]["files"] for name in _IMAGES if name in meta or name != "shN"}
     for name, own in names.items():
         if type(own) is not list or len(own) != _IMAGES[name] or not all(_NAME.fullmatch(each) for each in own):

@@ -29,18 +29,23 @@ import zstandard
 from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.files.advice import converted
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, byte_table, opacity_bytes, with_largest, without_largest
-from sgsst_core.files.formats.render_tag import UNTAGGED, RenderTag, stated
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
+    UNTAGGED,
     Arrays,
     FileStart,
     OpenScene,
+    RenderTag,
     SceneFormat,
     SceneHeader,
+    about_surplus,
+    is_padding,
+    number_of,
+    stated,
+    surplus_note,
 )
-from sgsst_core.files.formats.surplus import about_surplus, is_padding, number_of, surplus_note
-from sgsst_core.files.formats.unsupported import advice
 from sgsst_core.scene.rendering import Rendering
 
 Axes = Literal["rub", "rdf"]
@@ -297,9 +302,9 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
     version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
     if version not in versions:
-        raise SceneError(f"{path}: is SPZ of version {version}, which cannot be read. {advice('scene.spz')}")
+        raise SceneError(f"{path}: is SPZ of version {version}, which cannot be read. {converted('scene.spz')}")
     if degree not in _STORED_COEFFICIENTS:
-        raise SceneError(f"{path}: has SH degree {degree}; 0 to 4 can be read. {advice('scene.spz')}")
+        raise SceneError(f"{path}: has SH degree {degree}; 0 to 4 can be read. {converted('scene.spz')}")
     if not count:
         raise SceneError(f"{path}: holds no Gaussians. Export the scene again.")
     if version > 1 and not fractional_bits <= 24:

@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 
 from sgsst_core.errors import CameraError
-from sgsst_core.files.camera_advice import advice_for_name
+from sgsst_core.files.advice import advice_for_name
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.photos import check_photos
 from sgsst_core.scene.camera import Camera

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from sgsst_core.errors import OutputError
-from sgsst_core.files.json_files import json_numbers, write_json
+from sgsst_core.files.atomic import write_json
+from sgsst_core.files.formats.scene_format import json_numbers
 
 
 def test_non_unicode_names_are_written_as_json(tmp_path: Path) -> None:

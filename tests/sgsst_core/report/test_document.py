@@ -14,7 +14,7 @@ from PIL import Image
 
 from api.cli.console import loss_text
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.json_files import write_json
+from sgsst_core.files.atomic import write_json
 from sgsst_core.loss.scale_weights import EVEN
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Prediction
