@@ -11,7 +11,7 @@ if [ -d "$packages/torch/bin" ]; then
 fi
 # libraries built with symbols of all functions; those in *.libs were rewritten and must not be stripped
 for library in torch/lib/libtorch_cpu.so torch/lib/libtorch_python.so llvmlite/binding/libllvmlite.so ray/_raylet.so \
-  ray/core/src/ray/raylet/raylet ray/core/src/ray/gcs/gcs_server zstandard/*.so uvloop/*.so; do
+  ray/core/src/ray/raylet/raylet ray/core/src/ray/gcs/gcs_server backports/zstd/*.so uvloop/*.so; do
   for file in "$packages"/$library; do
     strip --strip-unneeded "$file"
   done

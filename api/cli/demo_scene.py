@@ -1,4 +1,4 @@
-"""Demo scene without a download: the Motorcycle stereo pair of scikit-image, lifted to Gaussians.
+"""Demo scene without a download: the stereo pair Motorcycle, lifted to Gaussians.
 
 The pair and its disparity are from the Middlebury 2014 benchmark (Scharstein et al., "High-resolution stereo datasets
 with subpixel-accurate ground truth", GCPR 2014). Every pixel of the left photo becomes a flat Gaussian that covers just
@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
-from skimage import data
+from PIL import Image
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder
@@ -32,6 +32,8 @@ from sgsst_core.scene.gaussians import Scene
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+#: Folder of the photos and of the disparity in pixels of the left one, infinite where it is unknown.
+PAIR = Path(__file__).with_name("motorcycle")
 #: Calibration for the size of the photos (741x500), as documented by scikit-image's `stereo_motorcycle`: focal length
 #: and principal point in pixels, and baseline in meters. Lengths in pixels are Middlebury's (focal 3979.911 px, doffs
 #: 124.343 px at 2964x2000) divided by 4.
@@ -121,8 +123,9 @@ def build_demo(folder: Path) -> DemoScene:
 
 def lift_pair() -> Scene:
     """Return the stereo pair as Gaussians of SH degree 0."""
-    left, right, measured = data.stereo_motorcycle()
-    left, right = left / 255.0, right / 255.0
+    left, right = (np.asarray(Image.open(PAIR / name)) / 255.0 for name in ("left.png", "right.png"))
+    with np.load(PAIR / "disparity.npz") as archive:
+        measured = archive["arr_0"]
     known = np.isfinite(measured)
     disparity, behind_left = _fill(measured.astype(np.float64), known, left)
 

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
 from sgsst_core.files.formats.ply_header import (
@@ -29,20 +30,25 @@ from sgsst_core.files.formats.ply_header import (
 )
 from sgsst_core.files.formats.quantized import (
     OPACITY_LOGITS,
-    SH_C0,
     along_curve,
-    byte_table,
     opacity_bytes,
     to_steps,
     with_largest,
     without_largest,
 )
-from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.files.formats.scene_format import (
+    Arrays,
+    FileStart,
+    OpenScene,
+    SceneFormat,
+    SceneHeader,
+    blocks,
+    read_rows,
+)
 from sgsst_core.scene.rendering import Rendering
 
 #: Number of Gaussians per chunk. Each chunk has its own quantization bounds.
 CHUNK_ROWS = 256
-_BLOCK_ROWS = 256 * CHUNK_ROWS
 
 
 def bounds(prefix: str, axes: str) -> tuple[str, ...]:
@@ -56,17 +62,8 @@ _BOUNDS = (*bounds("", "xyz"), *bounds("scale_", "xyz"), *bounds("", "rgb"))
 _LARGEST_SCALE = 20.0
 
 
-def _harmonics() -> NDArray[np.float64]:
-    """Return the SH coefficient for each byte.
-
-    It is the center of the byte's quantization step, or an end of the range for 0 and 255.
-    """
-    middle = (np.arange(256) + 0.5) / 256
-    middle[0], middle[-1] = 0, 1
-    return 8 * (middle - 0.5)
-
-
-_HARMONICS = byte_table(_harmonics())
+#: SH coefficient for each byte: the center of its quantization step, or an end of the range for 0 and 255.
+_HARMONICS = (8 * (np.array([0, *(np.arange(1, 255) + 0.5) / 256, 1]) - 0.5)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -140,15 +137,12 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
     note = surplus(file.path, header.ply)
     starts = element_offsets(file.path, header.ply)
     kinds = {element.name: element.dtype(header.ply.byte_order) for element in header.ply.elements}
-    for start in range(0, header.count, _BLOCK_ROWS):
-        block = slice(start, min(start + _BLOCK_ROWS, header.count))
 
-        def rows(name: str, first: int, count: int) -> NDArray[Any]:
-            data = np.empty(count * kinds[name].itemsize, np.uint8)
-            file.read(starts[name] + first * kinds[name].itemsize, data)
-            return data.view(kinds[name])
+    def rows(name: str, first: int, count: int) -> NDArray[Any]:
+        return read_rows(file, kinds[name], starts[name] + first * kinds[name].itemsize, count)
 
-        count = block.stop - start
+    for block in blocks(header.count):
+        start, count = block.start, block.stop - block.start
         chunks = rows("chunk", start // CHUNK_ROWS, -(-count // CHUNK_ROWS))
         _unpack(rows("vertex", start, count), chunks, {name: array[block] for name, array in into.items()})
         if header.coefficients:
@@ -174,7 +168,7 @@ def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
         into["scales"][:] = between("scale_", "xyz", _three(scale))
         fraction = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
         colors = between("", "rgb", fraction) if "min_r" in (chunks.dtype.names or ()) else fraction
-        into["sh_dc"][:] = (colors - 0.5) / SH_C0
+        into["sh_dc"][:] = (colors - COLOR_OFFSET) / SH_C0
     into["opacities"][:] = OPACITY_LOGITS[color & 255]
     components = np.stack([(rotation >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023
     into["quats"][:] = with_largest(rotation >> 30, (components - 0.5) * np.sqrt(2))
@@ -199,16 +193,16 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     count, coefficients = arrays["sh_rest"].shape[:2]
     order = along_curve(arrays["means"])
     output.write(_header(count, coefficients, rendering))
-    blocks = [order[start : start + _BLOCK_ROWS] for start in range(0, count, _BLOCK_ROWS)]
+    parts = [order[block] for block in blocks(count)]
     packed = []
-    for rows in blocks:
+    for rows in parts:
         bounds_of, values = _pack({name: array[rows] for name, array in arrays.items() if name != "sh_rest"})
         output.write(bounds_of.astype("<f4").tobytes())
         packed.append(values.astype("<u4"))
     for values in packed:
         output.write(values.tobytes())
     if coefficients:
-        for rows in blocks:
+        for rows in parts:
             # channel-major, as in PLY
             rest = arrays["sh_rest"][rows].astype(np.float64).transpose(0, 2, 1)
             output.write(np.clip(np.floor(rest * 32 + 128), 0, 255).astype(np.uint8).tobytes())
@@ -230,7 +224,11 @@ def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     chunk = np.arange(len(arrays["means"])) // CHUNK_ROWS
     scales = np.clip(arrays["scales"], -_LARGEST_SCALE, _LARGEST_SCALE)
     bounds_of, fractions = [], []
-    for values in (arrays["means"], scales, (arrays["sh_dc"].astype(np.float64) * SH_C0 + 0.5).astype(np.float32)):
+    for values in (
+        arrays["means"],
+        scales,
+        (arrays["sh_dc"].astype(np.float64) * SH_C0 + COLOR_OFFSET).astype(np.float32),
+    ):
         low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
         bounds_of += [low, high]
         extent = high.astype(np.float64) - low

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.constants import SH_C1, SH_C2, SH_C3
-from sgsst_core.files.formats.scene_format import Arrays
+from sgsst_core.files.formats.scene_format import Arrays, blocks
 
 #: Rotation by 180 degrees about z, [4, 4], which converts between a PLY and axes with y up and z forward, as of glTF.
 Y_UP = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -23,8 +23,6 @@ _DECIMALS = 12
 _LARGEST = 1e30
 #: Maximum deviation of a matrix from a rotation, relative to its scale.
 _TOLERANCE = 1e-4
-
-_BLOCK_ROWS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -59,8 +57,8 @@ class Frame:
     def apply(self, arrays: Arrays) -> None:
         """Transform the arrays of a scene in place. Computes in float64; rotations by 180 degrees are exact."""
         turn, harmonics = self._quaternion(), self._harmonics(arrays["sh_rest"].shape[1])
-        for start in range(0, len(arrays["means"]), _BLOCK_ROWS):
-            block = {name: array[start : start + _BLOCK_ROWS] for name, array in arrays.items()}
+        for part in blocks(len(arrays["means"])):
+            block = {name: array[part] for name, array in arrays.items()}
             means = block["means"].astype(np.float64)
             block["means"][:] = self.scale * (means @ self.rotation.T) + self.translation
             if self.scale != 1:
@@ -71,7 +69,7 @@ class Frame:
 
     def _quaternion(self) -> NDArray[np.float64]:
         """Return the matrix [4, 4] of left multiplication by the rotation's quaternion, for quaternions wxyz."""
-        from scipy.spatial.transform import Rotation  # the API process, which only reads headers, needs no SciPy
+        from scipy.spatial.transform import Rotation  # not for the API process, which only reads headers
 
         x, y, z, w = Rotation.from_matrix(self.rotation).as_quat()
         return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
@@ -89,7 +87,10 @@ class Frame:
 
 
 def basis(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the real spherical harmonics of degree 1 to 3 at unit vectors [n, 3], as [n, 15]."""
+    """Return the real spherical harmonics of degree 1 to 3 at unit vectors [n, 3], as [n, 15].
+
+    Those of the renderer need PyTorch, which the API process does not import.
+    """
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     polynomials = [y, z, x, x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy]

@@ -26,10 +26,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
 from sgsst_core.files.formats.frame import Y_UP, Frame
-from sgsst_core.files.formats.quantized import SH_C0
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
     Arrays,
@@ -38,9 +38,11 @@ from sgsst_core.files.formats.scene_format import (
     RenderTag,
     SceneFormat,
     SceneHeader,
+    blocks,
     extras_of,
     extras_tag,
     json_numbers,
+    read_rows,
     surplus_note,
 )
 from sgsst_core.files.formats.units import logarithms, logits
@@ -85,7 +87,6 @@ _HARMONICS = [f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3
 #: Range of written log scales, within that of float32, and largest written opacity, the last one below 1.
 _LOG_SCALES = (-87.0, 88.0)
 _LARGEST_OPACITY = 1 - 2.0**-24
-_BLOCK_ROWS = 1 << 16
 #: Errors of a JSON document with missing or wrong values.
 _WRONG_JSON = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, OverflowError)
 
@@ -184,12 +185,7 @@ def _chunks(start: FileStart) -> tuple[bytes, int, int]:
             f"{path}: has {json_bytes} bytes of JSON; at most {_MAX_JSON_BYTES} can be read. Export the Gaussians "
             "without the other objects of the file."
         )
-    try:
-        with path.open("rb") as file:
-            file.seek(first)
-            text, chunk = file.read(json_bytes), file.read(_CHUNK.size)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    text, chunk = start.read(first, json_bytes), start.read(first + json_bytes, _CHUNK.size)
     offset = first + json_bytes + _CHUNK.size
     size, kind = _CHUNK.unpack(chunk) if len(chunk) == _CHUNK.size else (0, b"BIN\0")
     if kind != b"BIN\0" or offset + size > max(start.size, offset):
@@ -394,15 +390,15 @@ def _read_part(file: OpenScene, part: GlbPart, into: Arrays) -> None:
 def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:
     """Yield the values of an accessor block by block, as slices of Gaussians and [n, components]."""
     kind = np.dtype(accessor.kind)
-    for start in range(0, count, _BLOCK_ROWS):
-        stop = min(start + _BLOCK_ROWS, count)
-        data = np.empty((stop - start - 1) * accessor.stride + accessor.value_bytes, np.uint8)
-        file.read(accessor.offset + start * accessor.stride, data)
-        shape, strides = (stop - start, accessor.components), (accessor.stride, kind.itemsize)
+    for block in blocks(count):
+        rows = block.stop - block.start
+        data_bytes = (rows - 1) * accessor.stride + accessor.value_bytes
+        data = read_rows(file, np.dtype(np.uint8), accessor.offset + block.start * accessor.stride, data_bytes)
+        shape, strides = (rows, accessor.components), (accessor.stride, kind.itemsize)
         values = np.ndarray(shape, kind, data, 0, strides).astype(np.float64)
         if accessor.normalized:
             values = np.maximum(values / _LARGEST[accessor.kind], -1)
-        yield slice(start, stop), values
+        yield block, values
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
@@ -432,7 +428,7 @@ def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
     with np.errstate(over="ignore"):
         opacities = np.clip(1 / (1 + np.exp(-arrays["opacities"].astype(np.float64))), 1e-37, _LARGEST_OPACITY)
     quats = np.roll(arrays["quats"].astype(np.float64), -1, axis=1)
-    colors = np.column_stack([np.clip(0.5 + SH_C0 * arrays["sh_dc"].astype(np.float64), 0, 1), opacities])
+    colors = np.column_stack([np.clip(COLOR_OFFSET + SH_C0 * arrays["sh_dc"].astype(np.float64), 0, 1), opacities])
     values = {
         "means": arrays["means"],
         "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.quantized import OPACITY_LOGITS, SH_C0
+from sgsst_core.files.formats.quantized import OPACITY_LOGITS
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
     Arrays,
@@ -25,6 +25,8 @@ from sgsst_core.files.formats.scene_format import (
     OpenScene,
     SceneFormat,
     SceneHeader,
+    blocks,
+    read_rows,
     surplus_note,
 )
 from sgsst_core.files.formats.units import logarithms
@@ -40,7 +42,6 @@ _TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", 
 _STEPS, _RANGE = 32767, 1.5
 #: Log scale of those that 16-bit floats round to 0: half of the smallest positive one.
 _LEAST_LOG_SCALE = math.log(2.0**-25)
-_BLOCK_ROWS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -107,12 +108,7 @@ def _read_header(start: FileStart) -> KsplatHeader:
             f"{path}: the .ksplat header declares {sections} sections in {start.size} bytes; at most {_MAX_SECTIONS} "
             "can be read. The file is truncated or its header is wrong. Copy or export it again."
         )
-    try:
-        with path.open("rb") as file:
-            file.seek(_HEADER_BYTES)
-            table = file.read(_SECTION_BYTES * sections)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    table = start.read(_HEADER_BYTES, _SECTION_BYTES * sections)
     read, position = [], table_end
     for index in range(sections):
         section, position = _section(table[index * _SECTION_BYTES :][:_SECTION_BYTES], level, position)
@@ -166,12 +162,14 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     first = 0
     for section in header.sections:
         buckets = _buckets(file, section) if header.level and section.count else None
-        for start, rows in _rows(file, header.level, section):
-            block = slice(first + start, first + start + len(rows))
+        kind = _row(header.level, section.degree)
+        for part in blocks(section.count):
+            rows = read_rows(file, kind, section.data_offset + part.start * kind.itemsize, part.stop - part.start)
+            block = slice(first + part.start, first + part.stop)
             positions = rows["position"].astype(np.float64)
             if buckets is not None:
                 ends, centers = buckets
-                owners = np.searchsorted(ends, np.arange(start, start + len(rows)), side="right")
+                owners = np.searchsorted(ends, np.arange(part.start, part.stop), side="right")
                 if owners[-1] >= len(ends):
                     raise SceneError(
                         f"{file.path}: holds Gaussians beyond its buckets: it is damaged. Export it again."
@@ -182,7 +180,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
                 scales = logarithms(file.path, rows["scale"].astype(np.float64))
                 into["scales"][block] = np.maximum(scales, _LEAST_LOG_SCALE) if header.level else scales
                 into["quats"][block] = rows["rotation"]
-                into["sh_dc"][block] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
+                into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
                 into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
                 into["sh_rest"][block, : COEFFICIENTS[section.degree]] = _harmonics(rows["harmonics"], header, section)
         first += section.count
@@ -190,21 +188,10 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
 
 def _buckets(file: OpenScene, section: KsplatSection) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the end of each bucket, as an index of Gaussians, and the bucket's center, [buckets, 3]."""
-    lengths = np.empty(section.partial, "<u4")
-    file.read(section.lengths_offset, lengths.view(np.uint8))
-    centers = np.empty((section.full + section.partial, 3), "<f4")
-    file.read(section.centers_offset, centers.view(np.uint8).reshape(-1))
+    lengths = read_rows(file, np.dtype("<u4"), section.lengths_offset, section.partial)
+    centers = read_rows(file, np.dtype("<f4"), section.centers_offset, 3 * (section.full + section.partial))
     sizes = np.concatenate([np.full(section.full, section.bucket_size, np.int64), lengths.astype(np.int64)])
-    return sizes.cumsum(), centers.astype(np.float64)
-
-
-def _rows(file: OpenScene, level: int, section: KsplatSection) -> Iterator[tuple[int, NDArray[np.void]]]:
-    """Yield the Gaussians of a section block by block, with the index of the first one."""
-    kind = _row(level, section.degree)
-    for start in range(0, section.count, _BLOCK_ROWS):
-        data = np.empty(min(_BLOCK_ROWS, section.count - start) * kind.itemsize, np.uint8)
-        file.read(section.data_offset + start * kind.itemsize, data)
-        yield start, data.view(kind)
+    return sizes.cumsum(), centers.reshape(-1, 3).astype(np.float64)
 
 
 def _harmonics(values: NDArray[np.generic], header: KsplatHeader, section: KsplatSection) -> NDArray[np.float64]:

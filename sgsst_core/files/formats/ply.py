@@ -19,7 +19,15 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.ply_header import PlyHeader, check_length, comment_lines, is_flat, ply_tag, read_header
-from sgsst_core.files.formats.scene_format import COEFFICIENTS, Arrays, FileStart, SceneFormat, SceneHeader
+from sgsst_core.files.formats.scene_format import (
+    COEFFICIENTS,
+    STORED_COEFFICIENTS,
+    Arrays,
+    FileStart,
+    SceneFormat,
+    SceneHeader,
+    blocks,
+)
 from sgsst_core.scene.rendering import Rendering
 
 #: Properties of the scene's tensors; opacity and f_rest_* follow.
@@ -31,9 +39,6 @@ PROPERTIES = {
 }
 #: Colors of 8 bits, which nerfstudio writes instead of f_dc_* on request, and others beside them.
 RGB = ("red", "green", "blue")
-#: Stored SH coefficients per color channel above degree 0, by SH degree. Those of degree 4 are not drawn.
-_STORED_COEFFICIENTS = {**COEFFICIENTS, 4: 24}
-_BLOCK_ROWS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -112,7 +117,7 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
                 f"{path}: {name} is stored as integers; new colors need float or double. Convert it first."
             )
     rest = [name for name in kinds if re.fullmatch(r"f_rest_\d+", name)]
-    if len(rest) // 3 not in _STORED_COEFFICIENTS.values() or len(rest) % 3:
+    if len(rest) // 3 not in STORED_COEFFICIENTS.values() or len(rest) % 3:
         raise SceneError(
             f"{path}: has {len(rest)} f_rest properties; SH degree 0 to 4 have 0, 9, 24, 45, 72. Export it again."
         )
@@ -143,8 +148,8 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     lines = ["ply", "format binary_little_endian 1.0", *comment_lines(rendering), f"element vertex {count}"]
     lines += [f"property float {name}" for name in names]
     output.write("\n".join([*lines, "end_header", ""]).encode())
-    for start in range(0, count, _BLOCK_ROWS):
-        block = {name: array[start : start + _BLOCK_ROWS] for name, array in arrays.items()}
+    for part in blocks(count):
+        block = {name: array[part] for name, array in arrays.items()}
         rows = np.zeros((len(block["means"]), len(names)), "<f4")
         rows[:, :3] = block["means"]
         rows[:, 6:9] = block["sh_dc"]

@@ -10,27 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: SH basis function of degree 0: factor between a coefficient and its contribution to a color.
-SH_C0 = 0.28209479177387814
-
 #: Opacities of exactly 0 and 1 have no finite logit, so they are read as 0.25/255 and 1 - 0.25/255. The difference is
 #: below the rounding of these formats, and invisible in 8-bit images.
-_LEAST_OPACITY = 0.25 / 255
+_MIN_OPACITY = 0.25 / 255
 _OTHER_THREE = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
-def byte_table(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Convert a table of the value of each byte, [256], to float32."""
-    return values.astype(np.float32)
-
-
-def _logits() -> NDArray[np.float64]:
-    opacities = np.clip(np.arange(256) / 255, _LEAST_OPACITY, 1 - _LEAST_OPACITY)
-    return np.log(opacities / (1 - opacities))
-
-
+_OPACITIES = np.clip(np.arange(256) / 255, _MIN_OPACITY, 1 - _MIN_OPACITY)
 #: Logit of the opacity i / 255 for each byte i, [256] float32.
-OPACITY_LOGITS = byte_table(_logits())
+OPACITY_LOGITS: NDArray[np.float32] = np.log(_OPACITIES / (1 - _OPACITIES)).astype(np.float32)
 
 
 def opacity_bytes(logits: NDArray[Any]) -> NDArray[Any]:

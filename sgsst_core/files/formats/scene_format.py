@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import codecs
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -21,6 +21,10 @@ from sgsst_core.scene.rendering import CLASSIC, MAX_EPS2D, Rendering
 
 #: SH coefficients per color channel above degree 0, by SH degree.
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+#: The same for files, whose coefficients of degree 4 are not drawn.
+STORED_COEFFICIENTS = {**COEFFICIENTS, 4: 24}
+#: Gaussians that are converted at a time.
+BLOCK_ROWS = 1 << 16
 
 #: float32 arrays of N Gaussians by the names of `Scene`'s tensors: means, scales and sh_dc [N, 3], quats [N, 4] (wxyz),
 #: opacities [N] (logits), sh_rest [N, coefficients, 3].
@@ -65,6 +69,19 @@ class FileStart:
     path: Path
     head: bytes
     size: int
+
+    def read(self, offset: int, count: int) -> bytes:
+        """Return `count` bytes from `offset` on, or those that are left.
+
+        Raises:
+            SceneError: If the file cannot be read.
+        """
+        try:
+            with self.path.open("rb") as file:
+                file.seek(offset)
+                return file.read(count)
+        except OSError as error:
+            raise SceneError(f"{self.path}: cannot be read: {error.strerror}. Check the path.") from error
 
 
 class OpenScene(Protocol):
@@ -195,6 +212,19 @@ def json_numbers(values: Any, count: int) -> NDArray[np.float64]:
     if len(numbers) != count or not all(type(value) in (int, float, type(None)) for value in numbers):
         raise ValueError(f"{len(numbers)} values in place of {count} numbers, or values that are not numbers")
     return np.array(numbers, np.float64)
+
+
+def blocks(count: int) -> Iterator[slice]:
+    """Yield the slices of `count` Gaussians that are converted at a time."""
+    for start in range(0, count, BLOCK_ROWS):
+        yield slice(start, min(start + BLOCK_ROWS, count))
+
+
+def read_rows(file: OpenScene, kind: np.dtype, offset: int, count: int) -> NDArray[Any]:
+    """Read `count` rows of a dtype from a byte offset on."""
+    data = np.empty(count * kind.itemsize, np.uint8)
+    file.read(offset, data)
+    return data.view(kind)
 
 
 def is_padding(data: bytes) -> bool:

@@ -47,6 +47,7 @@ from sgsst_core.files.formats.scene_format import (
     SceneFormat,
     SceneHeader,
     about_surplus,
+    blocks,
     extras_of,
     extras_tag,
     is_padding,
@@ -94,7 +95,6 @@ _WRONG_META = (ValueError, TypeError, KeyError, IndexError, AttributeError, Recu
 
 #: Effort of lossless compression, 0 to 100.
 _EFFORT = 50
-_BLOCK_ROWS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -338,7 +338,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
         return whole(name, index)[: header.count]
 
     low, high = image("means"), image("means", 1)
-    for block in _blocks(header.count):
+    for block in blocks(header.count):
         steps = (low[block, :3] | high[block, :3].astype(np.uint16) << 8) / 65535
         values = header.bounds[0] + (header.bounds[1] - header.bounds[0]) * steps
         with np.errstate(over="ignore", invalid="ignore"):  # non-finite results are reported later
@@ -346,7 +346,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
     quats = whole("quats")
     surplus = int((quats[header.count :, 3] >= _FIRST_TAG).sum())  # padding has no valid rotations
     quats = quats[: header.count]
-    for block in _blocks(header.count):
+    for block in blocks(header.count):
         index = quats[block, 3].astype(np.int64) - _FIRST_TAG
         if index.min() < 0:
             raise SceneError(f"{path}: {header.names['quats'][0]} has no valid rotations. Export the scene again.")
@@ -368,10 +368,6 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
                 )
             into["sh_rest"][:] = colors_of[labels]
     return (about_surplus(number_of(surplus, "Gaussian")),) if surplus else ()
-
-
-def _blocks(count: int) -> list[slice]:
-    return [slice(start, min(start + _BLOCK_ROWS, count)) for start in range(0, count, _BLOCK_ROWS)]
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:

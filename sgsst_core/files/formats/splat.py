@@ -7,13 +7,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.quantized import OPACITY_LOGITS, SH_C0
-from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader
+from sgsst_core.files.formats.quantized import OPACITY_LOGITS
+from sgsst_core.files.formats.scene_format import (
+    Arrays,
+    FileStart,
+    OpenScene,
+    SceneFormat,
+    SceneHeader,
+    blocks,
+    read_rows,
+)
 from sgsst_core.files.formats.units import logarithms
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
-_BLOCK_ROWS = 1 << 16
 
 
 def _matches(start: FileStart) -> bool:
@@ -42,14 +50,11 @@ def _read_header(start: FileStart) -> SceneHeader:
 
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene. A standard deviation of 0 becomes a log scale of minus infinity."""
-    for start in range(0, header.count, _BLOCK_ROWS):
-        block = slice(start, min(start + _BLOCK_ROWS, header.count))
-        data = np.empty((block.stop - start) * ROW.itemsize, np.uint8)
-        file.read(start * ROW.itemsize, data)
-        rows = data.view(ROW)
+    for block in blocks(header.count):
+        rows = read_rows(file, ROW, block.start * ROW.itemsize, block.stop - block.start)
         into["means"][block] = rows["position"]
         into["scales"][block] = logarithms(file.path, rows["scale"].astype(np.float64))
-        into["sh_dc"][block] = (rows["color"][:, :3] / 255 - 0.5) / SH_C0
+        into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
         into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
         into["quats"][block] = (rows["rotation"].astype(np.float64) - 128) / 128
 

@@ -21,18 +21,21 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 import numpy as np
-import zstandard
+from backports import zstd
 from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import converted
-from sgsst_core.files.formats.quantized import OPACITY_LOGITS, byte_table, opacity_bytes, with_largest, without_largest
+from sgsst_core.files.formats.quantized import OPACITY_LOGITS, opacity_bytes, with_largest, without_largest
 from sgsst_core.files.formats.scene_format import (
+    BLOCK_ROWS,
     COEFFICIENTS,
+    STORED_COEFFICIENTS,
     UNTAGGED,
     Arrays,
     FileStart,
@@ -43,6 +46,7 @@ from sgsst_core.files.formats.scene_format import (
     about_surplus,
     is_padding,
     number_of,
+    read_rows,
     stated,
     surplus_note,
 )
@@ -59,12 +63,11 @@ _OLD_VERSIONS = tuple(struct.pack("<I", version) for version in (1, 2, 3))
 #: Maximum compression ratio of deflate: 258 bytes for every two bits.
 _DEFLATE_RATIO = 1032
 
-_BLOCK_ROWS = 1 << 16
 _READ_BYTES = 1 << 18
 #: Maximum bytes of extensions.
 _EXTENSION_BYTES = 1 << 20
-#: Maximum window of zstd, the default limit of its command-line program.
-_WINDOW_BYTES = 1 << 27
+#: Maximum window of zstd, the default limit of its command-line program: 2^27 bytes.
+_ZSTD_OPTIONS = {zstd.DecompressionParameter.window_log_max: 27}
 #: Maximum compression ratio of zstd: a block of at most 128 KiB takes at least four bytes (RFC 8878, section 3.1.1.2).
 _ZSTD_RATIO = (1 << 17) // 4
 
@@ -78,9 +81,6 @@ _ASSUMED_AXES = "axes: read as rdf; the file states none. If the scene is upside
 #: Maximum number of unknown extensions that a note names.
 _NOTED_EXTENSIONS = 8
 
-#: Stored SH coefficients per color channel above degree 0, by SH degree.
-_STORED_COEFFICIENTS = {**COEFFICIENTS, 4: 24}
-
 #: Sign changes of a rotation by 180 degrees about x, which converts between RDF and RUB: for positions, rotations
 #: (wxyz), and real spherical harmonics of degree 1 to 3. An SH function changes its sign if its polynomial has an odd
 #: total power of y and z.
@@ -88,11 +88,11 @@ _FLIP = np.array([1, -1, -1], np.float32)
 _FLIP_QUATS = np.array([1, 1, -1, -1], np.float32)
 _FLIP_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
-_SCALES = byte_table(np.arange(256) / 16 - 10)
+_SCALES = (np.arange(256) / 16 - 10).astype(np.float32)
 #: SH coefficient of degree 0 for each byte. Their range exceeds that of colors in 0..1.
-_COLORS = byte_table((np.arange(256) / 255 - 0.5) / 0.15)
-_HARMONICS = byte_table((np.arange(256) - 128) / 128)
-_FIRST_BYTES = byte_table(np.arange(256) / 127.5 - 1)
+_COLORS = ((np.arange(256) / 255 - 0.5) / 0.15).astype(np.float32)
+_HARMONICS = ((np.arange(256) - 128) / 128).astype(np.float32)
+_FIRST_BYTES = (np.arange(256) / 127.5 - 1).astype(np.float32)
 
 #: Maximum number of fractional bits in written positions. With 20 bits, positions in a scene of a few units are finer
 #: than in float32.
@@ -107,15 +107,6 @@ Take = Callable[[int], bytes]
 
 
 @dataclass(frozen=True)
-class SpzSection:
-    """Compressed stream of an SPZ file of version 4: byte offset, compressed size and decompressed size."""
-
-    offset: int
-    compressed: int
-    size: int
-
-
-@dataclass(frozen=True)
 class SpzHeader(SceneHeader):
     """Header of an SPZ file.
 
@@ -126,8 +117,8 @@ class SpzHeader(SceneHeader):
         degree: SH degree of the file, 0 to 4.
         sections: Decompressed sizes in bytes of positions, opacities, colors, scales, rotations and spherical
             harmonics.
-        streams: Streams of version 4, one per section that is not empty. Empty for other versions, which have one
-            stream.
+        streams: Byte offsets and sizes of the streams of version 4, one per section that is not empty. Empty for other
+            versions, which have one stream.
         zipped: Whether the stream of version 1 to 3 is compressed by gzip.
         extended: Whether extension records follow the Gaussians of version 1 to 3.
         stated_axes: Axes that a file of version 4 states; None if it does not, and for other versions.
@@ -139,7 +130,7 @@ class SpzHeader(SceneHeader):
     degree: int
     fractional_bits: int
     sections: tuple[int, ...]
-    streams: tuple[SpzSection, ...] = ()
+    streams: tuple[tuple[int, int], ...] = ()
     zipped: bool = True
     extended: bool = False
     stated_axes: Axes | None = None
@@ -218,7 +209,7 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
                 f"belong to {count} Gaussians, and {size - position} bytes are left. The file is truncated or its "
                 "header is wrong. Copy or export it again."
             )
-        streams.append(SpzSection(position, compressed, decompressed))
+        streams.append((position, compressed))
         position += compressed
     surplus = (_about_rest(gap, records), surplus_note(path, position, size))
     return SpzHeader(
@@ -303,7 +294,7 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
     version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
     if version not in versions:
         raise SceneError(f"{path}: is SPZ of version {version}, which cannot be read. {converted('scene.spz')}")
-    if degree not in _STORED_COEFFICIENTS:
+    if degree not in STORED_COEFFICIENTS:
         raise SceneError(f"{path}: has SH degree {degree}; 0 to 4 can be read. {converted('scene.spz')}")
     if not count:
         raise SceneError(f"{path}: holds no Gaussians. Export the scene again.")
@@ -317,7 +308,7 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
         3 * count,
         3 * count,
         (3 if version < 3 else 4) * count,
-        3 * _STORED_COEFFICIENTS[degree] * count,
+        3 * STORED_COEFFICIENTS[degree] * count,
     )
     return version, count, degree, fractional_bits, sections
 
@@ -336,30 +327,26 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
         (into["sh_dc"], lambda data: _COLORS[data].reshape(-1, 3)),
         (into["scales"], lambda data: _SCALES[data].reshape(-1, 3)),
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
-        (into["sh_rest"], lambda data: _decode_harmonics(data, _STORED_COEFFICIENTS[spz.degree])),
+        (into["sh_rest"], lambda data: _decode_harmonics(data, STORED_COEFFICIENTS[spz.degree])),
     ]
-    tail = _Tail(spz.size)
-    streams = (
-        _zstd_streams(path, file, spz.streams)
-        if spz.streams
-        else (_gzip_stream if spz.zipped else _plain_stream)(path, file, spz, tail)
-    )
+    stream = _Stream(file, spz)
+    takes = _sections_of_streams(path, file, spz) if spz.streams else _sections_of_stream(path, stream, spz)
     for (array, decode), size in zip(decoders, spz.sections, strict=True):
         if not size:
             continue
-        take = next(streams)
+        take = next(takes)
         row_bytes = size // spz.count
-        for start in range(0, spz.count, _BLOCK_ROWS):
-            block = array[start : start + _BLOCK_ROWS]
+        for start in range(0, spz.count, BLOCK_ROWS):
+            block = array[start : start + BLOCK_ROWS]
             block[:] = decode(np.frombuffer(take(len(block) * row_bytes), np.uint8))
-    next(streams, None)  # reach the end of the last stream, where its checksum is verified
-    extensions = tail.content if spz.extended else b""
-    stated_axes = spz.stated_axes or _stated_axes(path, extensions)
-    axes = stated_axes if spz.axes == "auto" else spz.axes
+    next(takes, None)  # reach the end of the last stream, where its checksum is verified
+    content, end = (b"", spz.size) if spz.streams else _extensions(path, stream, spz)
+    extensions = content if spz.extended else b""
+    axes = (spz.stated_axes or _stated_axes(path, extensions)) if spz.axes == "auto" else spz.axes
     if axes == "rub":
         _rotate(into)
     notes = () if spz.streams else _notes(spz.degree, extensions)
-    surplus = (_about_rest(tail.content, extensions), surplus_note(path, tail.end, spz.size))
+    surplus = (_about_rest(content, extensions), surplus_note(path, end, spz.size))
     return (*notes, *filter(None, surplus), *(() if axes else (_ASSUMED_AXES,)))
 
 
@@ -370,130 +357,103 @@ def _rotate(arrays: Arrays) -> None:
     arrays["sh_rest"] *= _FLIP_HARMONICS[: arrays["sh_rest"].shape[1], None]
 
 
-@dataclass
-class _Tail:
-    """Content after the sections of version 1 to 3.
+class _Stream:
+    """Content of a file of version 1 to 3: one stream, compressed by gzip or not.
+
+    Args:
+        file: Open file.
+        spz: Header of the file.
 
     Attributes:
-        end: Byte offset of the end of the stream in the file.
-        content: Bytes of the stream after the last section, in which extensions are stored.
+        position: Byte offset of what has not been read from the file.
+        inflate: Decompressor; None for a stream that is not compressed.
     """
 
-    end: int
-    content: bytes = b""
+    def __init__(self, file: OpenScene, spz: SpzHeader) -> None:
+        self.position = 0
+        self.inflate = zlib.decompressobj(31) if spz.zipped else None
+        self._file, self._size = file, spz.size
 
-
-def _plain_stream(path: Path, file: OpenScene, spz: SpzHeader, tail: _Tail) -> Iterator[Take]:
-    """Yield, for each section, a function that reads its bytes from the common uncompressed stream."""
-    position = 16
-
-    def take(count: int) -> bytes:
-        nonlocal position
-        if position + count > spz.size:
-            raise _ends_early(path)
-        position += count
-        return _read_bytes(file, position - count, count)
-
-    for _ in filter(None, spz.sections):
-        yield take
-    tail.content = take(min(spz.size - position, _EXTENSION_BYTES))
-    if position < spz.size:
-        raise _too_much(path)
-    _check_rest(path, spz, tail)
-
-
-def _check_rest(path: Path, spz: SpzHeader, tail: _Tail) -> None:
-    """Raise a SceneError if what follows the sections is no extension, but as much as a Gaussian takes."""
-    rest = tail.content[sum(8 + len(content) for _, content in _extension_records(tail.content)) * spz.extended :]
-    if len(rest) >= sum(spz.sections) // spz.count and not is_padding(rest):
-        raise _too_much(path, f" by {number_of(len(rest), 'byte')}")
-
-
-def _gzip_stream(path: Path, file: OpenScene, spz: SpzHeader, tail: _Tail) -> Iterator[Take]:
-    """Yield, for each section, a function that reads its bytes from the common gzip stream."""
-    inflate = zlib.decompressobj(31)
-    position, size = 0, spz.size
-
-    def take(count: int) -> bytes:
-        nonlocal position
+    def read(self, count: int) -> bytes:
+        """Return the next `count` bytes, or those that are left."""
+        if self.inflate is None:
+            return self._next(count)
         content = bytearray()
-        while len(content) < count and not inflate.eof:
-            data = inflate.unconsumed_tail
-            if not data:
-                data = _read_bytes(file, position, min(_READ_BYTES, size - position))
-                position += len(data)
-            try:
-                content += inflate.decompress(data, count - len(content))
-            except zlib.error as error:
-                raise _damaged(path, error) from error
-            if position == size and not inflate.unconsumed_tail and not inflate.eof and len(content) < count:
+        while len(content) < count and not self.inflate.eof:
+            data = self.inflate.unconsumed_tail or self._next(_READ_BYTES)
+            content += self.inflate.decompress(data, count - len(content))
+            if not data and len(content) < count:
                 break
         return bytes(content)
 
-    def read_exactly(count: int) -> bytes:
-        content = take(count)
-        if len(content) < count:
-            raise _ends_early(path)
-        return content
-
-    take(16)
-    for _ in filter(None, spz.sections):
-        yield read_exactly
-    tail.content = take(_EXTENSION_BYTES)
-    if len(tail.content) == _EXTENSION_BYTES and not inflate.eof:
-        raise _too_much(path)
-    if not inflate.eof:
-        raise _ends_early(path)
-    tail.end = position - len(inflate.unused_data)
-    _check_rest(path, spz, tail)
+    def _next(self, count: int) -> bytes:
+        data = read_rows(self._file, np.dtype(np.uint8), self.position, min(count, self._size - self.position))
+        self.position += len(data)
+        return data.tobytes()
 
 
-def _zstd_streams(path: Path, file: OpenScene, streams: tuple[SpzSection, ...]) -> Iterator[Take]:
-    """Yield, for each section, a function that reads its own zstd stream; check that the stream ends there."""
-    for stream in streams:
-        decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
-        source: Any = _StreamSource(file, stream)
-        with decompressor.stream_reader(source, read_size=_READ_BYTES, read_across_frames=True) as reader:
-
-            def take(count: int, reader: Any = reader) -> bytes:
-                try:
-                    content: bytes = reader.read(count)
-                except zstandard.ZstdError as error:
-                    raise _damaged(path, error) from error
-                if len(content) < count:
-                    raise _ends_early(path)
-                return content
-
-            yield take
-            try:
-                more = reader.read(1)
-            except zstandard.ZstdError as error:
-                raise _damaged(path, error) from error
-            if more:
-                raise _too_much(path)
-
-
-class _StreamSource:
+class _Part:
     """File-like object for a byte range of a file."""
 
-    def __init__(self, file: OpenScene, stream: SpzSection) -> None:
-        self._file, self._position, self._end = file, stream.offset, stream.offset + stream.compressed
+    def __init__(self, file: OpenScene, offset: int, size: int) -> None:
+        self._file, self._position, self._end = file, offset, offset + size
 
     def read(self, size: int = -1) -> bytes:
         left = self._end - self._position
-        data = _read_bytes(self._file, self._position, left if size < 0 else min(size, left))
+        data = read_rows(self._file, np.dtype(np.uint8), self._position, left if size < 0 else min(size, left))
         self._position += len(data)
-        return data
+        return data.tobytes()
 
 
-def _read_bytes(file: OpenScene, offset: int, count: int) -> bytes:
-    data = np.empty(count, np.uint8)
-    file.read(offset, data)
-    return data.tobytes()
+def _sections_of_stream(path: Path, stream: _Stream, spz: SpzHeader) -> Iterator[Take]:
+    """Yield, for each section of version 1 to 3, a function that reads its bytes."""
+    _taken(path, stream.read, 16)
+    for _ in filter(None, spz.sections):
+        yield partial(_taken, path, stream.read)
 
 
-def _damaged(path: Path, error: Exception) -> SceneError:
-    return SceneError(f"{path}: the compressed data is damaged: {error}. Copy or export it again.")
+def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[bytes, int]:
+    """Return what follows the sections of version 1 to 3, and the byte offset of the end of the stream.
+
+    Raises:
+        SceneError: If it is no extension, but as much as a Gaussian takes.
+    """
+    content = _taken(path, stream.read, _EXTENSION_BYTES, least=0)
+    if _taken(path, stream.read, 1, least=0):
+        raise _too_much(path)
+    if stream.inflate and not stream.inflate.eof:
+        raise _ends_early(path)
+    rest = content[sum(8 + len(each) for _, each in _extension_records(content)) * spz.extended :]
+    if len(rest) >= sum(spz.sections) // spz.count and not is_padding(rest):
+        raise _too_much(path, f" by {number_of(len(rest), 'byte')}")
+    return content, stream.position - len(stream.inflate.unused_data if stream.inflate else b"")
+
+
+def _sections_of_streams(path: Path, file: OpenScene, spz: SpzHeader) -> Iterator[Take]:
+    """Yield, for each section of version 4, a function that reads its own stream; check that the stream ends there."""
+    for offset, size in spz.streams:
+        part: Any = _Part(file, offset, size)  # its only method is `read`
+        with zstd.ZstdFile(part, options=_ZSTD_OPTIONS) as stream:
+            yield partial(_taken, path, stream.read)
+            if _taken(path, stream.read, 1, least=0):
+                raise _too_much(path)
+
+
+def _taken(path: Path, read: Take, count: int, least: int | None = None) -> bytes:
+    """Return bytes of a stream, `count` of them, or at least `least`.
+
+    Raises:
+        SceneError: If the stream is damaged, or ends before.
+    """
+    try:
+        content = read(count)
+    except EOFError:
+        content = b""
+    except (zlib.error, zstd.ZstdError) as error:
+        raise SceneError(f"{path}: the compressed data is damaged: {error}. Copy or export it again.") from error
+    if len(content) < (count if least is None else least):
+        raise _ends_early(path)
+    return content
 
 
 def _ends_early(path: Path) -> SceneError:
@@ -547,7 +507,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     bits = _fractional_bits(arrays["means"])
     streams = []
     for section in _encoded_sections(arrays, bits):
-        compressor, size = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compressobj(), 0
+        compressor, size = zstd.ZstdCompressor(level=_ZSTD_LEVEL), 0
         compressed = bytearray()
         for block in section:
             compressed += compressor.compress(block)
@@ -598,7 +558,7 @@ def _encoded_sections(arrays: Arrays, bits: int) -> Iterator[Iterator[bytes]]:
         (arrays["sh_rest"], lambda values: _to_byte(values * 128 + 128)),
     ]
     for array, encode in encoders:
-        blocks = (array[start : start + _BLOCK_ROWS] for start in range(0, len(array), _BLOCK_ROWS))
+        blocks = (array[start : start + BLOCK_ROWS] for start in range(0, len(array), BLOCK_ROWS))
         yield (np.ascontiguousarray(encode(block.astype(np.float64))).tobytes() for block in blocks)
 
 

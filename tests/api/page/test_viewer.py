@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
+from sgsst_core.constants import SH_C0
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import by_name
-from sgsst_core.files.formats.quantized import SH_C0
 from sgsst_core.files.formats.splat import ROW
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import zstandard
+from backports import zstd
 from gsply.spz import read_spz, write_spz
 
 from sgsst_core.errors import OutputError
@@ -278,8 +278,8 @@ def test_false_streams_of_version_4_are_refused(tmp_path: Path) -> None:
     """Streams are truncated, too long or damaged, after a correct table."""
     sections = [bytes(size) for size in (9, 1, 3, 3, 4)]
     for index, wrong, message in ((0, bytes(8), "ends before"), (2, bytes(1 << 27), "continues"), (4, None, "damaged")):
-        bodies = [zstandard.compress(section) for section in sections]
-        bodies[index] = zstandard.compress(wrong) if wrong is not None else b"nonsense"
+        bodies = [zstd.compress(section) for section in sections]
+        bodies[index] = zstd.compress(wrong) if wrong is not None else b"nonsense"
         table = b"".join(struct.pack("<QQ", len(body), len(s)) for body, s in zip(bodies, sections, strict=True))
         head = b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 12, 0, 5, 32) + bytes(12)
         refused(tmp_path, head + table + b"".join(bodies), message)
