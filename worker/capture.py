@@ -22,9 +22,8 @@ from sgsst_core.orbit.subject import find_subject
 from sgsst_core.orbit.up import find_up
 from sgsst_core.planning.capture_checks import compare_photos, frame_warnings
 from sgsst_core.planning.shown import shown_by
-from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
+from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread, undistorted
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.lens import undistorted
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.settings import Settings
 from worker.job import SceneRequest

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
-from PIL import Image
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder

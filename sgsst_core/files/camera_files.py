@@ -26,18 +26,12 @@ from sgsst_core.files.colmap_model import COMPARE, QUATERNION_TOLERANCE, ColmapC
 from sgsst_core.files.images import image_size
 from sgsst_core.files.photos import PhotoFolder
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.lens import Lens, fisheye_lens, other_lens, radial_lens
+from sgsst_core.scene.lens import COEFFICIENTS, Lens, formula
 from sgsst_core.scene.rotations import exact_rotation
 
 #: Largest deviation of a size from whole pixels that is attributed to rounding: 119.99999 is 120.
 _WHOLE_TOLERANCE = 0.01
 
-#: Distortion coefficients of transforms.json: those of a fisheye, and the others in OpenCV's order.
-_FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
-_RADIAL_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-#: Camera models of transforms.json whose coefficients are those of `_RADIAL_KEYS`; all can be 0.
-_RADIAL_NAMES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_FISHEYE_NAMES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 #: Camera models without a focal length.
 _NO_PINHOLES = ("EQUIRECTANGULAR", "SPHERICAL", "ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
 #: Offset of a principal point from the middle of an image, relative to half its sides, above which an image counts as
@@ -48,9 +42,6 @@ _ONE_FOCAL = (
     *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE"),
     "SIMPLE_DIVISION",
 )
-#: COLMAP's camera models by formula. Coefficients follow the intrinsics, in OpenCV's order.
-_COLMAP_RADIAL = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_COLMAP_FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 
 
 def read_cameras(path: Path, photos: Path | None = None, warn: Warn | None = None) -> list[Camera]:
@@ -135,7 +126,9 @@ def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -
         model = _transforms_model(where, values)
         pinhole = _transforms_intrinsics(where, values, size)
         camera = _camera(where, name, size, pinhole, _inverse(where, pose))
-        return _with_lens(camera, _transforms_lens(where, model, values, size, pinhole))
+        keys = COEFFICIENTS[formula(model)]
+        coefficients = [_number(where, values, key) if values.get(key) is not None else 0.0 for key in keys]
+        return _with_lens(camera, Lens.of(model, coefficients, size, pinhole))
 
     return _convert_entries(path, content["frames"], convert)
 
@@ -152,23 +145,6 @@ def _transforms_model(where: str, values: Mapping[str, Any]) -> str:
             "images first, for example with `ns-process-data images --camera-type equirectangular`."
         )
     return model
-
-
-def _transforms_lens(
-    where: str,
-    model: str,
-    values: Mapping[str, Any],
-    size: tuple[int, int],
-    pinhole: tuple[float, float, float, float],
-) -> Lens:
-    def coefficients(keys: tuple[str, ...]) -> tuple[float, ...]:
-        return tuple(_number(where, values, key) if values.get(key) is not None else 0.0 for key in keys)
-
-    if model in _FISHEYE_NAMES:
-        return fisheye_lens(model, coefficients(_FISHEYE_KEYS), size, pinhole)
-    if model in _RADIAL_NAMES:
-        return radial_lens(model or "OPENCV", coefficients(_RADIAL_KEYS), size, pinhole)
-    return other_lens(model[:40], size, pinhole)
 
 
 def _with_lens(camera: Camera, lens: Lens) -> Camera:
@@ -296,11 +272,7 @@ def _colmap_lens(where: str, camera: ColmapCamera) -> Lens:
     size = (camera.width, camera.height)
     if not np.isfinite(rest).all():
         raise CameraError(f"{where}: its camera holds NaN or infinite values. Export the cameras again.")
-    if camera.model in _COLMAP_RADIAL:
-        return radial_lens(camera.model, tuple(rest), size, pinhole)
-    if camera.model in _COLMAP_FISHEYE:
-        return fisheye_lens(camera.model, tuple(rest), size, pinhole)
-    return other_lens(camera.model, size, pinhole)
+    return Lens.of(camera.model, rest, size, pinhole)
 
 
 def _rotation_matrix(where: str, quaternion: tuple[float, float, float, float]) -> NDArray[Any]:

@@ -16,7 +16,6 @@ from sgsst_core.errors import ImageError
 from sgsst_core.files.colmap_model import label
 from sgsst_core.files.images import BLACK, HEIF_SUFFIXES, Color, load_image, stored_size
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.lens import undistort
 
 #: Maximum relative difference between the aspect ratios of a photo and its camera. A larger difference indicates a
 #: wrong or cropped photo.
@@ -250,6 +249,30 @@ def load_photo(photo: Photo, camera: Camera, *, background: Color = BLACK, color
         planes, (camera.height, camera.width), mode="bicubic", antialias=True, align_corners=False
     )
     return small[0].permute(1, 2, 0).clamp(0, 1).contiguous()  # bicubic interpolation overshoots at edges
+
+
+def undistort(photo: Tensor, camera: Camera) -> Tensor:
+    """Return a photo as the pinhole camera would have taken it, by one bilinear sampling: [height, width, 3] float32.
+
+    A photo with more pixels than the camera is reduced first, so that sampling does not alias.
+
+    Args:
+        photo: Original photo [H, W, 3] float32, of the lens's aspect ratio.
+        camera: Camera with a lens.
+    """
+    lens = camera.lens
+    assert lens is not None
+    planes = photo.permute(2, 0, 1)[None]
+    density = min(1.0, camera.fx / lens.fx * lens.width / photo.shape[1])
+    if density < 1:
+        size = [max(1, round(side * density)) for side in photo.shape[:2]]
+        planes = torch.nn.functional.interpolate(planes, size, mode="bicubic", antialias=True, align_corners=False)
+    x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
+    y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
+    u, v = lens.positions(*torch.meshgrid(x, y, indexing="xy"))
+    grid = (2 * torch.stack([u, v], dim=2) - 1).float()[None]
+    sampled = torch.nn.functional.grid_sample(planes, grid, "bilinear", "border", align_corners=False)
+    return sampled[0].permute(1, 2, 0).clamp(0, 1).contiguous()
 
 
 def fits(size: tuple[int, int], camera: Camera) -> bool:

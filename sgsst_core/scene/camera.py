@@ -15,13 +15,16 @@ from torch import Tensor
 
 from sgsst_core.constants import FRUSTUM_MARGIN
 from sgsst_core.errors import CameraError, SettingsError
+from sgsst_core.scene.lens import Lens, largest_scale
 from sgsst_core.scene.rotations import exact_rotation
 
 if TYPE_CHECKING:
-    from sgsst_core.scene.lens import Lens
     from sgsst_core.settings import Settings
 
 V = TypeVar("V")
+
+#: Smallest fraction of a photo's width that an undistorted frame may keep.
+_MIN_FRAME = 0.1
 
 
 @dataclass(frozen=True)
@@ -206,6 +209,35 @@ def resized(camera: Camera, side: int) -> Camera:
         cy=camera.cy * y,
         resolution=side if camera.resolution else None,
     )
+
+
+def undistorted(camera: Camera) -> Camera:
+    """Return the pinhole camera that undistorted photos fill without black borders.
+
+    Focal lengths do not change, so pixels keep their size in the photo's center, as in COLMAP's `image_undistorter`.
+    The frame is cropped around the principal point with its aspect ratio. It is never enlarged.
+
+    Raises:
+        CameraError: If the lens model is not implemented, or less than a tenth of the frame remains.
+    """
+    lens = camera.lens
+    if lens is None:
+        return camera
+    if lens.kind is None:
+        raise CameraError(
+            f"Camera {camera.name!r}: photos of the camera model {lens.model} cannot be undistorted here. Undistort "
+            "them with `colmap image_undistorter` and give its cameras and images, or leave the photos out."
+        )
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    scale = largest_scale(lens, (camera.width, camera.height), intrinsics)
+    if scale < _MIN_FRAME:
+        raise CameraError(
+            f"Camera {camera.name!r}: its distortion ({lens.model} {', '.join(f'{k:g}' for k in lens.coefficients)}) "
+            "leaves no image. Check the coefficients, or leave the photos out."
+        )
+    width, height = (max(1, int(side * scale)) for side in (camera.width, camera.height))
+    x, y = width / camera.width, height / camera.height
+    return replace(camera, width=width, height=height, cx=camera.cx * x, cy=camera.cy * y)
 
 
 def fit_cameras(cameras: Sequence[Camera], settings: Settings) -> list[Camera]:

@@ -9,21 +9,28 @@ which COLMAP and nerfstudio share.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from sgsst_core.errors import CameraError
-
-if TYPE_CHECKING:
-    from sgsst_core.scene.camera import Camera
-
 #: Nodes per side of the grid on which a frame is checked for borders and folds.
 _NODES = 65
-#: Smallest fraction of a photo's width that an undistorted frame may keep.
-_LEAST_FRAME = 0.1
+#: Formulas of camera models of COLMAP and nerfstudio; photos of other models cannot be undistorted here.
+_FORMULAS: dict[str, Literal["radial", "fisheye"]] = {
+    **dict.fromkeys(("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"), "radial"),
+    **dict.fromkeys(("OPENCV", "FULL_OPENCV"), "radial"),
+    **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "fisheye"),
+    "OPENCV_FISHEYE": "fisheye",
+}
+#: Coefficients by formula, in OpenCV's order.
+COEFFICIENTS: dict[str | None, tuple[str, ...]] = {
+    "radial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+    None: (),
+}
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,7 @@ class Lens:
         model: Name of the camera model in the camera file.
         kind: Formula: "radial" for the rational model, "fisheye" for the equidistant one; None if the model is not
             implemented, so photos cannot be undistorted.
-        coefficients: Coefficients in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, or k1 to k4 for a fisheye.
+        coefficients: Values of `COEFFICIENTS`.
         width, height: Size of the photos in pixels.
         fx, fy, cx, cy: Intrinsics of the photos in pixels.
     """
@@ -48,6 +55,16 @@ class Lens:
     fy: float
     cx: float
     cy: float
+
+    @staticmethod
+    def of(
+        model: str, values: Sequence[float], size: tuple[int, int], pinhole: tuple[float, float, float, float]
+    ) -> Lens:
+        """Return the lens of a camera model, with its first coefficients; others are 0."""
+        kind = formula(model)
+        count = len(COEFFICIENTS[kind])
+        coefficients = (*values, *[0.0] * count)[:count]
+        return Lens(model[:40] or "OPENCV", kind, coefficients, *size, *pinhole)
 
     @property
     def distorts(self) -> bool:
@@ -83,56 +100,13 @@ class Lens:
         )
 
 
-def radial_lens(
-    model: str, values: tuple[float, ...], size: tuple[int, int], pinhole: tuple[float, float, float, float]
-) -> Lens:
-    """Return a lens with up to 8 coefficients in OpenCV's order; missing ones are 0."""
-    return Lens(model, "radial", (*values, *[0.0] * (8 - len(values))), *size, *pinhole)
-
-
-def fisheye_lens(
-    model: str, values: tuple[float, ...], size: tuple[int, int], pinhole: tuple[float, float, float, float]
-) -> Lens:
-    """Return a fisheye lens with up to 4 coefficients; missing ones are 0."""
-    return Lens(model, "fisheye", (*values, *[0.0] * (4 - len(values))), *size, *pinhole)
-
-
-def other_lens(model: str, size: tuple[int, int], pinhole: tuple[float, float, float, float]) -> Lens:
-    """Return a lens of a model that is not implemented, so its photos cannot be undistorted."""
-    return Lens(model, None, (), *size, *pinhole)
-
-
-def undistorted(camera: Camera) -> Camera:
-    """Return the pinhole camera that undistorted photos fill without black borders.
-
-    Focal lengths do not change, so pixels keep their size in the photo's center, as in COLMAP's `image_undistorter`.
-    The frame is cropped around the principal point with its aspect ratio. It is never enlarged.
-
-    Raises:
-        CameraError: If the lens model is not implemented, or less than a tenth of the frame remains.
-    """
-    lens = camera.lens
-    if lens is None:
-        return camera
-    if lens.kind is None:
-        raise CameraError(
-            f"Camera {camera.name!r}: photos of the camera model {lens.model} cannot be undistorted here. Undistort "
-            "them with `colmap image_undistorter` and give its cameras and images, or leave the photos out."
-        )
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    scale = _largest_scale(lens, (camera.width, camera.height), intrinsics)
-    if scale < _LEAST_FRAME:
-        raise CameraError(
-            f"Camera {camera.name!r}: its distortion ({lens.model} {', '.join(f'{k:g}' for k in lens.coefficients)}) "
-            "leaves no image. Check the coefficients, or leave the photos out."
-        )
-    width, height = (max(1, int(side * scale)) for side in (camera.width, camera.height))
-    x, y = width / camera.width, height / camera.height
-    return replace(camera, width=width, height=height, cx=camera.cx * x, cy=camera.cy * y)
+def formula(model: str) -> Literal["radial", "fisheye"] | None:
+    """Return the formula of a camera model; None if it is not implemented."""
+    return _FORMULAS.get(model)
 
 
 @functools.lru_cache(maxsize=1024)  # most cameras of a capture share their lens
-def _largest_scale(lens: Lens, size: tuple[int, int], intrinsics: tuple[float, float, float, float]) -> float:
+def largest_scale(lens: Lens, size: tuple[int, int], intrinsics: tuple[float, float, float, float]) -> float:
     """Return the largest factor, at most 1, by which a cropped frame lies inside the photo."""
     low, high = 0.0, 1.0
     if _fills(lens, size, intrinsics, high):
@@ -153,27 +127,3 @@ def _fills(lens: Lens, size: tuple[int, int], intrinsics: tuple[float, float, fl
     upright = right[0] * down[1] - right[1] * down[0] > 0
     inside = (u >= -1e-9) & (u <= 1 + 1e-9) & (v >= -1e-9) & (v <= 1 + 1e-9)
     return bool(upright.all()) and bool(inside.all())
-
-
-def undistort(photo: Tensor, camera: Camera) -> Tensor:
-    """Return a photo as the pinhole camera would have taken it, by one bilinear sampling: [height, width, 3] float32.
-
-    A photo with more pixels than the camera is reduced first, so that sampling does not alias.
-
-    Args:
-        photo: Original photo [H, W, 3] float32, of the lens's aspect ratio.
-        camera: Camera with a lens.
-    """
-    lens = camera.lens
-    assert lens is not None
-    planes = photo.permute(2, 0, 1)[None]
-    density = min(1.0, camera.fx / lens.fx * lens.width / photo.shape[1])
-    if density < 1:
-        size = [max(1, round(side * density)) for side in photo.shape[:2]]
-        planes = torch.nn.functional.interpolate(planes, size, mode="bicubic", antialias=True, align_corners=False)
-    x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
-    u, v = lens.positions(*torch.meshgrid(x, y, indexing="xy"))
-    grid = (2 * torch.stack([u, v], dim=2) - 1).float()[None]
-    sampled = torch.nn.functional.grid_sample(planes, grid, "bilinear", "border", align_corners=False)
-    return sampled[0].permute(1, 2, 0).clamp(0, 1).contiguous()

@@ -21,8 +21,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.files.advice import advice_for_name
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.photos import check_photos
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.lens import undistorted
+from sgsst_core.scene.camera import Camera, undistorted
 from tests.sgsst_core.files.test_camera_files import HEIGHT, WIDTH, colmap, inria, nerfstudio, views
 from tests.small_scenes import LFS_POINTER
 

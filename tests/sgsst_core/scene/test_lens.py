@@ -12,8 +12,9 @@ import torch
 from sgsst_core.errors import CameraError
 from sgsst_core.files.camera_files import _colmap_lens
 from sgsst_core.files.colmap_model import ColmapCamera
-from sgsst_core.scene.camera import Camera, resized
-from sgsst_core.scene.lens import Lens, radial_lens, undistort, undistorted
+from sgsst_core.files.photos import undistort
+from sgsst_core.scene.camera import Camera, resized, undistorted
+from sgsst_core.scene.lens import Lens
 
 WIDTH, HEIGHT = 320, 240
 #: Parameters of real lenses: phone, wide angle (barrel), telephoto (pincushion), with decentering, and fisheyes.
@@ -127,14 +128,14 @@ def test_coefficients_of_0_are_no_distortion() -> None:
     "values", [(float("inf"),), (-1e6,), (1e300, 1e300), (0, 0, 5.0, 5.0), (0, 0, 0, 0, 0, -900.0)]
 )
 def test_lenses_that_leave_no_image_are_refused(values: tuple[float, ...]) -> None:
-    hostile = radial_lens("OPENCV", values, (WIDTH, HEIGHT), (260.0, 260.0, 160.0, 120.0))
+    hostile = Lens.of("OPENCV", values, (WIDTH, HEIGHT), (260.0, 260.0, 160.0, 120.0))
     with pytest.raises(CameraError, match=r"'view': its distortion \(OPENCV .*leaves no image"):
         undistorted(camera(hostile))
 
 
 def test_folded_borders_are_cropped() -> None:
     """Beyond a radius of 0.58, this lens maps the image back onto itself, and its corners lie inside the photo."""
-    folding = camera(radial_lens("RADIAL", (-1.0,), (WIDTH, HEIGHT), (200.0, 200.0, 160.0, 120.0)))
+    folding = camera(Lens.of("RADIAL", (-1.0,), (WIDTH, HEIGHT), (200.0, 200.0, 160.0, 120.0)))
     u, v = corners(folding)
     assert 0 < float(min(u.min(), v.min())) <= float(max(u.max(), v.max())) < 1
     view = undistorted(folding)

@@ -20,7 +20,7 @@ from sgsst_core.files.photos import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.lens import radial_lens
+from sgsst_core.scene.lens import Lens
 from worker.capture import Capture
 from worker.outputs import Outputs
 from worker.ranks.messages import decode, encode
@@ -50,7 +50,7 @@ VALUES = [
         [Photo(Path("a.jpg"), (640, 480), oriented=True)],
         (Decision("axes", "rub", "seen"),),
     ),
-    radial_lens("OPENCV", (0.1, -0.02), (640, 480), (500.0, 500.0, 320.0, 240.0)),
+    Lens.of("OPENCV", (0.1, -0.02), (640, 480), (500.0, 500.0, 320.0, 240.0)),
     Prediction(1.0, 2.0, 3),
 ]
 
