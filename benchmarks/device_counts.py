@@ -52,7 +52,9 @@ def counted(scan: bool, precision: Precision, size: tuple[int, int]) -> dict[str
         plan = replace(plan, precision=precision)  # independent of what is fastest on this processor
         context = planning_context if plan.precision == planning_context.network.precision else None
         stylizer = Stylizer(
-            prepare_job(plan, scene, cameras(1, *SMALL), style(), settings, weights=weights, planning_context=context)
+            prepare_job(
+                plan, scene, cameras(1, *SMALL), Style.of(style()), settings, weights=weights, planning_context=context
+            )
         )
         steps = []
         for _ in range(2):

@@ -41,6 +41,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.result_colors import NEIGHBORS, neighbors_change
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -152,7 +153,9 @@ def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     plan, planning_context = make_plan(scene, cameras, settings, weights=weights, timer=timer)
     with timer("preparing"):
         stylizer = Stylizer(
-            prepare_job(plan, scene, cameras, style, settings, weights=weights, planning_context=planning_context)
+            prepare_job(
+                plan, scene, cameras, Style.of(style), settings, weights=weights, planning_context=planning_context
+            )
         )
     with timer("first_step"):
         stylizer.run_step()

@@ -289,7 +289,10 @@ def _row_layout(path: Path, header: PlyHeader, stamp: tuple[int, int], offset: i
 
 
 def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: SceneColumns) -> None:
-    """Read the vertex element in blocks. Large files are read with as many threads as PyTorch uses."""
+    """Read the vertex element in blocks. Large files are read with as many threads as PyTorch uses.
+
+    plyfile would map the file, which takes as long, but kills the process if another program truncates the file.
+    """
     dtype, count = header.vertex.dtype(header.byte_order), header.vertex.count
     step = max(1, READ_BYTES // dtype.itemsize)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +27,9 @@ from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, encode_scene, fil
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import changed
 
+#: Rows per block: a megabyte of a scene of SH degree 3 stays in a core's L2 cache while its columns change.
+_BLOCK_ROWS = 1 << 12
+_REST = re.compile(r"f_rest_\d+")
 #: New values of all Gaussians, by property name.
 _NewColumns = dict[str, NDArray[np.float32]]
 #: Largest finite float16 value.
@@ -35,6 +38,9 @@ _FLOAT16_MAX = 65504.0
 
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
     """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
+
+    plyfile would change them: it moves `obj_info` behind comments, writes other line ends, names of types and numbers
+    in text, refuses comments that are not ASCII, and drops what follows the last element.
 
     A color keeps its bytes too if its float32 value does not change. The rest of the file changes in these cases:
 
@@ -80,14 +86,12 @@ def encode_stylized(
         encode_scene(output, replace(source.scene.attenuated(sh_attenuation), sh_dc=colors), PLY, target)
         return
     check_sh_attenuation(source, sh_attenuation)
-    attenuation = _ShAttenuation.of(source.header, sh_attenuation)
-    columns = _new_columns(source, source.header, colors)
+    columns, factor = _new_columns(source, source.header, colors), attenuation_factor(sh_attenuation)
+    rest = [] if factor == 1 else [prop.name for prop in source.header.vertex.properties if _REST.fullmatch(prop.name)]
     with source.path.open("rb") as file:
         output.write(_header_for(source, source.header))
-        if source.header.text:
-            _write_text(source, source.header, columns, attenuation, file, output)
-        else:
-            _write_binary(source, source.header, columns, attenuation, file, output)
+        write = _write_text if source.header.text else _write_binary
+        write(source, source.header, columns, rest, factor, file, output)
 
 
 def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
@@ -99,7 +103,7 @@ def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
     if source.header is None or not attenuation:
         return
     kinds = {prop.name: prop.kind for prop in source.header.vertex.properties}
-    integers = [name for name, kind in kinds.items() if re.fullmatch(r"f_rest_\d+", name) and kind[0] != "f"]
+    integers = [name for name, kind in kinds.items() if _REST.fullmatch(name) and kind[0] != "f"]
     if integers:
         raise SceneError(
             f"{source.path}: {integers[0]} is stored as integers, which cannot be attenuated. Convert it to float "
@@ -107,47 +111,9 @@ def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _ShAttenuation:
-    """SH attenuation of the rows of a file.
-
-    Attributes:
-        names: Names of the SH properties in the file's order.
-        factor: Factor of all coefficients, rounded to float32. If it is 0, all coefficients become positive zeros.
-    """
-
-    names: tuple[str, ...]
-    factor: float
-
-    @staticmethod
-    def of(header: PlyHeader, attenuation: float) -> _ShAttenuation | None:
-        """Return the attenuation for a file's vertices; None if no coefficient changes."""
-        names = tuple(prop.name for prop in header.vertex.properties if re.fullmatch(r"f_rest_\d+", prop.name))
-        factor = attenuation_factor(attenuation)
-        return _ShAttenuation(names, factor) if names and factor != 1 else None
-
-    def apply(self, rows: NDArray[Any]) -> None:
-        """Attenuate a structured block of rows in place."""
-        if not len(rows):
-            return
-        dtype = rows.dtype
-        assert dtype.fields is not None
-        first = dtype.fields[self.names[0]][1]
-        contiguous = all(
-            dtype[name] == np.dtype("<f4") and dtype.fields[name][1] == first + 4 * index
-            for index, name in enumerate(self.names)
-        )
-        if contiguous and first % 4 == 0 and dtype.itemsize % 4 == 0:  # layout of 3DGS trainers: one pass over the rows
-            table = rows.view(np.uint8).view("<f4").reshape(len(rows), -1)
-            coefficients = table[:, first // 4 : first // 4 + len(self.names)]
-            coefficients[:] = self.attenuated(coefficients)
-            return
-        for name in self.names:
-            rows[name] = self.attenuated(rows[name].astype(np.float32))
-
-    def attenuated(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the attenuated values in float32."""
-        return values * np.float32(self.factor) if self.factor else np.zeros_like(values)
+def _attenuated(values: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
+    """Return attenuated coefficients in float32; positive zeros if the factor is 0."""
+    return values * np.float32(factor) if factor else np.zeros_like(values)
 
 
 def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
@@ -184,8 +150,8 @@ def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> _NewCo
 def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
     """Yield, for each block of file rows, its length, the number of copies of each row, and the slice of Gaussians."""
     position = gaussian = 0
-    for start in range(0, rows, BLOCK_ROWS):
-        count = min(BLOCK_ROWS, rows - start)
+    for start in range(0, rows, _BLOCK_ROWS):
+        count = min(_BLOCK_ROWS, rows - start)
         times = np.ones(count, np.int64)
         if source.retained is not None:
             times[:] = source.retained[start : start + count]
@@ -202,7 +168,8 @@ def _write_binary(
     source: SceneFile,
     header: PlyHeader,
     columns: _NewColumns,
-    attenuation: _ShAttenuation | None,
+    rest: list[str],
+    factor: float,
     file: io.BufferedReader,
     output: BinaryIO,
 ) -> None:
@@ -210,7 +177,7 @@ def _write_binary(
     before = element_offsets(source.path, header)["vertex"] - len(header.raw)
     file.seek(len(header.raw))
     _copy(file, output, before)
-    buffer = bytearray(min(BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
+    buffer = bytearray(min(_BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
     for count, times, gaussians in _blocks(source, header.vertex.count):
         part = memoryview(buffer)[: count * dtype.itemsize]
         if file.readinto(part) != len(part):
@@ -222,8 +189,8 @@ def _write_binary(
             column = values[gaussians]
             different = rows[name].astype(np.float32) != column
             rows[name][different] = column[different]
-        if attenuation is not None:
-            attenuation.apply(rows)
+        for name in rest:
+            rows[name] = _attenuated(rows[name].astype(np.float32), factor)
         output.write(rows.view(np.uint8).data)
     _copy(file, output)
     if file_stamp(source.path) != source.stamp:
@@ -244,14 +211,15 @@ def _write_text(
     source: SceneFile,
     header: PlyHeader,
     columns: _NewColumns,
-    attenuation: _ShAttenuation | None,
+    rest: list[str],
+    factor: float,
     file: BinaryIO,
     output: BinaryIO,
 ) -> None:
     vertex = header.vertex
     before = header.elements[: header.elements.index(vertex)]
     order = [prop.name for prop in vertex.properties]
-    names = (*columns, *(attenuation.names if attenuation else ()))
+    names = (*columns, *rest)
     slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in names]
     file.seek(len(header.raw))
     # latin-1 preserves every byte, and newline="" every line end
@@ -263,14 +231,12 @@ def _write_text(
         for copies in times:
             line = lines.readline()
             for _ in range(copies):
-                output.write(_changed_line(line, slots, next(values), attenuation).encode("latin-1"))
+                output.write(_changed_line(line, slots, next(values), factor).encode("latin-1"))
     for line in lines:
         output.write(line.encode("latin-1"))
 
 
-def _changed_line(
-    line: str, slots: list[tuple[int, str]], values: NDArray[Any], attenuation: _ShAttenuation | None
-) -> str:
+def _changed_line(line: str, slots: list[tuple[int, str]], values: NDArray[Any], factor: float) -> str:
     """Return a row of text with new values. Tokens whose value does not change, and all spacing, are copied.
 
     Args:
@@ -278,12 +244,11 @@ def _changed_line(
         slots: Token index and NumPy type code of each value to replace: those of `values` first, then those to
             attenuate.
         values: New values of the first slots.
-        attenuation: SH attenuation of the remaining slots; None if there are none.
+        factor: Factor of the remaining slots.
     """
     tokens = list(re.finditer(r"\S+", line))
-    if attenuation is not None:
-        old = np.array([tokens[slot][0] for slot, _ in slots[len(values) :]], dtype=np.float32)
-        values = np.concatenate([values, attenuation.attenuated(old)])
+    old = np.array([tokens[slot][0] for slot, _ in slots[len(values) :]], dtype=np.float32)
+    values = np.concatenate([values, _attenuated(old, factor)])
     for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):
         token = tokens[slot]
         if np.float32(token[0]) != value:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -36,11 +36,10 @@ from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.evaluation import Evaluation
 from sgsst_core.stylizing.state import StepRecord, StylizerState
 
 #: Increased whenever the meaning of a stored value changes.
-FORMAT_VERSION = "7"
+FORMAT_VERSION = "8"
 #: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
 #: measurements; the memory limit, which determines the partition, changes only rounding.
 _FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit", "measure"}
@@ -135,7 +134,7 @@ def versions() -> dict[str, str]:
 def fingerprint(
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor | Style,
+    style: Style,
     settings: Settings,
     weights: str,
     photos: str = "",
@@ -146,16 +145,15 @@ def fingerprint(
     Args:
         scene: Scene to stylize.
         cameras: Cameras of the views.
-        style: Style image [H, W, 3], or a mixture.
+        style: Style of the job.
         settings: Settings of the job.
         weights: Digest of the feature network's weights.
         photos: Identifier of the content images; empty for unstylized renders.
         regions: Regions of the scene; None if there are none.
     """
     digest = hashlib.sha256(repr((weights, photos)).encode())
-    mixture = Style.of(style)
     arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest)
-    for tensor in (*arrays, *mixture.images):
+    for tensor in (*arrays, *style.images):
         digest.update(repr(tuple(tensor.shape)).encode())
         if isinstance(tensor, StoredHarmonics):
             tensor.for_blocks(
@@ -165,8 +163,8 @@ def fingerprint(
             digest.update(tensor.contiguous().numpy().data)
     if scene.rendering != CLASSIC:
         digest.update(repr(scene.rendering).encode())
-    if len(mixture.images) > 1:
-        digest.update(repr(mixture.weights).encode())
+    if len(style.images) > 1:
+        digest.update(repr(style.weights).encode())
     if regions is not None:
         _add_regions(digest, regions)
     for camera in cameras:
@@ -190,47 +188,23 @@ def _add_regions(digest: Any, regions: Regions) -> None:
             digest.update(repr(tuple(image.shape)).encode() + image.contiguous().numpy().tobytes())
 
 
-def save_checkpoint(path: Path, checkpoint: Checkpoint, job: str) -> None:
-    """Write a checkpoint of the job with this fingerprint, atomically.
-
-    Raises:
-        OutputError: If the file cannot be written.
-    """
-    with atomic_path(path) as temporary:
-        _write(temporary, checkpoint, job)
-
-
 def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
-    state = checkpoint.state
-    plan_tensors, plan_values = _plan_parts(checkpoint.plan)
-    tensors = {
-        "sh_dc": state.sh_dc,
-        "first_moment": state.first_moment,
-        "second_moment": state.second_moment,
-        "generator": state.generator,
-        **plan_tensors,
-    }
-    metadata = {
-        "version": FORMAT_VERSION,
-        "job": job,
-        "run": checkpoint.run,
-        "written_by": json.dumps(checkpoint.written_by),
-        "step": str(state.step),
-        "seconds": repr(state.seconds),
-        "queue": json.dumps(state.queue),
-        "history": json.dumps([_record_values(record) for record in state.history]),
-        "seconds_by_part": json.dumps(state.seconds_by_part),
-        "memory": json.dumps(state.memory),
-        "measured": json.dumps(state.measured),
-        "plan": json.dumps(plan_values),
-        "ranks": str(checkpoint.ranks),
-    }
+    tensors, values = _plan_parts(checkpoint.plan)
+    for name, value in vars(checkpoint.state).items():
+        (tensors if isinstance(value, Tensor) else values)[name] = value
+    values["history"] = [
+        {**vars(record), "terms": {scale: dict(terms) for scale, terms in record.terms.items()}}
+        for record in checkpoint.state.history
+    ]
+    values |= {"ranks": checkpoint.ranks, "written_by": checkpoint.written_by}
+    metadata = {"version": FORMAT_VERSION, "job": job, "run": checkpoint.run, "values": json.dumps(values)}
     try:
         save_file(tensors, path, {**metadata, "digest": _digest(tensors, metadata)})
     except SafetensorError as error:  # the operating system's error is contained only in the text
         if "os error" not in str(error).lower():
             raise
-        raise OSError(_error_number(str(error)), str(error)) from error
+        digits = str(error).lower().rpartition("os error")[2].strip(" )")  # "No space left on device (os error 28)"
+        raise OSError(int(digits) if digits.isdigit() else 0, str(error)) from error
 
 
 def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
@@ -261,13 +235,9 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
             )
         if run is not None and metadata["run"] != run:
             raise CheckpointError(f"{path}: was written by an earlier run. Start again without --resume.")
-        return Checkpoint(
-            state=_state(tensors, metadata),
-            plan=_plan(tensors, json.loads(metadata["plan"])),
-            ranks=int(metadata["ranks"]),
-            run=metadata["run"],
-            written_by=json.loads(metadata["written_by"]),
-        )
+        values = json.loads(metadata["values"])
+        plan, state = _plan(tensors, values.pop("plan")), _state(tensors, values)
+        return Checkpoint(state, plan, values["ranks"], metadata["run"], values["written_by"])
     except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
         raise CheckpointError(
             f"{path}: is not a readable checkpoint ({error}). Start again without --resume."
@@ -284,30 +254,18 @@ def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
     return digest.hexdigest()
 
 
-def _error_number(text: str) -> int:
-    """Return the number in "No space left on device (os error 28)"; 0 if there is none."""
-    digits = text.lower().rpartition("os error")[2].strip(" )")
-    return int(digits) if digits.isdigit() else 0
-
-
-def _state(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> StylizerState:
-    return StylizerState(
-        sh_dc=tensors["sh_dc"],
-        first_moment=tensors["first_moment"],
-        second_moment=tensors["second_moment"],
-        step=int(metadata["step"]),
-        seconds=float(metadata["seconds"]),
-        generator=tensors["generator"].to(torch.uint8),
-        queue=json.loads(metadata["queue"]),
-        history=[_record(entry) for entry in json.loads(metadata["history"])],
-        seconds_by_part=json.loads(metadata["seconds_by_part"]),
-        memory=json.loads(metadata["memory"]),
-        measured=json.loads(metadata["measured"]),
-    )
+def _state(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> StylizerState:
+    """Return the state of a checkpoint from its tensors and other values."""
+    stored = {**values, **tensors, "generator": tensors["generator"].to(torch.uint8)}
+    stored["history"] = [
+        StepRecord(**{**entry, "terms": {int(scale): LossTerms(**terms) for scale, terms in entry["terms"].items()}})
+        for entry in values["history"]
+    ]
+    return StylizerState(**{field.name: stored[field.name] for field in fields(StylizerState)})
 
 
 def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Split a plan into its tensors and JSON-serializable values."""
+    """Return the tensors of a plan, and its JSON-serializable values under "plan"."""
     tensors = {
         "plan.total_weights": plan.survey.total_blend_weights,
         "plan.optimized": plan.optimized,
@@ -325,7 +283,7 @@ def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if refinement is not None:
         del values["refinement"]["pieces"], values["refinement"]["sh_dc"]
     del values["optimized"], values["seen"], values["survey"]["total_blend_weights"]
-    return tensors, values
+    return tensors, {"plan": values}
 
 
 def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
@@ -334,7 +292,9 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
     decisions = tuple(Decision(**decision) for decision in values.pop("decisions"))
     covered = tuple(values.pop("covered"))
     expected = values.pop("prediction")
-    refined = values.pop("refinement", None)
+    refined, refinement = values.pop("refinement", None), None
+    if refined:
+        refinement = Refinement(tensors["plan.pieces"], sh_dc=tensors.get("plan.refined_sh_dc"), **refined)
     return Plan(
         survey=Survey(total_blend_weights=tensors["plan.total_weights"], regions=regions, **survey),
         optimized=tensors["plan.optimized"],
@@ -342,26 +302,6 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
         covered=covered,
         decisions=decisions,
         prediction=Prediction(**expected) if expected else None,
-        refinement=_refinement(tensors, refined) if refined else None,
+        refinement=refinement,
         **values,
     )
-
-
-def _refinement(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Refinement:
-    return Refinement(pieces=tensors["plan.pieces"], sh_dc=tensors.get("plan.refined_sh_dc"), **values)
-
-
-def _evaluation_values(evaluation: Evaluation) -> dict[int, dict[str, float]]:
-    return {scale: dict(terms) for scale, terms in evaluation.items()}
-
-
-def _record_values(record: StepRecord) -> dict[str, Any]:
-    return {**vars(record), "terms": _evaluation_values(record.terms)}
-
-
-def _evaluation(values: dict[str, dict[str, float]]) -> Evaluation:
-    return {int(scale): LossTerms(**parts) for scale, parts in values.items()}
-
-
-def _record(entry: dict[str, Any]) -> StepRecord:
-    return StepRecord(**{**entry, "terms": _evaluation(entry["terms"])})

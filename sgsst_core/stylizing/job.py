@@ -205,7 +205,6 @@ def plan_job(
     """
     style, regions = Style.given(style), regions and regions.with_checked_styles()
     scene, cameras = checked_scene(scene), checked_cameras(cameras)
-    photos = photos and _checked_photos(photos)
     weights = weights or load_network_weights("auto")
     refinement = refine(
         scene,
@@ -238,23 +237,18 @@ def plan_job(
         style,
         settings,
         weights=weights,
-        photos=photos,
+        photos=photos and (lambda index: image_of(photos(index), f"photo of view {index}")),
         collectives=collectives,
         planning_context=planning_context,
         regions=regions,
     )
 
 
-def _checked_photos(photos: PhotoLoader) -> PhotoLoader:
-    """Return a loader that checks and converts the photos of a caller's loader."""
-    return lambda index: image_of(photos(index), f"photo of view {index}")
-
-
 def prepare_job(
     plan: Plan,
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor | Style,
+    style: Style,
     settings: Settings,
     *,
     weights: BackboneWeights,
@@ -269,7 +263,7 @@ def prepare_job(
         plan: Plan for this scene, these cameras and settings: from `make_plan`, or from an earlier run of the same job.
         scene: Scene to stylize, refined if the plan says so.
         cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
-        style: Image [H, W, 3] in 0..1, or a mixture of several images.
+        style: Style of the job.
         settings: Settings of the job.
         weights: Weights of the feature network.
         photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
@@ -329,14 +323,14 @@ def _job_styles(
     plan: Plan,
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor | Style,
+    style: Style,
     settings: Settings,
     regions: Regions | None,
 ) -> JobStyles:
     """Return the styles of a job, in depth bands if the settings say so."""
     blend_weights = plan.survey.total_blend_weights
     regions = regions and regions.resolved(blend_weights)
-    styles = JobStyles.prepared(Style.of(style), regions, settings, scene.sh_dc, blend_weights)
+    styles = JobStyles.prepared(style, regions, settings, scene.sh_dc, blend_weights)
     if not settings.stroke_depth:
         return styles
     level = mean_level(scene.means, blend_weights, [cameras[index] for index in plan.covered], settings.near)

@@ -98,7 +98,9 @@ def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
     while stylizer.step < stylizer.job.total_steps:
         reason = stylizer.job.collectives.broadcast(lambda: _end_requested(stylizer, callbacks)) or _enough(stylizer)
         if reason:
-            return _end_early(stylizer, callbacks, reason)
+            if callbacks.checkpoint:
+                _checkpoint(stylizer, callbacks.checkpoint)
+            return reason
         _step(stylizer, pace)
         now = time.perf_counter()
         if callbacks.progress:
@@ -218,12 +220,6 @@ def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft, runni
 def _by_scale(losses: Mapping[int, float]) -> list[float | None] | None:
     """Return losses by scale, full size first and None for skipped scales; None without losses."""
     return [losses.get(scale) for scale in range(max(losses, default=-1) + 1)] or None
-
-
-def _end_early(stylizer: Stylizer, callbacks: Callbacks, reason: Stopped) -> Stopped:
-    if callbacks.checkpoint:
-        _checkpoint(stylizer, callbacks.checkpoint)
-    return reason
 
 
 def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:

@@ -55,7 +55,7 @@ _ROUNDS, _TAKEN_BACK = 24, 0.25
 def refine(
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Tensor | Style,
+    style: Style,
     settings: Settings,
     *,
     weights: BackboneWeights,
@@ -69,7 +69,7 @@ def refine(
     Args:
         scene: Scene to refine.
         cameras: Cameras of the views.
-        style: Style image [H, W, 3] in 0..1, or a mixture.
+        style: Style of the job.
         settings: Settings of the job.
         weights: Weights of the feature network.
         rasterizer: Name of the rasterizer, as in `make_plan`.
@@ -86,7 +86,7 @@ def refine(
     fitted = fit_cameras(cameras, settings)
     planning_context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
     frozen = None if regions is None else regions.frozen
-    return _Refining(planning_context, Style.of(style), collectives, frozen, show).run()
+    return _Refining(planning_context, style, collectives, frozen, show).run()
 
 
 def refined(scene: Scene, refinement: Refinement | None) -> Scene:

@@ -20,7 +20,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.checkpoint import load_checkpoint, save_checkpoint
+from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.small_scenes import wall
 from tests.worker.ranks.faults import Fault, small_request
@@ -111,7 +111,7 @@ def test_plan_for_another_device_reuses_the_survey(request_: JobSpec) -> None:
     run_job(first, steps=3)
     checkpoint = load_checkpoint(first.outputs.checkpoint, first.fingerprint)
     plan = replace(checkpoint.plan, device="cuda", rasterizer="cuda")
-    save_checkpoint(first.outputs.checkpoint, replace(checkpoint, plan=plan), first.fingerprint)
+    Checkpoints(first.outputs.checkpoint).save(replace(checkpoint, plan=plan), first.fingerprint)
     second = prepare(request_, resume=Resume(True))
     assert (second.stylizer.job.plan.device, second.stylizer.job.plan.rasterizer) == (
         "cpu",
@@ -231,7 +231,7 @@ def test_unusable_rasterizer_in_checkpoint_is_replanned(request_: JobSpec) -> No
     path = request_.out.with_name("s.checkpoint.safetensors")
     saved = load_checkpoint(path, job.fingerprint)
     unusable = replace(saved.plan, rasterizer="cuda", uncached="cuda")
-    save_checkpoint(path, replace(saved, plan=unusable), job.fingerprint)
+    Checkpoints(path).save(replace(saved, plan=unusable), job.fingerprint)
     again = prepare(request_, resume=Resume(True))
     assert again.resumed is not None
     assert again.resumed.plan.rasterizer == "cuda"

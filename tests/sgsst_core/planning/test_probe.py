@@ -24,6 +24,7 @@ from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
@@ -163,7 +164,7 @@ def test_job_reuses_objects_of_the_planning_context(tiny_weights: BackboneWeight
     for scene, reused in ((ball(), True), (wall(), False)):
         settings = make_settings(cached_weights=cached)
         plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)
-        inputs = (plan, scene, cameras(2), style(), settings)
+        inputs = (plan, scene, cameras(2), Style.of(style()), settings)
         used, fresh = (
             Stylizer(prepare_job(*inputs, weights=tiny_weights, planning_context=context))
             for context in (planning_context, None)

@@ -12,6 +12,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.planner import make_plan
 from sgsst_core.quality.float32_reference import Float32Reference, approximations
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
@@ -84,7 +85,9 @@ def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) ->
     errors = []
     for shop in (None, replace(planning_context, network=rounded)):
         stylizer = Stylizer(
-            prepare_job(plan, scene, cameras(2), style(), settings, weights=tiny_weights, planning_context=shop)
+            prepare_job(
+                plan, scene, cameras(2), Style.of(style()), settings, weights=tiny_weights, planning_context=shop
+            )
         )
         assert approximations(stylizer) == ["TF32 convolutions"]
         errors.append(Float32Reference(stylizer).gradient_error())
@@ -98,7 +101,7 @@ def test_bfloat16_error_is_plausible(tiny_weights: BackboneWeights) -> None:
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12)
     plan, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
     plan = replace(plan, precision="bfloat16")
-    stylizer = Stylizer(prepare_job(plan, scene, cameras(2), style(), settings, weights=tiny_weights))
+    stylizer = Stylizer(prepare_job(plan, scene, cameras(2), Style.of(style()), settings, weights=tiny_weights))
     assert approximations(stylizer) == ["bfloat16 features"]
     error = Float32Reference(stylizer).gradient_error()
     assert 1e-3 < error.relative_error < 0.8

@@ -26,6 +26,7 @@ from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
@@ -243,7 +244,7 @@ def test_job_reuses_tile_intersections_of_its_plan(tiny_weights: BackboneWeights
     settings = make_settings("preview", steps_coarse=0, steps_sos=1, cached_weights="half")
     for name in ("cpu", "triton"):
         plan, planning_context = make_plan(scene, VIEWS[:1], settings, weights=tiny_weights, rasterizer=name)
-        inputs = (plan, scene, VIEWS[:1], style(), settings)
+        inputs = (plan, scene, VIEWS[:1], Style.of(style()), settings)
         used, resumed = (
             Stylizer(prepare_job(*inputs, weights=tiny_weights, planning_context=shop))
             for shop in (planning_context, None)

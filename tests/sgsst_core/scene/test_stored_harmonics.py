@@ -28,6 +28,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import RowFile, StoredHarmonics, held
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import fingerprint
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
 
@@ -153,7 +154,8 @@ def test_values_derived_from_stored_coefficients_are_the_same(tmp_path: Path) ->
     """These are fingerprints of jobs, so that a job can be resumed either way, and the largest coefficients."""
     stored, plain = both(written(tmp_path))
     fingerprints = [
-        fingerprint(scene, [camera()], torch.zeros(2, 2, 3), make_settings(), "w") for scene in (stored, plain)
+        fingerprint(scene, [camera()], Style.of(torch.zeros(2, 2, 3)), make_settings(), "w")
+        for scene in (stored, plain)
     ]
     assert fingerprints[0] == fingerprints[1]
     assert isinstance(stored.sh_rest, StoredHarmonics)

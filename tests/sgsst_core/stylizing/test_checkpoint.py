@@ -25,7 +25,6 @@ from sgsst_core.stylizing.checkpoint import (
     Checkpoints,
     fingerprint,
     load_checkpoint,
-    save_checkpoint,
     versions,
 )
 from sgsst_core.stylizing.state import StepRecord, StylizerState
@@ -94,7 +93,7 @@ def assert_same(expected: object, actual: object) -> None:
 
 
 def test_checkpoint_round_trips_exactly(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
+    Checkpoints(tmp_path / "c").save(full_checkpoint, "job")
     loaded = load_checkpoint(tmp_path / "c", "job")
     assert_same(full_checkpoint, loaded)
     torch.Generator().set_state(loaded.state.generator)
@@ -106,7 +105,7 @@ def test_gpu_memory_round_trips(full_checkpoint: Checkpoint, tmp_path: Path) -> 
         full_checkpoint.plan, device="cuda", precision="tf32", prediction=Prediction(0.1, 0.2, 3, device_bytes=10**12)
     )
     full_checkpoint = replace(full_checkpoint, state=replace(full_checkpoint.state, history=history), plan=plan)
-    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
+    Checkpoints(tmp_path / "c").save(full_checkpoint, "job")
     assert_same(full_checkpoint, load_checkpoint(tmp_path / "c", "job"))
 
 
@@ -114,24 +113,24 @@ def test_refinement_round_trips(full_checkpoint: Checkpoint, tmp_path: Path) -> 
     pieces = torch.tensor([[1, 1, 1], [3, 1, 1]], dtype=torch.uint8)
     refinement = Refinement(pieces, 1, 4, 1 / 3, 44.4, 41.1, 2, torch.rand(4, 3))
     refined = replace(full_checkpoint, plan=replace(full_checkpoint.plan, refinement=refinement))
-    save_checkpoint(tmp_path / "c", refined, "job")
+    Checkpoints(tmp_path / "c").save(refined, "job")
     checkpoint = load_checkpoint(tmp_path / "c", "job")
     assert_same(refined, checkpoint)
     assert checkpoint.plan.refinement is not None
 
 
 def test_checkpoint_of_an_earlier_version_is_refused(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
-    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"7"', b'"version":"6"'))
+    Checkpoints(tmp_path / "c").save(full_checkpoint, "job")
+    (tmp_path / "c").write_bytes((tmp_path / "c").read_bytes().replace(b'"version":"8"', b'"version":"7"'))
     with pytest.raises(CheckpointError, match="another version of this program"):
         load_checkpoint(tmp_path / "c", "job")
 
 
 def test_storage_format_of_losses_is_stable(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
+    Checkpoints(tmp_path / "c").save(full_checkpoint, "job")
     with safe_open(tmp_path / "c", "pt") as file:
         metadata = file.metadata()
-    history = json.loads(metadata["history"])
+    history = json.loads(metadata["values"])["history"]
     stored = {"gram": 1.5, "mean": 2.5e-30, "std": 1 / 3, "content": 0.0}
     assert stored.items() <= history[1].pop("terms")["0"].items()
     assert history[1] == {
@@ -150,7 +149,7 @@ def test_missing_loss_term_is_0(full_checkpoint: Checkpoint, tmp_path: Path, mon
     last = list(TERMS)[-1]
     with monkeypatch.context() as patch:
         patch.delitem(TERMS, last)  # undoing the patch restores the order
-        save_checkpoint(tmp_path / "c", with_terms(full_checkpoint, gram=1.0, mean=2.0, std=3.0), "job")
+        Checkpoints(tmp_path / "c").save(with_terms(full_checkpoint, gram=1.0, mean=2.0, std=3.0), "job")
     (record,) = load_checkpoint(tmp_path / "c", "job").state.history
     assert record.terms == {0: LossTerms(gram=1.0, mean=2.0, std=3.0)}
     assert record.terms[0][last] == 0
@@ -162,7 +161,7 @@ def test_unknown_loss_term_is_refused_by_name(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setitem(TERMS, "later", "a term of a later version")
-        save_checkpoint(tmp_path / "c", with_terms(full_checkpoint, gram=1.0, later=2.0), "job")
+        Checkpoints(tmp_path / "c").save(with_terms(full_checkpoint, gram=1.0, later=2.0), "job")
     with pytest.raises(CheckpointError, match="the loss has no term later"):
         load_checkpoint(tmp_path / "c", "job")
 
@@ -181,13 +180,13 @@ def flipped(data: bytes, at: int) -> bytes:
         lambda data: b"no checkpoint at all",
         lambda data: b"\xff" * 8 + data[8:],
         lambda data: flipped(data, len(data) - 10),
-        lambda data: flipped(data, data.index(b'"seconds"') + 15),
-        lambda data: data.replace(b'"step":"2"', b'"step":"3"'),
+        lambda data: flipped(data, data.index(b"seconds") + 15),
+        lambda data: data.replace(rb"\"step\": 2", rb"\"step\": 3"),
     ],
 )
 def test_damaged_file_is_refused(full_checkpoint: Checkpoint, tmp_path: Path, damage: Any) -> None:
     path = tmp_path / "c"
-    save_checkpoint(path, full_checkpoint, "job")
+    Checkpoints(path).save(full_checkpoint, "job")
     before = path.read_bytes()
     path.write_bytes(damage(before))
     assert path.read_bytes() != before
@@ -216,7 +215,8 @@ def test_previous_checkpoint_replaces_an_unusable_one(full_checkpoint: Checkpoin
     elif spoil == "missing":
         checkpoints.latest.unlink()
     else:
-        save_checkpoint(checkpoints.latest, full_checkpoint, "another job")
+        Checkpoints(tmp_path / "other").save(full_checkpoint, "another job")
+        (tmp_path / "other").replace(checkpoints.latest)
     warnings: list[str] = []
     assert checkpoints.load("job", warnings.append).state.step == 2
     assert len(warnings) == 1
@@ -257,7 +257,7 @@ def test_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_other_jobs_and_missing_files_are_refused(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", full_checkpoint, "job")
+    Checkpoints(tmp_path / "c").save(full_checkpoint, "job")
     with pytest.raises(CheckpointError, match="another job"):
         load_checkpoint(tmp_path / "c", "other")
     with pytest.raises(CheckpointError, match="no checkpoint"):
@@ -266,25 +266,25 @@ def test_other_jobs_and_missing_files_are_refused(full_checkpoint: Checkpoint, t
 
 def test_missing_folder_is_an_output_error(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     with pytest.raises(OutputError):
-        save_checkpoint(tmp_path / "missing" / "c", full_checkpoint, "job")
+        Checkpoints(tmp_path / "missing" / "c").save(full_checkpoint, "job")
 
 
 def test_fingerprint_distinguishes_jobs() -> None:
     scene, views, image, settings = wall(), cameras(), style(), make_settings()
-    base = fingerprint(scene, views, image, settings, "w")
-    assert base == fingerprint(wall(), cameras(), style(), make_settings(), "w")
+    base = fingerprint(scene, views, Style.of(image), settings, "w")
+    assert base == fingerprint(wall(), cameras(), Style.of(style()), make_settings(), "w")
     moved = scene.means.clone()
     moved[-1, 2] = torch.nextafter(moved[-1, 2], torch.tensor(9.0))
     others = [
-        fingerprint(replace(scene, means=moved), views, image, settings, "w"),
-        fingerprint(scene, views[::-1], image, settings, "w"),
-        fingerprint(scene, [replace(views[0], fx=65.0), *views[1:]], image, settings, "w"),
-        fingerprint(scene, views, image.transpose(0, 1), settings, "w"),
-        fingerprint(scene, views, image.reshape(80, 96, 3), settings, "w"),
-        fingerprint(scene, views, image, make_settings(seed=1), "w"),
-        fingerprint(scene, views, image, make_settings(background=(1, 1, 1)), "w"),
-        fingerprint(scene, views, image, settings, "v"),
-        fingerprint(scene, views, image, settings, "w", "photos"),
+        fingerprint(replace(scene, means=moved), views, Style.of(image), settings, "w"),
+        fingerprint(scene, views[::-1], Style.of(image), settings, "w"),
+        fingerprint(scene, [replace(views[0], fx=65.0), *views[1:]], Style.of(image), settings, "w"),
+        fingerprint(scene, views, Style.of(image.transpose(0, 1)), settings, "w"),
+        fingerprint(scene, views, Style.of(image.reshape(80, 96, 3)), settings, "w"),
+        fingerprint(scene, views, Style.of(image), make_settings(seed=1), "w"),
+        fingerprint(scene, views, Style.of(image), make_settings(background=(1, 1, 1)), "w"),
+        fingerprint(scene, views, Style.of(image), settings, "v"),
+        fingerprint(scene, views, Style.of(image), settings, "w", "photos"),
     ]
     assert len({base, *others}) == len(others) + 1
 
@@ -294,7 +294,7 @@ def test_fingerprint_distinguishes_jobs() -> None:
 def test_fingerprint_depends_on_the_feature_scale_factors(
     scale: str, same: bool, factor: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job = (wall(), cameras(), style(), make_settings(feature_scale=scale), "w")
+    job = (wall(), cameras(), Style.of(style()), make_settings(feature_scale=scale), "w")
     before = fingerprint(*job)
     monkeypatch.setattr(checkpoint, factor, 8.0)
     assert (fingerprint(*job) == before) == same
@@ -303,13 +303,15 @@ def test_fingerprint_depends_on_the_feature_scale_factors(
 def test_fingerprint_ignores_budgets() -> None:
     scene, views, image = wall(), cameras(), style()
     free = make_settings(max_seconds=3, memory_limit=10**9, measure=0.0)
-    assert fingerprint(scene, views, image, free, "w") == fingerprint(scene, views, image, make_settings(), "w")
+    assert fingerprint(scene, views, Style.of(image), free, "w") == fingerprint(
+        scene, views, Style.of(image), make_settings(), "w"
+    )
 
 
 def test_fingerprint_distinguishes_styles_and_their_weights() -> None:
     scene, views, settings = wall(), cameras(), make_settings()
     images = [style(), style().flip(0)]
-    alone = fingerprint(scene, views, style(), settings, "w")
+    alone = fingerprint(scene, views, Style.of(style()), settings, "w")
     assert fingerprint(scene, views, Style.weighted(images[:1], [3]), settings, "w") == alone
     mixtures = [([0, 1], [1, 1]), ([0, 1], [1, 2]), ([1, 0], [1, 2])]
     fingerprints = {

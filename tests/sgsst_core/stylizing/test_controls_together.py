@@ -42,8 +42,8 @@ def stylized(stylizer: Stylizer) -> torch.Tensor:
 
 def test_frozen_gaussians_are_not_split_and_children_keep_regions(tiny_weights: BackboneWeights) -> None:
     settings, regions = make_settings("preview", refine=2.0), halves()
-    free = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights)
-    refinement = refine(large_wall(), cameras(), style(), settings, weights=tiny_weights, regions=regions)
+    free = refine(large_wall(), cameras(), Style.of(style()), settings, weights=tiny_weights)
+    refinement = refine(large_wall(), cameras(), Style.of(style()), settings, weights=tiny_weights, regions=regions)
     assert free is not None
     assert refinement is not None
     assert bool((piece_counts(free.pieces)[regions.frozen] > 1).any()), "nothing is proved"

@@ -19,6 +19,7 @@ from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import Sources, build_report
 from sgsst_core.settings import PlannedBackground, make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
@@ -76,7 +77,7 @@ def make(
         uncached=rasterizer,
         graphs=graphs,
     )
-    return Stylizer(prepare_job(plan, scene, views, style(), settings, weights=weights))
+    return Stylizer(prepare_job(plan, scene, views, Style.of(style()), settings, weights=weights))
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ def in_bfloat16(weights: BackboneWeights) -> Stylizer:
     scene, settings = wall(60, 40), settings_of()
     plan, _ = make_plan(scene, cameras(), settings, weights=weights)
     return Stylizer(
-        prepare_job(replace(plan, precision="bfloat16"), scene, cameras(), style(), settings, weights=weights)
+        prepare_job(replace(plan, precision="bfloat16"), scene, cameras(), Style.of(style()), settings, weights=weights)
     )
 
 
@@ -90,7 +90,9 @@ def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights) -> None:
         first.run_step()
         first.stylized()  # as for a preview
     again = Stylizer(
-        prepare_job(first.job.plan, wall(60, 40), cameras(), style(), first.job.settings, weights=tiny_weights)
+        prepare_job(
+            first.job.plan, wall(60, 40), cameras(), Style.of(style()), first.job.settings, weights=tiny_weights
+        )
     )
     again.load_state(first.state())
     run(again)

@@ -20,7 +20,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
 from sgsst_core.stylizing.job_styles import prepared_style
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.optimizer import ColorOptimizer
@@ -184,7 +184,7 @@ def test_resumed_run_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: A
     for _ in range(3):
         first.run_step()
     path = tmp_path / "checkpoint.safetensors"
-    save_checkpoint(path, Checkpoint(first.state(), first.job.plan, 1, "run", versions()), "job")
+    Checkpoints(path).save(Checkpoint(first.state(), first.job.plan, 1, "run", versions()), "job")
     second.load_state(load_checkpoint(path, "job").state)
     run(second)
     assert torch.equal(whole.stylized(), second.stylized())

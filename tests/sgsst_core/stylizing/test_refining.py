@@ -16,6 +16,7 @@ from sgsst_core.refine.choice import LEAST_PSNR, Footprints
 from sgsst_core.refine.split import Refinement, parents_of, piece_counts
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import Settings, make_settings
+from sgsst_core.style import Style
 from sgsst_core.stylizing import refining
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.refining import disagreement, refine, refined, render, spread_evenly
@@ -47,7 +48,7 @@ def settings(**values: object) -> Settings:
 
 
 def refinement_of(weights: BackboneWeights, factor: float, scene: Scene | None = None) -> Refinement:
-    refinement = refine(scene or large_wall(), cameras(), style(), settings(refine=factor), weights=weights)
+    refinement = refine(scene or large_wall(), cameras(), Style.of(style()), settings(refine=factor), weights=weights)
     assert refinement is not None
     return refinement
 
@@ -110,7 +111,7 @@ def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights)
 
 def test_auto_splits_only_what_is_too_large_for_strokes(tiny_weights: BackboneWeights) -> None:
     scene, views = large_wall(), cameras()
-    refinement = refine(scene, views, style(), settings(refine="auto"), weights=tiny_weights)
+    refinement = refine(scene, views, Style.of(style()), settings(refine="auto"), weights=tiny_weights)
     assert refinement is not None
     assert refinement.size is not None
     assert refinement.size >= choice.STROKE_SIZE
@@ -128,7 +129,7 @@ def test_auto_computes_no_gradient_if_no_gaussian_is_large(tiny_weights: Backbon
     refinement = refine(
         small,
         cameras(),
-        style(),
+        Style.of(style()),
         settings(refine="auto"),
         weights=tiny_weights,
         show=lambda now: reports.append(now.step),
@@ -155,12 +156,12 @@ def test_splits_that_would_change_the_image_are_undone(
 
 def test_factor_of_one_turns_refinement_off(tiny_weights: BackboneWeights) -> None:
     scene = large_wall()
-    assert refine(scene, cameras(), style(), settings(refine=1), weights=tiny_weights) is None
+    assert refine(scene, cameras(), Style.of(style()), settings(refine=1), weights=tiny_weights) is None
     assert refined(scene, None) is scene
 
 
 def test_cameras_that_see_nothing_cause_no_splits(tiny_weights: BackboneWeights) -> None:
-    refinement = refine(ball(), [blind_camera()], style(), settings(refine=2), weights=tiny_weights)
+    refinement = refine(ball(), [blind_camera()], Style.of(style()), settings(refine=2), weights=tiny_weights)
     assert refinement is not None
     assert refinement.split == 0
 
@@ -186,7 +187,7 @@ def test_refinement_reports_its_progress(tiny_weights: BackboneWeights) -> None:
     refine(
         large_wall(),
         cameras(),
-        style(),
+        Style.of(style()),
         settings(refine=2.0),
         weights=tiny_weights,
         show=lambda now: reports.append((now.stage, now.step, now.total)),
@@ -213,7 +214,7 @@ def on_a_rank(collectives: object, factor: float) -> Refinement | None:
     return refine(
         large_wall(),
         cameras(),
-        style(),
+        Style.of(style()),
         settings(refine=factor),
         weights=weights,
         collectives=collectives,  # type: ignore[arg-type]

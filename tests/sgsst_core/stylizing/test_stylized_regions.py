@@ -21,7 +21,7 @@ from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.checkpoint import Checkpoint, fingerprint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, fingerprint, load_checkpoint, versions
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.result_colors import neighbors_change_by_region, transferred_colors
@@ -207,11 +207,17 @@ def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: P
     run(whole)
     for _ in range(3):
         first.run_step()
-    save_checkpoint(tmp_path / "c", Checkpoint(first.state(), first.job.plan, 1, "r", versions()), "job")
+    Checkpoints(tmp_path / "c").save(Checkpoint(first.state(), first.job.plan, 1, "r", versions()), "job")
     checkpoint = load_checkpoint(tmp_path / "c", "job")
     again = Stylizer(
         prepare_job(
-            checkpoint.plan, scene, cameras(), style(), first.job.settings, weights=tiny_weights, regions=regions
+            checkpoint.plan,
+            scene,
+            cameras(),
+            Style.of(style()),
+            first.job.settings,
+            weights=tiny_weights,
+            regions=regions,
         )
     )
     again.load_state(checkpoint.state)
@@ -229,9 +235,9 @@ def test_fingerprint_depends_on_regions() -> None:
     right = regions.every[1]
     others = [replace(right, **{name: value}) for name, value in _OTHER_TREATMENT.items()]
     every = [None, regions, moved, *(replace(regions, every=(regions.every[0], other)) for other in others)]
-    fingerprints = [fingerprint(scene, views, style(), settings, "w", "", each) for each in every]
+    fingerprints = [fingerprint(scene, views, Style.of(style()), settings, "w", "", each) for each in every]
     assert len(set(fingerprints)) == len(every)
-    assert fingerprints[0] == fingerprint(scene, views, style(), settings, "w")
+    assert fingerprints[0] == fingerprint(scene, views, Style.of(style()), settings, "w")
 
 
 def test_float32_reference_has_the_same_regions(tiny_weights: BackboneWeights) -> None:

@@ -21,7 +21,8 @@ from sgsst_core.rasterizer.tile_intersections import TileIntersections, build_ti
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, make_settings
-from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.style import Style
+from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
@@ -77,7 +78,7 @@ def test_tile_intersections_of_the_survey_are_reused(
     results = []
     for given in (planning_context, None):
         stylizer = Stylizer(
-            prepare_job(plan, scene, views, style(), settings, weights=tiny_weights, planning_context=given)
+            prepare_job(plan, scene, views, Style.of(style()), settings, weights=tiny_weights, planning_context=given)
         )
         run(stylizer)
         results.append(stylizer.stylized())
@@ -95,7 +96,7 @@ def test_resumed_run_is_bit_identical(tiny_weights: BackboneWeights, scene: Scen
         stopped.run_step()
     assert stopped.state().queue
     checkpoint = Checkpoint(stopped.state(), stopped.job.plan, 1, "run", versions())
-    save_checkpoint(tmp_path / "c.safetensors", checkpoint, "job")
+    Checkpoints(tmp_path / "c.safetensors").save(checkpoint, "job")
     resumed = make(tiny_weights, scene, steps_sos=8)
     resumed.load_state(load_checkpoint(tmp_path / "c.safetensors", "job").state)
     assert run(resumed) == "finished"

@@ -15,7 +15,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, versions
+from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -149,7 +149,7 @@ def test_repeated_and_resumed_runs_are_bit_identical(tiny_weights: BackboneWeigh
     stopped = make(tiny_weights, ball(), training_background=kind, seed=3)
     for _ in range(4):
         stopped.run_step()
-    save_checkpoint(tmp_path / "c", Checkpoint(stopped.state(), stopped.job.plan, 1, "run", versions()), "job")
+    Checkpoints(tmp_path / "c").save(Checkpoint(stopped.state(), stopped.job.plan, 1, "run", versions()), "job")
     loaded = load_checkpoint(tmp_path / "c", "job")
     assert (loaded.plan.training_background, loaded.plan.warm_start) == (kind, True)
     resumed.load_state(loaded.state)
