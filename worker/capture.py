@@ -15,11 +15,10 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.images import WHITE, Color
-from sgsst_core.files.photos import MOST_MISSING, Photo, PhotoFolder, check_photos, photo_size, some_names
+from sgsst_core.files.photos import MAX_MISSING, Photo, PhotoFolder, check_photos, photo_size, some_names
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
-from sgsst_core.orbit.subject import find_subject
-from sgsst_core.orbit.up import find_up
+from sgsst_core.orbit.subject import find_subject, find_up
 from sgsst_core.planning.capture_checks import compare_photos, frame_warnings
 from sgsst_core.planning.shown import shown_by
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread, undistorted
@@ -80,7 +79,7 @@ class Capture:
         lines = [*_about_undistorted(cameras, min(widths, default=1.0)), *_about_photos(sizes, photos, missing)]
         if strangers := PhotoFolder(folder).strangers(self.names):
             reason = f"they have the name of no camera: {some_names(strangers)}"
-            mostly = len(strangers) > MOST_MISSING * (len(strangers) + len(photos))
+            mostly = len(strangers) > MAX_MISSING * (len(strangers) + len(photos))
             text = f"{'warning: ' if mostly else ''}{len(strangers)} files are not used"
             lines.append(Decision("photos", text, reason))
         return Capture(cameras, self.orbit, self.names, sizes, photos, (*self.decisions, *lines))

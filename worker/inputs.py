@@ -166,7 +166,7 @@ def load_styles(files: Sequence[StyleFile], background: Color = WHITE) -> Style:
     sizes = [math.prod(image_size(file.path)) for file in files]
     most = STYLE_PIXELS // len(files) if sum(sizes) > STYLE_PIXELS else STYLE_PIXELS
     notes += [_REDUCED.format(file.path.name) for file, size in zip(files, sizes, strict=True) if size > most]
-    images = tuple(load_image(file.path, background=background, warn=notes.append, most_pixels=most) for file in files)
+    images = tuple(load_image(file.path, background=background, warn=notes.append, max_pixels=most) for file in files)
     return Style(images, weights, names, tuple(notes))
 
 

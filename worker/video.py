@@ -14,8 +14,7 @@ from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit.cameras import ELEVATION, turntable
-from sgsst_core.orbit.subject import find_subject
-from sgsst_core.orbit.up import find_up
+from sgsst_core.orbit.subject import find_subject, find_up
 from sgsst_core.quality.float32_reference import rasterizer_beside
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.video import Layer, write_frames

@@ -40,8 +40,8 @@ from sgsst_core.decision import warnings_of
 from sgsst_core.errors import CameraError, InvalidInputError, MaskError, SettingsError, SgsstError, WeightsError
 from sgsst_core.features import pooling_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.features.network_weights import list_network_weights, load_network_weights
+from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.blending import blend_scenes, encode_blend
-from sgsst_core.files.cache_folder import cache_folder
 from sgsst_core.files.formats import format_of_name, read_scene_header
 from sgsst_core.files.images import image_size, load_image
 from sgsst_core.files.photos import check_names

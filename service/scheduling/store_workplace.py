@@ -33,7 +33,7 @@ from service.scheduling.publishing import Outbox, put_patiently
 from service.settings import ServiceSettings
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
-from sgsst_core.files.cache_folder import cache_folder
+from sgsst_core.features.weight_files import cache_folder
 from worker.ranks.cluster import scene_bytes
 from worker.ranks.rank import Stored
 

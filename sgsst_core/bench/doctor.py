@@ -114,8 +114,8 @@ def _caches() -> Iterator[Finding]:
     """Yield a finding for each folder that cannot be written; if all can be, a single finding."""
     from sgsst_core.compiled import kernel_folders
     from sgsst_core.errors import OutputError
+    from sgsst_core.features.weight_files import cache_folder
     from sgsst_core.files.atomic import ensure_writable_folder
-    from sgsst_core.files.cache_folder import cache_folder
 
     importlib.import_module("sgsst_core.rasterizer.kernels")  # registers the folder of its compiled kernels
     triton = Path(os.environ.get("TRITON_CACHE_DIR") or Path(os.environ.get("TRITON_HOME") or Path.home()) / ".triton")

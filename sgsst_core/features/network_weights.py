@@ -27,8 +27,8 @@ from sgsst_core.features.weight_files import (
     verify,
     weights_file,
 )
+from sgsst_core.features.weight_files import cache_folder as cache_folder
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.cache_folder import cache_folder as cache_folder
 
 _DEFAULT_SOURCE = dict.fromkeys(FETCHED_WITH, PACKAGE_SOURCE) | {"vgg19": sources.VGG19_URL}
 #: Sources of known files by digest. File names do not identify the source, because users may rename files.

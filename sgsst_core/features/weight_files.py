@@ -1,16 +1,17 @@
-"""Paths and verification of installed network weights. Does not import PyTorch."""
+"""Folder, paths and verification of installed network weights. Does not import PyTorch."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
+import os
+import sys
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from sgsst_core.errors import WeightsError
-from sgsst_core.files.cache_folder import cache_folder
 
 #: Argument of `sgsst weights fetch` that installs each set of weights.
 FETCHED_WITH = {"vgg19": "vgg19", "vgg16": "vgg16", "lpips_alex": "vgg16", "lpips_vgg16": "vgg16"}
@@ -155,3 +156,14 @@ def source_of(path: Path) -> str:
 def digest_of_bytes(content: bytes) -> str:
     """Compute the digest of a safetensors file's contents; see `digest_of`."""
     return digest_of(io.BytesIO(content))[0]
+
+
+def cache_folder() -> Path:
+    """Return the folder of network weights: $SGSST_CACHE, or `sgsst` in the platform's cache folder."""
+    if chosen := os.environ.get("SGSST_CACHE"):
+        return Path(chosen).expanduser()
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "sgsst"
+    if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
+        return Path(local) / "sgsst" / "cache"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sgsst"

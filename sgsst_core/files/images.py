@@ -66,7 +66,7 @@ def load_image(
     oriented: bool = True,
     color_managed: bool = True,
     warn: Callable[[str], None] | None = None,
-    most_pixels: int = MAX_PIXELS,
+    max_pixels: int = MAX_PIXELS,
 ) -> Tensor:
     """Read an image in one of `FORMATS` or HEIC, or the first frame of an animated one.
 
@@ -79,7 +79,7 @@ def load_image(
         oriented: Whether the EXIF orientation is applied.
         color_managed: Whether the ICC profile is applied. Masks hold no colors.
         warn: Callback for a color profile or frames that are ignored; None to issue an `ImageWarning`.
-        most_pixels: Number of pixels above which the image is reduced, by averaging squares of whole pixels, before it
+        max_pixels: Number of pixels above which the image is reduced, by averaging squares of whole pixels, before it
             is converted to floats, which take four times the memory.
 
     Returns:
@@ -100,19 +100,19 @@ def load_image(
             _check_scans(path)
         if image.format not in _STILL and getattr(image, "is_animated", False):
             warn(f"{path.name}: only its first frame is used")
-        factor = _reduction(image, most_pixels)
+        factor = _reduction(image, max_pixels)
         if factor > 1:
             image.draft(None, (image.width // factor, image.height // factor))  # JPEG is decoded at a lower resolution
         image.load()
         profile = _profile_of(path, image, warn) if color_managed else None
-        small = _reduced(image, _reduction(image, most_pixels))
+        small = _reduced(image, _reduction(image, max_pixels))
         upright = ImageOps.exif_transpose(small) if oriented else small
         return torch.from_numpy(_to_rgb(path, upright, profile, background))
 
 
-def _reduction(image: Image.Image, most_pixels: int) -> int:
+def _reduction(image: Image.Image, max_pixels: int) -> int:
     """Return the side of the squares of pixels to average, so that an image has at most so many pixels."""
-    return math.ceil(math.sqrt(image.width * image.height / most_pixels))
+    return math.ceil(math.sqrt(image.width * image.height / max_pixels))
 
 
 def _reduced(image: Image.Image, factor: int) -> Image.Image:

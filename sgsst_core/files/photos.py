@@ -21,7 +21,7 @@ from sgsst_core.scene.camera import Camera
 #: wrong or cropped photo.
 ASPECT_TOLERANCE = 0.01
 #: Largest fraction of the cameras that may lack a photo.
-MOST_MISSING = 0.5
+MAX_MISSING = 0.5
 
 _NAMES_IN_MESSAGE = 10
 
@@ -158,7 +158,7 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     by_name = (
         "Photos are found by the cameras' names, with or without extension: give the folder that holds exactly these."
     )
-    if len(missing) > MOST_MISSING * len(cameras):
+    if len(missing) > MAX_MISSING * len(cameras):
         suffixes = files.unreadable(missing)
         advice = (
             f"Files of these names are {', '.join(suffixes)}: convert them to PNG or JPEG." if suffixes else by_name

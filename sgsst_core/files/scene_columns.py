@@ -23,7 +23,7 @@ _ORDER = (*itertools.chain(*PROPERTIES.values()), "opacity")
 #: Log scale of the missing axis of flat Gaussians. In any scene, their thickness is far below rounding errors.
 FLAT = -40.0
 #: Rounding error of positions, relative to the median standard deviation of Gaussians, above which it is noted.
-MOST_ROUNDED = 0.1
+MAX_ROUNDED = 0.1
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def about_rounded_positions(means: NDArray[Any], scales: NDArray[Any]) -> tuple[
     with np.errstate(over="ignore"):
         error = 0.5 * float(np.spacing(np.nanmedian(np.abs(means), axis=0)).max())
         fraction = error / max(float(np.exp(np.nanmedian(scales))), 1e-30)
-    if not fraction > MOST_ROUNDED:
+    if not fraction > MAX_ROUNDED:
         return ()
     return (
         f"positions are rounded to float32 by up to {error:.2g}, {fraction:.1f} times the size of a typical Gaussian; "

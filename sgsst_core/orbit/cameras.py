@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.orbit.subject import Subject, find_subject
-from sgsst_core.orbit.up import USUAL_UP
+from sgsst_core.orbit.subject import USUAL_UP, Subject, find_subject
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
 
@@ -27,8 +26,8 @@ _FOCAL = 1.5
 #: Margin around the subject, as a factor of its extent in the frame.
 _MARGIN = 1.03
 #: Aspect ratios (width over height) are powers of `_STEP`, a quarter octave, so that an orbit has few different sizes.
-#: They are at most `_MOST_STEPS` steps from square, which is 4 to 1.
-_STEP, _MOST_STEPS = 2**0.25, 8
+#: They are at most `_MAX_STEPS` steps from square, which is 4 to 1.
+_STEP, _MAX_STEPS = 2**0.25, 8
 #: Minimum area of a frame as a fraction of the largest, so that stroke sizes stay within half an octave.
 _SMALLEST = 0.5
 #: Minimum distance of the subject's nearest point, as a multiple of the near plane.
@@ -260,40 +259,46 @@ def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: f
     position, target = middle + offset, middle
     half = (0.0, 0.0)
     for _ in range(5):
-        pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
-        local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
-        visible = local[local[:, 2] > near]
-        if not len(visible):
+        rotation, slopes = _slopes(subject, position, target, up, near)
+        if not len(slopes):
             break
-        slopes = (visible[:, :2] / visible[:, 2:]).clamp(-_WIDEST, _WIDEST)
-        low, high = slopes.amin(0), slopes.amax(0)
         half = (float(slopes[:, 0].abs().amax()), float(slopes[:, 1].abs().amax()))
-        aim = torch.cat([(low + high) / 2, torch.ones(1, dtype=torch.float64)])
+        aim = torch.cat([(slopes.amin(0) + slopes.amax(0)) / 2, torch.ones(1, dtype=torch.float64)])
         if float(aim[:2].abs().amax()) < 1e-3 * max(half):
             break
-        target = position + float(offset.norm()) * (pose[:3, :3].T @ aim)
-    # A single point has no extent, so give it a small one. With that of the pixel blur, it would look the same from any
-    # distance.
-    least = 1e-3 * subject.size / float(offset.norm()) + 1e-6
-    return _Frame(position, target, (_MARGIN * max(half[0], least), _MARGIN * max(half[1], least)))
+        target = position + float(offset.norm()) * (rotation.T @ aim)
+    return _Frame(position, target, _with_margin(half, subject, float(offset.norm())))
 
 
 def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> tuple[float, float]:
     """Return half the width and height at depth 1 that show a subject from a position toward a target."""
+    slopes = _slopes(subject, position, target, up, near)[1]
+    half = slopes.abs().amax(0).tolist() if len(slopes) else (0.0, 0.0)
+    return _with_margin(half, subject, float((target - position).norm()))
+
+
+def _slopes(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> tuple[Tensor, Tensor]:
+    """Return a camera's rotation [3, 3], and the x and y [n, 2] of the visible subject at depth 1."""
     pose = look_at("", position, target, up, width=1, height=1, focal=1.0).world_to_camera
     local = subject.hull @ pose[:3, :3].T + pose[:3, 3]
     visible = local[local[:, 2] > near]
-    least = 1e-3 * subject.size / float((target - position).norm()) + 1e-6  # a single point has no extent
-    if not len(visible):
-        return least, least
-    x, y = (visible[:, :2] / visible[:, 2:]).abs().amax(0).clamp_max(_WIDEST).tolist()
-    return _MARGIN * max(x, least), _MARGIN * max(y, least)
+    return pose[:3, :3], (visible[:, :2] / visible[:, 2:]).clamp(-_WIDEST, _WIDEST)
+
+
+def _with_margin(half: Sequence[float], subject: Subject, distance: float) -> tuple[float, float]:
+    """Return half extents with a margin around the subject.
+
+    A single point has no extent, so it gets a small one. With that of the pixel blur, it would look the same from any
+    distance.
+    """
+    least = 1e-3 * subject.size / distance + 1e-6
+    return _MARGIN * max(half[0], least), _MARGIN * max(half[1], least)
 
 
 def _shape(half: tuple[float, float]) -> float:
     """Return the permitted aspect ratio (width over height) that is nearest to that of the half extents."""
     steps = round(math.log(half[0] / half[1]) / math.log(_STEP))
-    return float(_STEP ** max(-_MOST_STEPS, min(_MOST_STEPS, steps)))
+    return float(_STEP ** max(-_MAX_STEPS, min(_MAX_STEPS, steps)))
 
 
 def _widened(half: tuple[float, float], shape: float) -> tuple[float, float]:

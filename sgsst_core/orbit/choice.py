@@ -12,8 +12,7 @@ from torch import Tensor
 from sgsst_core.constants import NEAR
 from sgsst_core.decision import Decision
 from sgsst_core.orbit.cameras import ELEVATION, middle_of, orbit
-from sgsst_core.orbit.subject import Subject, find_subject
-from sgsst_core.orbit.up import Up, find_up
+from sgsst_core.orbit.subject import Subject, Up, find_subject, find_up
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene, sampled
@@ -26,7 +25,7 @@ _LITTLE = 0.03
 #: Default number of views of a ring at elevation 0. All rings together then have 49 views.
 _AROUND = 16
 #: Minimum number of views per ring if there are several rings.
-_LEAST_VIEWS = 6
+_MIN_VIEWS = 6
 #: Fraction of its largest visible area from which on a surface counts as fully seen: that of a surface rotated by 45
 #: degrees.
 _ENOUGH = 0.7
@@ -98,7 +97,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
     subject = find_subject(scene)
     up = find_up(subject) if request.up is None else _requested_up(request.up)
     first = ELEVATION if request.elevation is None else request.elevation
-    rings = request.count // _LEAST_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
+    rings = request.count // _MIN_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
     tried = [first]
     if request.elevation is None and rings > 1:
         alone = not up.ground and subject.left_out <= _OUTSIDE
@@ -109,7 +108,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
     elevations = tuple(tried[ring] for ring in chosen)
     count = request.count
     if count is None:
-        count = sum(max(_LEAST_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
+        count = sum(max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
     cameras = trial.cameras(count, elevations)
     radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())
     hidden = [fraction < _SHOWS for ring in chosen for fraction in views[ring].subject]

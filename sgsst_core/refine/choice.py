@@ -10,29 +10,29 @@ import torch
 from torch import Tensor
 
 from sgsst_core.decision import Decision
-from sgsst_core.refine.split import MOST_PIECES, Refinement, piece_counts, pieces_to
+from sgsst_core.refine.split import MAX_PIECES, Refinement, piece_counts, pieces_to
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rotations import rotations
 from sgsst_core.settings import Settings
 
 #: Minimum PSNR of the unstylized image in dB, in each measured view.
-LEAST_PSNR = 40.0
+MIN_PSNR = 40.0
 #: Candidate target sizes: projected standard deviations in pixels, coarsest first. A Gaussian below the last one is
 #: hardly larger than a pixel.
 SIZES = tuple(256 * 2 ** (-step / 4) for step in range(30))
 #: Size of the finest strokes: with "auto", Gaussians are not split to smaller ones.
 STROKE_SIZE = 4.0
 #: Minimum total blend weight of a Gaussian over all views, in pixels; smaller ones are too small for a stroke.
-_LEAST_WEIGHT = 8.0
+_MIN_WEIGHT = 8.0
 #: Maximum number of children: those of a flat Gaussian split into the most pieces along both axes.
-_MOST_CHILDREN = MOST_PIECES**2
+_MAX_CHILDREN = MAX_PIECES**2
 #: Maximum ratio of a Gaussian's deviation to its distance from a camera that shows it. Beyond it, pieces would be
 #: projected elsewhere than the unsplit Gaussian, whose projection linearizes the perspective at its center.
 _LARGEST_REACH = 1.0
 #: Minimum fraction of the gradient's magnitude under a Gaussian that cancels in its sum. Below it, the Gaussian needs
 #: only one color.
-_LEAST_DISAGREEMENT = 0.1
+_MIN_DISAGREEMENT = 0.1
 #: Number of Gaussians whose sizes are computed at a time; takes some tens of megabytes in float64.
 _CHUNK = 1 << 17
 
@@ -110,18 +110,18 @@ def candidates(footprints: Footprints, splittable: Tensor, cancels: Tensor, magn
         cancels: [N], portion of the gradient that cancels, summed over all views; see `disagreement`.
         magnitude: [N], total of the gradient's magnitude, summed over all views; see `disagreement`.
     """
-    disagree = cancels > _LEAST_DISAGREEMENT * magnitude
-    large = footprints.weights >= _LEAST_WEIGHT
+    disagree = cancels > _MIN_DISAGREEMENT * magnitude
+    large = footprints.weights >= _MIN_WEIGHT
     return splittable & disagree & large & (footprints.reach <= _LARGEST_REACH)
 
 
-def most_children(weights: Tensor) -> Tensor:
+def max_children(weights: Tensor) -> Tensor:
     """Return the maximum number of children of each Gaussian, [N]; smaller children would be too small for a stroke.
 
     Args:
         weights: [N], blend weights over all pixels of all views.
     """
-    return (weights / _LEAST_WEIGHT).clamp(1, _MOST_CHILDREN)
+    return (weights / _MIN_WEIGHT).clamp(1, _MAX_CHILDREN)
 
 
 def choose_pieces(
@@ -137,7 +137,7 @@ def choose_pieces(
         lengths: [N, 3], see `Footprints`.
         allowed: [N] bool, Gaussians that may be split.
         cancels: [N], see `disagreement`.
-        most: [N], maximum number of children, see `most_children`.
+        most: [N], maximum number of children, see `max_children`.
         budget: Maximum total number of Gaussians.
         finest: Smallest target size in pixels.
 

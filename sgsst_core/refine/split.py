@@ -35,8 +35,8 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rotations import rotations
 
 #: Maximum number of pieces along one axis. Isotropic Gaussians get at most a third as many per axis, because the number
-#: of their children is limited too (`choice.most_children`).
-MOST_PIECES = 32
+#: of their children is limited too (`choice.max_children`).
+MAX_PIECES = 32
 #: K pieces are smaller than the parent by the factor r = _SLOPE K + _START, for which the mixture is within 3 % of the
 #: parent.
 _SLOPE, _START = 0.35, 0.33
@@ -122,13 +122,13 @@ def split(scene: Scene, pieces: Tensor) -> Scene:
 
     Args:
         scene: Scene with N Gaussians.
-        pieces: [N, 3] uint8, 1 or 3 to `MOST_PIECES`; more than 1 only for Gaussians with `can_be_split`.
+        pieces: [N, 3] uint8, 1 or 3 to `MAX_PIECES`; more than 1 only for Gaussians with `can_be_split`.
 
     Raises:
         ValueError: If `pieces` has another shape or value, or a Gaussian cannot be split.
     """
     if pieces.shape != (len(scene), 3) or not bool(_is_number_of_pieces(pieces).all()):
-        raise ValueError(f"pieces must be [{len(scene)}, 3] of 1, 3 to {MOST_PIECES}")
+        raise ValueError(f"pieces must be [{len(scene)}, 3] of 1, 3 to {MAX_PIECES}")
     counts = piece_counts(pieces)
     parents = (counts > 1).nonzero()[:, 0]
     if not len(parents):
@@ -154,7 +154,7 @@ def pieces_to(lengths: Tensor, size: Tensor | float) -> Tensor:
         lengths: [n, 3].
         size: Positive target length; a number, or [n, 1].
     """
-    numbers = torch.tensor([1, *range(3, MOST_PIECES + 1)], dtype=torch.uint8)
+    numbers = torch.tensor([1, *range(3, MAX_PIECES + 1)], dtype=torch.uint8)
     ratios = torch.tensor([1.0, *(ratio_of(int(number)) for number in numbers[1:])], dtype=torch.float64)
     index = torch.searchsorted(ratios, (lengths.double() / size).contiguous())
     return numbers[index.clamp_max(len(numbers) - 1)]
@@ -167,7 +167,7 @@ def ratio_of(number: int) -> float:
 
 @functools.cache
 def split_axis(number: int) -> AxisSplit:
-    """Return the division of an axis into `number` pieces, which is 1, or 3 to `MOST_PIECES`."""
+    """Return the division of an axis into `number` pieces, which is 1, or 3 to `MAX_PIECES`."""
     if number == 1:
         return AxisSplit(1.0, np.zeros(1), np.ones(1))
     ratio = ratio_of(number)
@@ -219,15 +219,15 @@ def _normalized_weights(squares: NDArray[np.float64], slope: float) -> NDArray[n
 
 
 def _is_number_of_pieces(pieces: Tensor) -> Tensor:
-    return (pieces == 1) | ((pieces >= 3) & (pieces <= MOST_PIECES))
+    return (pieces == 1) | ((pieces >= 3) & (pieces <= MAX_PIECES))
 
 
 @functools.cache
 def _tables() -> tuple[Tensor, Tensor, Tensor]:
     """Return tables indexed by piece count: child offsets [P + 1, P], log(w r) [P + 1, P] and log(r) [P + 1]."""
-    offsets, log_weights = torch.zeros(2, MOST_PIECES + 1, MOST_PIECES, dtype=torch.float64)
-    ratios = torch.zeros(MOST_PIECES + 1, dtype=torch.float64)
-    for number in (1, *range(3, MOST_PIECES + 1)):
+    offsets, log_weights = torch.zeros(2, MAX_PIECES + 1, MAX_PIECES, dtype=torch.float64)
+    ratios = torch.zeros(MAX_PIECES + 1, dtype=torch.float64)
+    for number in (1, *range(3, MAX_PIECES + 1)):
         division = split_axis(number)
         offsets[number, :number] = torch.from_numpy(division.offsets)
         log_weights[number, :number] = torch.from_numpy(np.log(division.weights * division.ratio))

@@ -30,7 +30,7 @@ from sgsst_core.planning.context import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.refine.choice import LEAST_PSNR, Footprints, candidates, choose_pieces, finest_size, most_children
+from sgsst_core.refine.choice import MIN_PSNR, Footprints, candidates, choose_pieces, finest_size, max_children
 from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
@@ -146,7 +146,7 @@ class _Refining:
             return nothing
         cancels, magnitude = self._gradient_disagreement(spread_evenly(covered, GRADIENT_VIEWS))
         allowed = candidates(self._footprints, self._may_be_split(), cancels, magnitude)
-        budget, most = math.floor(self._settings.growth * count), most_children(self._footprints.weights)
+        budget, most = math.floor(self._settings.growth * count), max_children(self._footprints.weights)
         pieces, size = self._collectives.broadcast(
             lambda: choose_pieces(lengths, allowed, cancels, most, budget, finest)
         )
@@ -180,7 +180,7 @@ class _Refining:
             if not bool((pieces > 1).any()):
                 break
             change = self._change(pieces, fitted, views)
-            if change.lowest >= LEAST_PSNR:
+            if change.lowest >= MIN_PSNR:
                 return pieces, change
             pieces = self._collectives.broadcast(partial(self._undo_the_worst, pieces, change))
         return torch.ones_like(pieces), None

@@ -19,7 +19,7 @@ DRIFT_STEPS = 50
 #: preparation.
 BALANCE_STEPS = 6
 #: Minimum ratio of the fastest to the slowest rank at which the work is redivided.
-LEAST_IMBALANCE = 1.15
+MIN_IMBALANCE = 1.15
 
 _NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics", "matching")
 
@@ -90,6 +90,6 @@ class Team:
         self._pace = None
         speeds = self.group.all_gather(rates[len(rates) // 2] if rates else 0.0)
         known = [speed for speed in speeds if speed > 0]
-        if max(known) <= LEAST_IMBALANCE * min(known):
+        if max(known) <= MIN_IMBALANCE * min(known):
             return None
         return tuple(speed or sum(known) / len(known) for speed in speeds)

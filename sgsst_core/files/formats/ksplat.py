@@ -41,7 +41,7 @@ _TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", 
 #: Default of the largest position step and of the range of SH coefficients at level 2.
 _STEPS, _RANGE = 32767, 1.5
 #: Log scale of those that 16-bit floats round to 0: half of the smallest positive one.
-_LEAST_LOG_SCALE = math.log(2.0**-25)
+_MIN_LOG_SCALE = math.log(2.0**-25)
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
                 into["means"][block] = positions
                 scales = logarithms(file.path, rows["scale"].astype(np.float64))
-                into["scales"][block] = np.maximum(scales, _LEAST_LOG_SCALE) if header.level else scales
+                into["scales"][block] = np.maximum(scales, _MIN_LOG_SCALE) if header.level else scales
                 into["quats"][block] = rows["rotation"]
                 into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
                 into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]

@@ -80,7 +80,7 @@ class PlyElement:
         """Return the dtype of a row in a binary file; only for elements without lists."""
         return np.dtype([(prop.name, byte_order + prop.kind) for prop in self.properties])
 
-    def least_row_bytes(self, text: bool) -> int:
+    def min_row_bytes(self, text: bool) -> int:
         """Return the minimum bytes of a row. Text values have at least a digit and a separator; lists may be empty."""
         if text:
             return 2 * len(self.properties)
@@ -220,7 +220,7 @@ def check_length(path: Path, header: PlyHeader) -> None:
     Raises:
         SceneError: If the file is shorter than declared.
     """
-    least = sum(element.count * element.least_row_bytes(header.text) for element in header.elements)
+    least = sum(element.count * element.min_row_bytes(header.text) for element in header.elements)
     data = path.stat().st_size - len(header.raw)
     if least - (1 if header.text else 0) > data:  # the last line may lack its line end
         declared = ", ".join(f"{element.count} {element.name}" for element in header.elements)

@@ -34,7 +34,7 @@ _BLANKS, _PADDING = b" \t\r\n\x1a", b"\0 \t\r\n\x1a"
 #: Maximum bytes of padding, and of data that are searched for traces of a transfer as text.
 _MAX_PADDING, _SAMPLE_BYTES = 1 << 16, 1 << 20
 #: Least number of line ends that show a transfer as text if all of them are CR LF.
-_LEAST_LINE_ENDS = 8
+_MIN_LINE_ENDS = 8
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,7 @@ def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: i
         return
     data = _bytes(path, header_bytes, min(start, header_bytes + _SAMPLE_BYTES))
     line_ends = data.count(b"\n")
-    changed = newline == b"\r\n" or (line_ends == data.count(b"\r\n") and line_ends >= _LEAST_LINE_ENDS)
+    changed = newline == b"\r\n" or (line_ends == data.count(b"\r\n") and line_ends >= _MIN_LINE_ENDS)
     blank = not _bytes(path, start, min(end, start + _MAX_PADDING)).strip(_BLANKS)
     if (changed and not blank) or _is_utf8(data):
         surplus = number_of(end - start, "byte")

@@ -80,7 +80,7 @@ _MAX_SIDE = 16383
 _PALETTE_COLUMNS = 64
 _MAX_PALETTE = 1 << 16
 #: Number of vectors below which a palette is not worth its loss.
-_LEAST_PALETTE = 1 << 14
+_MIN_PALETTE = 1 << 14
 _PALETTE_PIXELS = _MAX_PALETTE * COEFFICIENTS[3]
 _COEFFICIENTS_BY_WIDTH = {_PALETTE_COLUMNS * number: number for number in COEFFICIENTS.values() if number}
 #: Alpha of the rotations' image for w as the omitted component; x, y and z follow.
@@ -301,16 +301,12 @@ def _dimensions(path: Path, files: _Files, name: str, least: int, most: int | No
         size = int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
     if size is None or head[:4] != b"RIFF" or head[8:12] != b"WEBP":
         raise SceneError(f"{path}: {name} is not a lossless WebP image. Export the scene again.")
-    if not least <= size[0] * size[1] <= (_most_pixels(least) if most is None else most):
+    if not least <= size[0] * size[1] <= (_PIXELS_PER_GAUSSIAN * least + _MORE_PIXELS if most is None else most):
         raise SceneError(
             f"{path}: {name} has {size[0]} x {size[1]} pixels, which do not fit {least} Gaussians: meta.json or the "
             "image is wrong. Export the scene again."
         )
     return size
-
-
-def _most_pixels(count: int) -> int:
-    return _PIXELS_PER_GAUSSIAN * count + _MORE_PIXELS
 
 
 def _pixels(path: Path, files: _Files, name: str, least: int, most: int | None = None) -> NDArray[np.uint8]:
@@ -407,7 +403,8 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
     meta |= {"model": extras.pop("model")} if "model" in extras else {}
     meta |= {"extras": extras} if extras else {}
     if coefficients:
-        vectors, labels = palette(sorted_arrays["sh_rest"].reshape(count, -1), _palette_size(count))
+        size = min(_MAX_PALETTE, max(_MIN_PALETTE, 1 << (count.bit_length() - 1)))
+        vectors, labels = palette(sorted_arrays["sh_rest"].reshape(count, -1), size)
         harmonics = value_codebook(vectors)
         vectors, merged = palette(harmonics[nearest_entries(vectors, harmonics)], len(vectors))
         labels = merged[labels]
@@ -432,11 +429,6 @@ def _encoded_positions(means: NDArray[np.float32]) -> tuple[NDArray[np.uint32], 
     values = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = values.min(axis=0), values.max(axis=0)
     return to_steps((values - low) / np.where(high > low, high - low, 1), 65535), np.stack([low, high])
-
-
-def _palette_size(count: int) -> int:
-    """Return the maximum number of vectors of a palette: 16,384 to 65,536, at most as many as Gaussians above."""
-    return min(_MAX_PALETTE, max(_LEAST_PALETTE, 1 << (count.bit_length() - 1)))
 
 
 def _webp(pixels: NDArray[np.uint8], width: int) -> bytes:

@@ -15,9 +15,9 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.scene_format import Arrays
 
 #: Fraction of values outside their range, above which they have other units.
-_MOST_OUTSIDE = 0.2
+_MAX_OUTSIDE = 0.2
 #: Number of Gaussians below which values in an unusual range say nothing, and maximum number that is sampled.
-_LEAST_GAUSSIANS, _SAMPLE = 16, 100_000
+_MIN_GAUSSIANS, _SAMPLE = 16, 100_000
 #: SH coefficient of degree 0 above which colors are not those of 3DGS: eight times as bright as white.
 _LARGEST_COLOR = 26.0
 #: Range of the largest logit that is doubtful if none is negative: more than trainers reach, at most a byte.
@@ -33,7 +33,7 @@ def logarithms(path: Path, deviations: NDArray[np.float64]) -> NDArray[np.float6
     Raises:
         SceneError: If many are negative, because they are logarithms themselves.
     """
-    if (deviations < 0).mean() > _MOST_OUTSIDE:
+    if (deviations < 0).mean() > _MAX_OUTSIDE:
         raise SceneError(
             f"{path}: its scales are negative, so they are logarithms, but the format stores standard deviations. "
             "Export the scene again."
@@ -49,7 +49,7 @@ def logits(path: Path, opacities: NDArray[np.float64]) -> NDArray[np.float64]:
     Raises:
         SceneError: If many are outside, because they are logits themselves.
     """
-    if ((opacities < 0) | (opacities > 1)).mean() > _MOST_OUTSIDE:
+    if ((opacities < 0) | (opacities > 1)).mean() > _MAX_OUTSIDE:
         raise SceneError(
             f"{path}: its opacities are not in 0..1, so they are logits, but the format stores opacities. "
             "Export the scene again."
@@ -71,7 +71,7 @@ def check_units(path: Path, arrays: Arrays, flat: float, *, logits_stored: bool)
     Raises:
         SceneError: If scales, opacities or colors were stored as they are.
     """
-    if len(arrays["means"]) < _LEAST_GAUSSIANS:
+    if len(arrays["means"]) < _MIN_GAUSSIANS:
         return ()
     scales, opacities, colors = (_range(arrays[name]) for name in ("scales", "opacities", "sh_dc"))
     axes = arrays["scales"][:, [axis for axis in range(3) if arrays["scales"][:1, axis] != flat]]

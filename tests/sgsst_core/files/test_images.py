@@ -334,14 +334,14 @@ def test_large_images_are_reduced_before_they_are_floats(tmp_path: Path, mode: s
     path = tmp_path / ("a.tif" if mode == "CMYK" else "a.png")
     image.save(path)
     whole = load_image(path, color_managed=False)
-    assert torch.equal(load_image(path, color_managed=False, most_pixels=80 * 60), whole)
-    small = load_image(path, color_managed=False, most_pixels=80 * 60 - 1)
+    assert torch.equal(load_image(path, color_managed=False, max_pixels=80 * 60), whole)
+    small = load_image(path, color_managed=False, max_pixels=80 * 60 - 1)
     assert small.shape == (30, 40, 3)
     assert (small - downscale(whole, 1)).abs().max() <= (4 if mode == "P" else 1.01) / 255
 
 
 def test_large_jpegs_are_decoded_at_a_lower_resolution(tmp_path: Path) -> None:
     Image.linear_gradient("L").convert("RGB").save(tmp_path / "a.jpg", quality=95)
-    small = load_image(tmp_path / "a.jpg", most_pixels=64 * 64)
+    small = load_image(tmp_path / "a.jpg", max_pixels=64 * 64)
     assert small.shape == (64, 64, 3)
     assert (small - downscale(load_image(tmp_path / "a.jpg"), 2)).abs().max() < 0.02

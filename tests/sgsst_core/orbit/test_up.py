@@ -8,8 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sgsst_core.orbit.subject import find_subject
-from sgsst_core.orbit.up import Up, find_up
+from sgsst_core.orbit.subject import Up, find_subject, find_up
 from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.orbit.objects import UP, ball, box, figure, ground, joined, moved, scene_of
 

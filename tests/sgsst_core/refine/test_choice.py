@@ -21,7 +21,7 @@ from sgsst_core.refine.choice import (
     candidates,
     choose_pieces,
     finest_size,
-    most_children,
+    max_children,
     refine_decision,
 )
 from sgsst_core.refine.split import Refinement, piece_counts, ratio_of
@@ -99,13 +99,13 @@ def test_gaussians_that_disagree_most_are_split_first_within_the_budget() -> Non
     lengths = torch.tensor([[10.0, 0.1, 0.1]], dtype=torch.float64).repeat(6, 1)
     weights = torch.full((6,), 1e4, dtype=torch.float64)
     cancels = torch.tensor([1.0, 5.0, 2.0, 0.5, 4.0, 3.0], dtype=torch.float64)
-    pieces, _ = choose_pieces(lengths, torch.ones(6, dtype=torch.bool), cancels, most_children(weights), 11)
+    pieces, _ = choose_pieces(lengths, torch.ones(6, dtype=torch.bool), cancels, max_children(weights), 11)
     assert piece_counts(pieces).tolist() == [1, 3, 1, 1, 3, 1]
-    one, most = torch.ones(1, dtype=torch.bool), most_children(weights[:1])
+    one, most = torch.ones(1, dtype=torch.bool), max_children(weights[:1])
     blob, _ = choose_pieces(lengths.new_full((1, 3), 200.0), one, cancels[:1], most, 10**6)
     assert 200 < int(piece_counts(blob)) <= 1024
     nothing, size = choose_pieces(
-        torch.full_like(lengths, 1.0), torch.ones(6, dtype=torch.bool), cancels, most_children(weights), 60
+        torch.full_like(lengths, 1.0), torch.ones(6, dtype=torch.bool), cancels, max_children(weights), 60
     )
     assert bool((nothing == 1).all())
     assert size is None

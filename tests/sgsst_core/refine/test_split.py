@@ -17,7 +17,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import split as module
 from sgsst_core.refine.split import (
-    MOST_PIECES,
+    MAX_PIECES,
     can_be_split,
     mixture_error,
     parents_of,
@@ -32,7 +32,7 @@ from sgsst_core.scene.rotations import unit_rotations
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.sgsst_core.splat_scenes import camera, cloud, single
 
-NUMBERS = [1, *range(3, MOST_PIECES + 1)]
+NUMBERS = [1, *range(3, MAX_PIECES + 1)]
 
 
 def covariances(scene: Scene) -> Tensor:
@@ -168,7 +168,7 @@ def test_lengths_are_split_to_a_size_with_the_fewest_pieces() -> None:
     pieces = pieces_to(lengths, 2.0)
     assert pieces.dtype == torch.uint8
     assert pieces[:, 0].tolist() == [1, 4, 1]
-    assert pieces[1, 1:].tolist() == [MOST_PIECES, MOST_PIECES]
+    assert pieces[1, 1:].tolist() == [MAX_PIECES, MAX_PIECES]
     assert pieces[2].tolist() == [1, 3, 5]
     generator = torch.Generator().manual_seed(0)
     some = 20 * torch.rand(200, 3, generator=generator, dtype=torch.float64)

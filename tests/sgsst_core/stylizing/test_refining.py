@@ -12,7 +12,7 @@ from sgsst_core.loss.gradient_error import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import choice
-from sgsst_core.refine.choice import LEAST_PSNR, Footprints
+from sgsst_core.refine.choice import MIN_PSNR, Footprints
 from sgsst_core.refine.split import Refinement, parents_of, piece_counts
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import Settings, make_settings
@@ -85,7 +85,7 @@ def test_large_gaussians_are_split_within_the_budget_and_images_are_preserved(
     assert len(scene) < refinement.gaussians == int(counts.sum()) <= factor * len(scene)
     assert refinement.psnr is not None
     assert refinement.lowest_psnr is not None
-    assert refinement.psnr >= refinement.lowest_psnr >= LEAST_PSNR
+    assert refinement.psnr >= refinement.lowest_psnr >= MIN_PSNR
     refined_scene = refined(scene, refinement)
     errors = []
     for view in cameras():  # with the slow float64 rasterizer
@@ -143,12 +143,12 @@ def test_splits_that_would_change_the_image_are_undone(
     tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An impossible bound undoes all splits, and no bound undoes none."""
-    monkeypatch.setattr(refining, "LEAST_PSNR", 200.0)
+    monkeypatch.setattr(refining, "MIN_PSNR", 200.0)
     refinement = refinement_of(tiny_weights, 4.0)
     assert refinement.split == 0
     assert refinement.reverted > 0
     assert "are not split" in choice.refine_decision(refinement, settings(refine=4)).reason
-    monkeypatch.setattr(refining, "LEAST_PSNR", 0.0)
+    monkeypatch.setattr(refining, "MIN_PSNR", 0.0)
     loose = refinement_of(tiny_weights, 4.0)
     assert loose.reverted == 0
     assert loose.split == refinement.reverted
