@@ -6,25 +6,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-
-
-class Event(Protocol):
-    """Event in a device's stream, with the interface of `torch.cuda.Event`."""
-
-    def record(self) -> None:
-        """Record the event after all work queued so far."""
-
-    def query(self) -> bool:
-        """Return whether the device has reached the event."""
-
-    def synchronize(self) -> None:
-        """Wait until the device has reached the event."""
-
-    def elapsed_time(self, end_event: Any, /) -> float:
-        """Return the milliseconds from this event to a later one, once the device has reached both."""
 
 
 class Timer:
@@ -38,24 +22,24 @@ class Timer:
 
     Args:
         device: Device whose time is measured.
-        event: Function that creates an event in the device's stream; None for PyTorch's events on a GPU and the clock
-            on a CPU.
+        event: Function that creates an event in the device's stream, as `torch.cuda.Event`; None for these events on a
+            GPU and the clock on a CPU.
 
     Attributes:
         seconds: Accumulated seconds by name; on a GPU, only for blocks that ended before the last call of `read`.
     """
 
-    def __init__(self, device: torch.device | str = "cpu", event: Callable[[], Event] | None = None) -> None:
+    def __init__(self, device: torch.device | str = "cpu", event: Callable[[], Any] | None = None) -> None:
         self.seconds: dict[str, float] = {}
         if event is None and torch.device(device).type == "cuda":
             event = partial(torch.cuda.Event, enable_timing=True)
         self._event = event
         self._open: list[str] = []
         self._whole: str | None = None
-        self._since: Event | None = None
+        self._since: Any = None
         self._since_clock = 0.0
         #: Name, start and end of blocks that have not been read yet.
-        self._marked: list[tuple[str, Event, Event]] = []
+        self._marked: list[tuple[str, Any, Any]] = []
 
     @contextmanager
     def __call__(self, name: str, *, whole: bool = False) -> Iterator[None]:

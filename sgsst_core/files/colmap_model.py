@@ -111,9 +111,10 @@ def read_model(folder: Path, warn: Warn) -> tuple[dict[int, ColmapCamera], list[
     intrinsics = _by_id(cameras, _text_cameras(cameras))
     poses = _by_id(images, _text_images(images))
     for path, count in ((cameras, len(intrinsics)), (images, len(poses))):
-        declared = _declared_count(path)
-        if declared not in (None, count):
-            warn(f"{path}: holds {count:,} {path.stem}, but its first lines state {declared:,}. {COMPARE}")
+        with path.open("rb") as file:
+            stated = _DECLARED.search(file.read(_HEAD_BYTES))
+        if stated and int(stated[1]) != count:
+            warn(f"{path}: holds {count:,} {path.stem}, but its first lines state {int(stated[1]):,}. {COMPARE}")
     return intrinsics, list(poses.values())
 
 
@@ -229,13 +230,6 @@ def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
             line = data.removeprefix(codecs.BOM_UTF8).strip()
             if not line.startswith(b"#"):
                 yield f"{path}: line {number}", line
-
-
-def _declared_count(path: Path) -> int | None:
-    """Return the number of entries that the first lines of a text file state; None if they state none."""
-    with path.open("rb") as file:
-        stated = _DECLARED.search(file.read(_HEAD_BYTES))
-    return int(stated[1]) if stated else None
 
 
 def _image(name: str, camera: int, pose: Sequence[float]) -> ColmapImage:

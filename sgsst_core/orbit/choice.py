@@ -95,7 +95,11 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
         SettingsError: If an option is out of range; see `cameras.orbit`.
     """
     subject = find_subject(scene)
-    up = find_up(subject) if request.up is None else _requested_up(request.up)
+    if request.up is None:
+        up = find_up(subject)
+    else:
+        axis = torch.tensor(request.up, dtype=torch.float64)
+        up = Up(axis / axis.norm().clamp_min(1e-300), "requested")
     first = ELEVATION if request.elevation is None else request.elevation
     rings = request.count // _MIN_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
     tried = [first]
@@ -135,12 +139,13 @@ def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence
         uncovered: Fraction of uncovered pixels of each view; None if unknown.
     """
     decisions = [Decision("up", orbit.up.name, orbit.up.reason)]
-    angles = _listed([f"{angle:g}" for angle in orbit.elevations])
+    *others, last = [f"{angle:g}" for angle in orbit.elevations]
+    angles = f"{', '.join(others)} and {last}" if others else last
     rings = f"{len(orbit.elevations)} rings" if len(orbit.elevations) > 1 else "a ring"
     reason = "requested"
     if len(orbit.tried) > 1:
-        others = f"rings at {min(orbit.tried):g} to {max(orbit.tried):g} degrees"
-        reason = f"they show {orbit.shown:.0%} of the surface that {others} show"
+        tried = f"rings at {min(orbit.tried):g} to {max(orbit.tried):g} degrees"
+        reason = f"they show {orbit.shown:.0%} of the surface that {tried} show"
         reason += f"; another ring would add {orbit.next:.1%}" if orbit.next is not None else ""
     views = f"{len(cameras)} view{'s' if len(cameras) > 1 else ''}"
     decisions.append(
@@ -170,15 +175,6 @@ def _doubts(orbit: Orbit) -> list[Decision]:
         decision = f"warning: {orbit.inside:.0%} of the scene lies inside, hidden from all views around it"
         warnings.append(Decision("subject", decision, f"it may be a room; {better}"))
     return warnings
-
-
-def _requested_up(direction: tuple[float, float, float]) -> Up:
-    axis = torch.tensor(direction, dtype=torch.float64)
-    return Up(axis / axis.norm().clamp_min(1e-300), "requested")
-
-
-def _listed(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,8 @@ def split(scene: Scene, pieces: Tensor) -> Scene:
     Raises:
         ValueError: If `pieces` has another shape or value, or a Gaussian cannot be split.
     """
-    if pieces.shape != (len(scene), 3) or not bool(_is_number_of_pieces(pieces).all()):
+    usable = (pieces == 1) | ((pieces >= 3) & (pieces <= MAX_PIECES))
+    if pieces.shape != (len(scene), 3) or not bool(usable.all()):
         raise ValueError(f"pieces must be [{len(scene)}, 3] of 1, 3 to {MAX_PIECES}")
     counts = piece_counts(pieces)
     parents = (counts > 1).nonzero()[:, 0]
@@ -216,10 +217,6 @@ def _normalized_weights(squares: NDArray[np.float64], slope: float) -> NDArray[n
     weights = np.exp(-slope * (squares - squares.min()))
     normalized: NDArray[np.float64] = weights / weights.sum()
     return normalized
-
-
-def _is_number_of_pieces(pieces: Tensor) -> Tensor:
-    return (pieces == 1) | ((pieces >= 3) & (pieces <= MAX_PIECES))
 
 
 @functools.cache

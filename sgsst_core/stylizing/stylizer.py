@@ -187,8 +187,10 @@ class Stylizer:
         terms = self._read(largest, results)
         self.step += 1
         self.job.timer.read()
-        if phase.scale is None:
-            self._balance(cost)
+        speeds = self.job.team.compare_speeds(cost, self.job.timer.seconds) if phase.scale is None else None
+        if speeds:  # divide the work again, once in phase 2
+            self.job.loss.divider.speeds = speeds
+            self.job.view_targets.forget_division()
         self.seconds += time.perf_counter() - started
         for name, seconds in self.job.timer.seconds.items():
             self.seconds_by_part[name] = self.seconds_by_part.get(name, 0.0) + seconds
@@ -272,13 +274,6 @@ class Stylizer:
             f"--learning-rate than {self.job.settings.learning_rate:g}, or look for extreme coefficients with `sgsst "
             "check`."
         )
-
-    def _balance(self, cost: int) -> None:
-        """Divide the work again, once in phase 2, in proportion to the measured speeds of the ranks."""
-        speeds = self.job.team.compare_speeds(cost, self.job.timer.seconds)
-        if speeds:
-            self.job.loss.divider.speeds = speeds
-            self.job.view_targets.forget_division()
 
     def _prefetch(self, left: Sequence[int], phase: Phase) -> None:
         """Announce the view that this group processes next, so that its data can be read while the device works.

@@ -79,7 +79,7 @@ def _matches(start: FileStart) -> bool:
 
 def _read_header(start: FileStart) -> CompressedPlyHeader:
     path = start.path
-    header = read_header(path)
+    header = read_header(start)
     if "vertex" not in header.names:
         raise SceneError(f"{path}: is a compressed PLY without element 'vertex'. Export it again.")
     if header.text:

@@ -56,12 +56,8 @@ class PlySceneHeader(SceneHeader):
     sources: dict[str, str]
 
 
-def _matches(start: FileStart) -> bool:
-    return start.head.startswith(b"ply") and not COMPRESSED_PLY.matches(start)
-
-
 def _read_header(start: FileStart) -> PlySceneHeader:
-    header = read_header(start.path)
+    header = read_header(start)
     stored, sources = _check_properties(start.path, header)
     check_length(start.path, header)
     coefficients = min(stored, COEFFICIENTS[3])
@@ -163,7 +159,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
 PLY = SceneFormat(
     name="ply",
     title="PLY",
-    matches=_matches,
+    matches=lambda start: start.head.startswith(b"ply") and not COMPRESSED_PLY.matches(start),
     read_header=_read_header,
     bytes_per_gaussian=248,
     write=_write,

@@ -21,6 +21,7 @@ import numpy as np
 from sgsst_core.constants import EPS2D
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.scene_format import (
+    FileStart,
     RenderTag,
     about_surplus,
     number_of,
@@ -138,17 +139,13 @@ def comment_of(line: bytes) -> str | None:
     return comment.decode("latin-1").strip() if keyword == b"comment" else None
 
 
-def read_header(path: Path) -> PlyHeader:
+def read_header(file: FileStart) -> PlyHeader:
     """Parse the header of a PLY file without reading its data.
 
     Raises:
         SceneError: If the file cannot be read, has no PLY header, or its header has an invalid line.
     """
-    try:
-        with path.open("rb") as file:
-            start = file.read(MAX_HEADER_BYTES)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    path, start = file.path, file.read(0, MAX_HEADER_BYTES)
     opening = re.match(rb"ply(\r\n|\n|\r)", start)
     if not opening:
         raise SceneError(f"{path}: has no PLY header (it does not start with 'ply'). Give a 3DGS scene as .ply file.")
@@ -191,7 +188,12 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
     if byte_order is None:
         raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")
     parsed = tuple(PlyElement(name, count, span, tuple(props.values())) for name, count, span, props in elements)
-    _check_elements(path, parsed)
+    names = [each.name for each in parsed]
+    for each in parsed:
+        if names.count(each.name) > 1:
+            raise SceneError(f"{path}: the PLY header declares element {each.name!r} twice. Export the scene again.")
+        if each.count and not each.properties:
+            raise SceneError(f"{path}: element {each.name!r} of the PLY header has no property. Export it again.")
     return PlyHeader(byte_order, raw, parsed)
 
 
@@ -202,16 +204,6 @@ def _property(definition: list[str]) -> PlyProperty | None:
         case [kind, name] if kind in _TYPES:
             return PlyProperty(name, _TYPES[kind])
     return None
-
-
-def _check_elements(path: Path, elements: tuple[PlyElement, ...]) -> None:
-    names: set[str] = set()
-    for element in elements:
-        if element.name in names:
-            raise SceneError(f"{path}: the PLY header declares element {element.name!r} twice. Export the scene again.")
-        names.add(element.name)
-        if element.count and not element.properties:
-            raise SceneError(f"{path}: element {element.name!r} of the PLY header has no property. Export it again.")
 
 
 def check_length(path: Path, header: PlyHeader) -> None:
@@ -321,7 +313,9 @@ def ply_tag(header: PlyHeader) -> RenderTag:
         elif match := _EPS2D.fullmatch(comment):
             eps2d = usable_eps2d(match[1])
         elif _UNSCENTED.search(comment):
-            warnings.append(_unscented(f"the comment {comment!r}"))
+            reason = f"the comment {comment!r} names another projection"
+            differs = "renders differ where Gaussians are large or lenses were distorted"
+            warnings.append(("by linearized projection (EWA)", f"{reason}; {differs}"))
             continue
         else:
             continue
@@ -343,13 +337,6 @@ def is_flat(names: Collection[str]) -> bool:
     return "scale_1" in names and "scale_2" not in names and "scale" not in names
 
 
-def _unscented(where: str) -> tuple[str, str]:
-    return (
-        "by linearized projection (EWA)",
-        f"{where} names another projection; renders differ where Gaussians are large or lenses were distorted",
-    )
-
-
 def comment_lines(rendering: Rendering) -> list[str]:
     """Return the lines of a PLY header that state a render mode; empty for the default mode."""
     mode, eps2d = _stating(rendering)
@@ -366,7 +353,12 @@ def retagged(raw: bytes, header: PlyHeader, rendering: Rendering) -> bytes:
     """
     if ply_tag(header).rendering == rendering:
         return raw
-    lines = [line for line in raw.split(header.newline) if not _states_mode(line)]
+    stating = (_MODE, _FLAG, _EPS2D)
+    lines = [
+        line
+        for line in raw.split(header.newline)
+        if not any(pattern.fullmatch(comment_of(line) or "") for pattern in stating)
+    ]
     after_format = next(i for i, line in enumerate(lines) if line.startswith(b"format")) + 1
     lines[after_format:after_format] = [line.encode() for line in _stating(rendering)]
     return header.newline.join(lines)
@@ -376,9 +368,3 @@ def _stating(rendering: Rendering) -> tuple[str, str]:
     """Return the lines of a PLY header that state mode and blur."""
     name = next(name for name, mode in _MODES.items() if mode == rendering.mode)
     return f"comment SplatRenderMode: {name}", f"comment eps2d {rendering.eps2d!r}"
-
-
-def _states_mode(line: bytes) -> bool:
-    """Return whether a line of a PLY header is a comment that states mode or blur."""
-    comment = comment_of(line)
-    return comment is not None and any(pattern.fullmatch(comment) for pattern in (_MODE, _FLAG, _EPS2D))

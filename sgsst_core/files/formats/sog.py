@@ -43,7 +43,6 @@ from sgsst_core.files.formats.scene_format import (
     Arrays,
     FileStart,
     OpenScene,
-    RenderTag,
     SceneFormat,
     SceneHeader,
     about_surplus,
@@ -247,16 +246,9 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
         coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"], 1)[0]
         if COEFFICIENTS.get(meta["shN"].get("bands"), coefficients) != coefficients:
             raise ValueError(f"bands: {meta['shN']['bands']} with {coefficients} coefficients")
-    return SogHeader(
-        SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, tag=_tag(meta)
-    )
-
-
-def _tag(meta: dict[str, Any]) -> RenderTag:
-    """Return the render mode that meta.json states."""
-    extras = meta.get("extras")
-    own = extras if isinstance(extras, dict) else {}
-    return extras_tag({**own, "model": meta.get("model", "default")}, "meta.json")
+    extras = meta["extras"] if isinstance(meta.get("extras"), dict) else {}
+    tag = extras_tag({**extras, "model": meta.get("model", "default")}, "meta.json")
+    return SogHeader(SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, tag=tag)
 
 
 def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:

@@ -322,12 +322,15 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
     assert isinstance(spz, SpzHeader)
     path = file.path
     decoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
-        (into["means"], _halves if spz.version == 1 else lambda data: _fixed_point(data, spz.fractional_bits)),
+        (into["means"], lambda data: _positions(data, spz)),
         (into["opacities"], lambda data: OPACITY_LOGITS[data]),
         (into["sh_dc"], lambda data: _COLORS[data].reshape(-1, 3)),
         (into["scales"], lambda data: _SCALES[data].reshape(-1, 3)),
         (into["quats"], _smallest_three if spz.version >= 3 else _first_three),
-        (into["sh_rest"], lambda data: _decode_harmonics(data, STORED_COEFFICIENTS[spz.degree])),
+        (
+            into["sh_rest"],
+            lambda data: _HARMONICS[data].reshape(-1, STORED_COEFFICIENTS[spz.degree], 3)[:, : COEFFICIENTS[3]],
+        ),
     ]
     stream = _Stream(file, spz)
     takes = _sections_of_streams(path, file, spz) if spz.streams else _sections_of_stream(path, stream, spz)
@@ -470,14 +473,13 @@ def _too_much(path: Path, surplus: str = "") -> SceneError:
     )
 
 
-def _halves(data: NDArray[np.uint8]) -> NDArray[Any]:
-    return data.view("<f2").reshape(-1, 3).astype(np.float32)
-
-
-def _fixed_point(data: NDArray[np.uint8], fractional_bits: int) -> NDArray[Any]:
+def _positions(data: NDArray[np.uint8], spz: SpzHeader) -> NDArray[Any]:
+    """Decode positions: 16-bit floats in version 1, and 24-bit fixed-point numbers later."""
+    if spz.version == 1:
+        return data.view("<f2").reshape(-1, 3).astype(np.float32)
     low, middle, high = data.reshape(-1, 3).astype(np.int32).T
     values = (low | middle << 8 | high << 16) << 8 >> 8  # bit 23 is the sign
-    return np.ldexp(values.astype(np.float32), -fractional_bits).reshape(-1, 3)
+    return np.ldexp(values.astype(np.float32), -spz.fractional_bits).reshape(-1, 3)
 
 
 def _first_three(data: NDArray[np.uint8]) -> NDArray[Any]:
@@ -491,11 +493,6 @@ def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     three = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1)
     values = np.where(three & 512, -1.0, 1.0) * (three & 511) / 511 * np.sqrt(0.5)
     return np.roll(with_largest(packed >> 30, values), 1, axis=1)
-
-
-def _decode_harmonics(data: NDArray[np.uint8], stored: int) -> NDArray[Any]:
-    """Decode SH coefficients up to degree 3."""
-    return _HARMONICS[data].reshape(-1, stored, 3)[:, : COEFFICIENTS[3]]
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
