@@ -10,12 +10,19 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import ImageError
-from sgsst_core.files.gaussian_masks import read_mask
 from sgsst_core.files.photos import Photo, find_masks, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_property
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions, check_regions
-from sgsst_core.regions.selection import count_votes, decide_by_votes, in_box, in_half_space, in_sphere, where_property
+from sgsst_core.regions.selection import (
+    count_votes,
+    decide_by_votes,
+    in_box,
+    in_half_space,
+    in_sphere,
+    read_mask,
+    where_property,
+)
 from sgsst_core.scene.camera import Camera
 from sgsst_core.style import Style
 from worker.region_requests import REST, RegionRequest, Selection

@@ -1,15 +1,23 @@
-"""Readers and writers of images as float32 tensors [H, W, 3] of sRGB values in 0..1."""
+"""Readers and writers of images as float32 tensors [H, W, 3] of sRGB values in 0..1.
+
+Pillow refuses PNGs with color profiles or compressed texts of more than 1 MiB, and finds metadata that follow the
+pixels only by decoding all of them. It therefore gets a PNG's pixels with the metadata that are used, and no others.
+"""
 
 from __future__ import annotations
 
 import io
 import math
+import os
 import re
+import struct
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -20,8 +28,7 @@ from torch import Tensor
 from sgsst_core.errors import ImageError
 from sgsst_core.files.advice import POINTER, refuse_known
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.color_profiles import ColorProfile
-from sgsst_core.files.png_metadata import SIGNATURE, open_png
+from sgsst_core.files.color_profiles import MAX_PROFILE_BYTES, ColorProfile
 
 #: Maximum number of pixels: Pillow's limit against decompression bombs, which is twice its warning threshold. These 179
 #: megapixels exceed the largest camera sensors, and take 2 GB as float32.
@@ -53,6 +60,16 @@ _JPEG_MARKER = re.compile(rb"\xff([\x01-\xfe])")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 #: Markers without a segment: TEM, restarts and the start of the image.
 _BARE_MARKERS = {0x01, *range(0xD0, 0xD9)}
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+#: Maximum length of all compressed texts together.
+MAX_TEXT_BYTES = 16 << 20
+#: Chunks before the pixels that determine them, or the number of frames.
+_COPIED = (b"IHDR", b"PLTE", b"tRNS", b"acTL", b"fcTL")
+#: Texts that may hold the orientation.
+_USED_TEXTS = (b"XML:com.adobe.xmp", b"Raw profile type exif")
+#: Additional bytes of a compressed value that is as long as the limit.
+_OVERHEAD = 1 << 16
+_PNG_END = struct.pack(">I4sI", 0, b"IEND", zlib.crc32(b"IEND"))
 
 
 class ImageWarning(UserWarning):
@@ -151,7 +168,7 @@ def stored_size(path: Path) -> tuple[tuple[int, int], int]:
         ImageError: If the file is missing or not an image, or has more than MAX_PIXELS pixels.
     """
     with _opened(path, pixels=False) as image:
-        # that of a PNG decodes all pixels to find EXIF data behind them, which `open_png` has found already
+        # that of a PNG decodes all pixels to find EXIF data behind them, which `_open_png` has found already
         exif = Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
         orientation = exif.get(_EXIF_ORIENTATION, 1)
         return image.size, orientation if orientation in range(1, 9) else 1
@@ -179,7 +196,9 @@ def _opened(path: Path, *, pixels: bool = True) -> Iterator[Image.Image]:
     Without `pixels`, the image can only be asked for its header.
     """
     try:
-        source, profile = _source(path, pixels)
+        with path.open("rb") as file:
+            is_png = file.read(len(_PNG_SIGNATURE)) == _PNG_SIGNATURE
+        source, profile = _open_png(path, pixels=pixels) if is_png else (path, None)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # checked below with our own limit
             opened = Image.open(source, formats=[*FORMATS, *_heif_format(path)])
@@ -202,13 +221,6 @@ def _opened(path: Path, *, pixels: bool = True) -> Iterator[Image.Image]:
         if isinstance(error, OSError) and error.strerror:
             raise ImageError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
         raise ImageError(f"{path}: is truncated or corrupt ({error}). Use an intact copy.") from error
-
-
-def _source(path: Path, pixels: bool) -> tuple[Path | io.BytesIO, bytes | None]:
-    """Return what Pillow opens, and the color profile of a PNG, which Pillow would refuse if it is long."""
-    with path.open("rb") as file:
-        is_png = file.read(len(SIGNATURE)) == SIGNATURE
-    return open_png(path, pixels=pixels) if is_png else (path, None)
 
 
 def _check_scans(path: Path) -> None:
@@ -311,3 +323,95 @@ def _save(path: Path, image: Tensor, **options: Any) -> None:
     values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
     with atomic_path(path) as temporary:
         Image.fromarray(values.numpy()).save(temporary, **options)
+
+
+@dataclass
+class _PngMetadata:
+    """Metadata of a file.
+
+    Attributes:
+        chunks: Chunks for Pillow, complete.
+        profile: Color profile, of which at most one byte more than allowed is inflated; None if there is none.
+        text_left: Bytes of compressed texts that are still allowed.
+    """
+
+    chunks: list[bytes] = field(default_factory=list)
+    profile: bytes | None = None
+    text_left: int = MAX_TEXT_BYTES
+
+
+def _open_png(path: Path, *, pixels: bool) -> tuple[io.BytesIO, bytes | None]:
+    """Return a PNG for Pillow, and its color profile; None if it has none that can be inflated.
+
+    Args:
+        path: File that starts with `_PNG_SIGNATURE`.
+        pixels: Whether the pixels are needed; without them, the file is only good for its header.
+
+    Raises:
+        ImageError: If the file has too much compressed text.
+        ValueError: If a chunk is beyond the end of the file.
+        OSError: If the file cannot be read.
+    """
+    metadata, start, stop = _PngMetadata(), 0, 0
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        position = file.seek(len(_PNG_SIGNATURE))
+        while position < size:
+            file.seek(position)
+            header = file.read(8)
+            length, kind = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
+            stop_of_chunk = position + 12 + length
+            if kind == b"IDAT":
+                start, stop = start or position, stop_of_chunk
+            elif kind == b"IEND" or (start and stop_of_chunk > size):
+                break
+            elif stop_of_chunk > size:
+                raise ValueError("its header is incomplete")
+            elif kind in _COPIED and not start:
+                metadata.chunks.append(header + file.read(length + 4))
+            else:
+                _read_chunk(path, kind, length, file, metadata)
+            position = stop_of_chunk
+        file.seek(start)
+        data = file.read(stop - start if pixels else 8) if start else b""
+    end = _PNG_END if start and stop <= size else b""
+    return io.BytesIO(b"".join([_PNG_SIGNATURE, *metadata.chunks, data, end])), metadata.profile
+
+
+def _read_chunk(path: Path, kind: bytes, length: int, file: BinaryIO, metadata: _PngMetadata) -> None:
+    """Read EXIF data, a color profile, or a text that may hold the orientation; other chunks are skipped."""
+    if kind == b"eXIf":
+        metadata.chunks.append(_chunk(kind, b"", file.read(length)))
+    elif kind == b"iCCP":
+        value = file.read(min(length, MAX_PROFILE_BYTES + _OVERHEAD)).partition(b"\0")[2]
+        metadata.profile = _inflated(value[1:], MAX_PROFILE_BYTES) or metadata.profile
+    elif kind in (b"tEXt", b"zTXt", b"iTXt"):
+        keyword, _, value = file.read(min(length, MAX_TEXT_BYTES + _OVERHEAD)).partition(b"\0")
+        compressed = kind == b"zTXt"
+        if kind == b"iTXt":
+            compressed, value = value[:1] == b"\1", value[2:].partition(b"\0")[2].partition(b"\0")[2]
+        elif compressed:
+            value = value[1:]
+        if compressed:
+            value = _inflated(value, metadata.text_left) or b""
+            metadata.text_left -= len(value)
+        if metadata.text_left < 0:
+            raise ImageError(
+                f"{path}: holds more than {MAX_TEXT_BYTES >> 20} MiB of compressed text. Save it without its metadata."
+            )
+        if keyword in _USED_TEXTS and len(value) <= MAX_TEXT_BYTES:
+            xmp = keyword == _USED_TEXTS[0]
+            metadata.chunks.append(_chunk(*(b"iTXt", keyword + bytes(5)) if xmp else (b"tEXt", keyword + b"\0"), value))
+
+
+def _inflated(data: bytes, limit: int) -> bytes | None:
+    """Return inflated data, at most one byte more than a limit; None if it is broken."""
+    try:
+        return zlib.decompressobj().decompress(data, limit + 1)
+    except zlib.error:
+        return None
+
+
+def _chunk(kind: bytes, head: bytes, value: bytes) -> bytes:
+    data = head + value
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

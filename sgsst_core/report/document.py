@@ -21,7 +21,7 @@ from sgsst_core.quality.findings import Finding
 from sgsst_core.report.machine import machine, peak_memory, program_version
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, relative_loss
 from sgsst_core.stylizing.loop import Stopped
-from sgsst_core.stylizing.state import StepRecord
+from sgsst_core.stylizing.schedule import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Version of report.json, raised whenever a field is removed or changes its meaning.

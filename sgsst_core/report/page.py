@@ -26,7 +26,7 @@ from sgsst_core.report.tables import (
     novel_views_table,
     prediction_table,
 )
-from sgsst_core.stylizing.state import BEFORE_STEPS
+from sgsst_core.stylizing.schedule import BEFORE_STEPS
 
 #: Maximum number of list members shown in the collapsed section, followed by their total number.
 _LIST = 40

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from sgsst_core.errors import CameraError
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, resized
 
 #: Rotation between two cameras beyond which they are not neighbors: about the field of view of a photo. A view halfway
 #: between such cameras may show nothing that either of them sees.
@@ -180,17 +180,13 @@ def framed(camera: Camera, side: int | None, *, even: bool) -> Camera:
         side: Length of the longer side in pixels; None keeps the camera's.
         even: Whether width and height must be even, as for video with chroma subsampling. Sides of one pixel stay.
     """
+    camera = replace(camera, resolution=None)
     if side is not None:
-        scale = side / max(camera.width, camera.height)
-        width, height = (max(1, round(scale * length)) for length in (camera.width, camera.height))
-        x, y = width / camera.width, height / camera.height
-        camera = replace(
-            camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
-        )
+        camera = resized(camera, side)
     if even:
         width, height = (length - length % 2 or 1 for length in (camera.width, camera.height))
         camera = replace(camera, width=width, height=height)
-    return replace(camera, resolution=None)
+    return camera
 
 
 def _changes(cameras: Sequence[Camera]) -> NDArray[np.float64]:

@@ -36,7 +36,7 @@ from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.state import StepRecord, StylizerState
+from sgsst_core.stylizing.schedule import StepRecord, StylizerState
 
 #: Increased whenever the meaning of a stored value changes.
 FORMAT_VERSION = "8"

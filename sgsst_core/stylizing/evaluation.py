@@ -16,7 +16,7 @@ from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.targets import StyleTargets
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.scene.camera import Camera
-from sgsst_core.stylizing.state import StepRecord
+from sgsst_core.stylizing.schedule import StepRecord
 from sgsst_core.stylizing.view_targets import ViewTargets
 
 Evaluation = dict[int, LossTerms]

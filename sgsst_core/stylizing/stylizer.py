@@ -19,6 +19,7 @@ from torch import Tensor
 from sgsst_core.budget import device_peak
 from sgsst_core.errors import DeviceMemoryError, DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
@@ -40,9 +41,16 @@ from sgsst_core.stylizing.job import StylizationJob, plan_job
 from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.result_colors import result_colors, transferred_colors
-from sgsst_core.stylizing.schedule import Phase, ViewOrder, drawn_views, phase_at
-from sgsst_core.stylizing.state import BEFORE_STEPS, StepRecord, StylizerState
-from sgsst_core.stylizing.training_background import Color, drawn_color
+from sgsst_core.stylizing.schedule import (
+    BEFORE_STEPS,
+    Phase,
+    StepRecord,
+    StylizerState,
+    ViewOrder,
+    drawn_views,
+    phase_at,
+)
+from sgsst_core.stylizing.training_background import drawn_color
 
 T = TypeVar("T")
 

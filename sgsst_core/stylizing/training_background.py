@@ -15,11 +15,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from sgsst_core.files.images import Color
 from sgsst_core.settings import PlannedBackground
 from sgsst_core.style import Style
-
-#: Red, green and blue in 0..1.
-Color = tuple[float, float, float]
 
 _BITS = 53  # bits of a float64's fraction
 

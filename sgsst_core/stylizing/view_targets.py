@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sgsst_core.budget import Cache, content_fraction, tensor_bytes
 from sgsst_core.features.partition import PartitionTile, Rectangle
+from sgsst_core.files.images import Color
 from sgsst_core.loss.position_term import ScaledView
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.targets import ContentFeatures, ViewTarget
@@ -19,7 +20,7 @@ from sgsst_core.parallel.division import Piece
 from sgsst_core.regions.maps import ContentMaps, ViewMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader, PhotosAhead
-from sgsst_core.stylizing.training_background import Color, replace_background
+from sgsst_core.stylizing.training_background import replace_background
 from sgsst_core.stylizing.views import Views
 
 

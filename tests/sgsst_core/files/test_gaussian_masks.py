@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from sgsst_core.errors import MaskError
-from sgsst_core.files.gaussian_masks import read_mask
 from sgsst_core.files.scene_file import SceneFile, read_scene
+from sgsst_core.regions.selection import read_mask
 from tests.small_scenes import LFS_POINTER, wall, write_files
 
 

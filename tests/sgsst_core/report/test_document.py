@@ -25,7 +25,7 @@ from sgsst_core.report.page import render_page
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.evaluation import Evaluation, RunningRound, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.state import StepRecord
+from sgsst_core.stylizing.schedule import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import ball, blind_camera, cameras, style
 

@@ -27,7 +27,7 @@ from sgsst_core.stylizing.checkpoint import (
     load_checkpoint,
     versions,
 )
-from sgsst_core.stylizing.state import StepRecord, StylizerState
+from sgsst_core.stylizing.schedule import StepRecord, StylizerState
 from tests.small_scenes import cameras, style, wall
 
 
