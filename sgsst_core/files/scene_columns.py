@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,10 @@ from numpy.typing import NDArray
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.ply import PROPERTIES, RGB
+from sgsst_core.files.formats.ply import PROPERTIES, RGB, PlySceneHeader
 from sgsst_core.files.formats.ply_header import FILTER_3D, is_flat
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS
+from sgsst_core.files.formats.scene_format import SceneHeader
 from sgsst_core.scene.stored_harmonics import RowLayout
 
 #: Order of the properties in messages; f_rest_* follow.
@@ -65,12 +65,8 @@ class SceneColumns:
     """Arrays of a scene, filled block by block from the rows of a file, and the invalid values found in them.
 
     Args:
-        count: Number of rows.
-        coefficients: Number of SH coefficients per color channel to load.
+        header: Header of the file.
         stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
-        stored_coefficients: Number of SH coefficients per color channel in the rows; None for `coefficients`.
-        sources: Properties in the rows by the name of the usual property that they replace; see `PlySceneHeader`.
-        names: Properties in the rows, which may lack scale_2 and have the 3D filter of Mip-Splatting.
 
     Attributes:
         arrays: float32 arrays by the names of the scene's tensors.
@@ -79,27 +75,22 @@ class SceneColumns:
             almost 0 and 1 that compressed formats use, because exporters write an alpha of 255 as infinity.
     """
 
-    def __init__(
-        self,
-        count: int,
-        coefficients: int,
-        stored: RowLayout | None,
-        stored_coefficients: int | None = None,
-        sources: dict[str, str] | None = None,
-        names: Collection[str] = (),
-    ) -> None:
+    def __init__(self, header: SceneHeader, stored: RowLayout | None) -> None:
+        ply = header if isinstance(header, PlySceneHeader) else None
+        names = {prop.name for prop in ply.ply.vertex.properties} if ply else set()
+        count, coefficients = header.count, 0 if stored else header.coefficients
         self._stored = stored
-        self._sources = sources or {}
+        self._sources = ply.sources if ply else {}
         self.arrays: dict[str, NDArray[Any]] = {
-            name: np.empty((count, len(names)), np.float32) for name, names in PROPERTIES.items()
+            name: np.empty((count, len(columns)), np.float32) for name, columns in PROPERTIES.items()
         }
         self.arrays["opacities"] = np.empty(count, np.float32)
         self.arrays["sh_rest"] = np.empty((count, coefficients, 3), np.float32)
         self._targets = {
-            prop: self.arrays[name][:, i] for name, names in PROPERTIES.items() for i, prop in enumerate(names)
+            prop: self.arrays[name][:, i] for name, columns in PROPERTIES.items() for i, prop in enumerate(columns)
         }
         self._targets["opacity"] = self.arrays["opacities"]
-        stride = coefficients if stored_coefficients is None else stored_coefficients
+        stride = ply.stored_coefficients if ply else coefficients
         for channel, i in itertools.product(range(3), range(coefficients)):
             self._targets[f"f_rest_{channel * stride + i}"] = self.arrays["sh_rest"][:, i, channel]
         self._filtered = FILTER_3D in names

@@ -25,7 +25,14 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import FILTER_3D, PlyHeader, element_offsets, surplus
-from sgsst_core.files.formats.scene_format import UNTAGGED, Arrays, RenderTag, SceneFormat, SceneHeader
+from sgsst_core.files.formats.scene_format import (
+    UNTAGGED,
+    Arrays,
+    RenderTag,
+    SceneFormat,
+    SceneHeader,
+    blocks,
+)
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.formats.units import check_units
@@ -34,10 +41,6 @@ from sgsst_core.refine.split import Refinement, piece_counts
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.rendering import RenderMode
 from sgsst_core.scene.stored_harmonics import RowFile, RowLayout, StoredHarmonics, changed, held
-
-#: Number of rows per block. 64k rows of 62 floats take only 16 MB. The columns of a block are copied from the CPU
-#: cache, instead of in one pass over the file per column.
-BLOCK_ROWS = 1 << 16
 
 #: Number of bytes per read. They stay in a core's L2 cache while they are split into columns.
 READ_BYTES = 1 << 20
@@ -158,15 +161,17 @@ def read_scene(
     file = RowFile(path)
     stamp = file.stamp
     stored = _row_layout(path, ply, stamp, offset) if ply and stays_in_file(header, held_bytes) else None
-    columns, notes = _columns(header, stored), header.notes
+    columns, notes = SceneColumns(header, stored), header.notes
     about_rest = surplus(path, ply) if ply else ""
-    if ply is None:
-        notes += _read_arrays(file, header, columns)
-    elif ply.text:
+    if header.format.read is not None:
+        notes += header.format.read(file, header, columns.arrays) or ()
+        for block in blocks(header.count):
+            columns.check(block.start, block.stop - block.start)
+    elif ply is not None and ply.text:
         rows = text_vertices(path, ply)
-        for start in range(0, len(rows), BLOCK_ROWS):
-            columns.take(start, rows[start : start + BLOCK_ROWS])
-    else:
+        for block in blocks(header.count):
+            columns.take(block.start, rows[block])
+    elif ply is not None:
         _read_binary(file, ply, offset, columns)
     file.check_unchanged(stamp)
     retained = columns.valid_rows(path, drop_invalid, about_rest)
@@ -184,24 +189,6 @@ def read_scene(
         ply = None
     clamped = sum(columns.clamped)
     return SceneFile(path, scene, ply, retained, stamp, header.format.name, clamped, notes, header.tag)
-
-
-def _columns(header: SceneHeader, stored: RowLayout | None) -> SceneColumns:
-    """Return the arrays to read a scene into."""
-    coefficients = 0 if stored else header.coefficients
-    if isinstance(header, PlySceneHeader):
-        names = [prop.name for prop in header.ply.vertex.properties]
-        return SceneColumns(header.count, coefficients, stored, header.stored_coefficients, header.sources, names)
-    return SceneColumns(header.count, coefficients, stored)
-
-
-def _read_arrays(file: RowFile, header: SceneHeader, columns: SceneColumns) -> tuple[str, ...]:
-    """Read a scene in any format other than PLY, and return the reader's notes."""
-    assert header.format.read is not None
-    notes = header.format.read(file, header, columns.arrays)
-    for start in range(0, header.count, BLOCK_ROWS):
-        columns.check(start, min(BLOCK_ROWS, header.count - start))
-    return notes or ()
 
 
 def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:

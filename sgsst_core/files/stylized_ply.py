@@ -23,12 +23,13 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, RGB
 from sgsst_core.files.formats.ply_header import FILTER_3D, PlyHeader, element_offsets, retagged
-from sgsst_core.files.scene_file import BLOCK_ROWS, SceneFile, encode_scene, file_stamp
+from sgsst_core.files.formats.scene_format import blocks
+from sgsst_core.files.scene_file import SceneFile, encode_scene, file_stamp
 from sgsst_core.scene.gaussians import attenuation_factor
 from sgsst_core.scene.stored_harmonics import changed
 
 #: Rows per block: a megabyte of a scene of SH degree 3 stays in a core's L2 cache while its columns change.
-_BLOCK_ROWS = 1 << 12
+BLOCK_ROWS = 1 << 12
 _REST = re.compile(r"f_rest_\d+")
 #: New values of all Gaussians, by property name.
 _NewColumns = dict[str, NDArray[np.float32]]
@@ -150,8 +151,8 @@ def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> _NewCo
 def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
     """Yield, for each block of file rows, its length, the number of copies of each row, and the slice of Gaussians."""
     position = gaussian = 0
-    for start in range(0, rows, _BLOCK_ROWS):
-        count = min(_BLOCK_ROWS, rows - start)
+    for start in range(0, rows, BLOCK_ROWS):
+        count = min(BLOCK_ROWS, rows - start)
         times = np.ones(count, np.int64)
         if source.retained is not None:
             times[:] = source.retained[start : start + count]
@@ -177,7 +178,7 @@ def _write_binary(
     before = element_offsets(source.path, header)["vertex"] - len(header.raw)
     file.seek(len(header.raw))
     _copy(file, output, before)
-    buffer = bytearray(min(_BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
+    buffer = bytearray(min(BLOCK_ROWS, header.vertex.count) * dtype.itemsize)
     for count, times, gaussians in _blocks(source, header.vertex.count):
         part = memoryview(buffer)[: count * dtype.itemsize]
         if file.readinto(part) != len(part):
@@ -274,5 +275,5 @@ def write_colors(path: Path, sh_dc: Tensor) -> None:
     """
     values = sh_dc.detach().cpu().numpy()
     with atomic_path(path) as temporary, temporary.open("wb") as output:
-        for start in range(0, len(values), BLOCK_ROWS):
-            output.write(np.clip(values[start : start + BLOCK_ROWS], -_FLOAT16_MAX, _FLOAT16_MAX).astype("<f2").data)
+        for block in blocks(len(values)):
+            output.write(np.clip(values[block], -_FLOAT16_MAX, _FLOAT16_MAX).astype("<f2").data)

@@ -33,7 +33,6 @@ from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import converted
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, opacity_bytes, with_largest, without_largest
 from sgsst_core.files.formats.scene_format import (
-    BLOCK_ROWS,
     COEFFICIENTS,
     STORED_COEFFICIENTS,
     UNTAGGED,
@@ -44,6 +43,7 @@ from sgsst_core.files.formats.scene_format import (
     SceneFormat,
     SceneHeader,
     about_surplus,
+    blocks,
     is_padding,
     number_of,
     read_rows,
@@ -339,9 +339,8 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
             continue
         take = next(takes)
         row_bytes = size // spz.count
-        for start in range(0, spz.count, BLOCK_ROWS):
-            block = array[start : start + BLOCK_ROWS]
-            block[:] = decode(np.frombuffer(take(len(block) * row_bytes), np.uint8))
+        for block in blocks(spz.count):
+            array[block] = decode(np.frombuffer(take((block.stop - block.start) * row_bytes), np.uint8))
     next(takes, None)  # reach the end of the last stream, where its checksum is verified
     content, end = (b"", spz.size) if spz.streams else _extensions(path, stream, spz)
     extensions = content if spz.extended else b""
@@ -555,8 +554,7 @@ def _encoded_sections(arrays: Arrays, bits: int) -> Iterator[Iterator[bytes]]:
         (arrays["sh_rest"], lambda values: _to_byte(values * 128 + 128)),
     ]
     for array, encode in encoders:
-        blocks = (array[start : start + BLOCK_ROWS] for start in range(0, len(array), BLOCK_ROWS))
-        yield (np.ascontiguousarray(encode(block.astype(np.float64))).tobytes() for block in blocks)
+        yield (np.ascontiguousarray(encode(array[block].astype(np.float64))).tobytes() for block in blocks(len(array)))
 
 
 def _fractional_bits(means: NDArray[np.float32]) -> int:

@@ -10,12 +10,12 @@ import torch
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import OutputError
-from sgsst_core.files import stylized_ply
+from sgsst_core.files.formats import scene_format
 from sgsst_core.files.stylized_ply import write_colors
 
 
 def test_colors_round_trip_within_the_error_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stylized_ply, "BLOCK_ROWS", 100)
+    monkeypatch.setattr(scene_format, "BLOCK_ROWS", 100)
     generator = torch.Generator().manual_seed(1)
     size = torch.rand(1003, 3, generator=generator) * 14 - 9  # from 1e-9 to 1e5
     sh_dc = torch.randn(1003, 3, generator=generator).sign() * 10.0**size

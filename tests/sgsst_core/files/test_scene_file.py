@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files import scene_file, stylized_ply
+from sgsst_core.files import stylized_ply
+from sgsst_core.files.formats import scene_format
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.refine.split import Refinement, parents_of, piece_counts
@@ -192,7 +193,7 @@ def test_only_colors_of_any_3dgs_ply_change(tmp_path_factory: pytest.TempPathFac
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("block", [1, 2, 1 << 16])
 def test_only_color_bytes_change(tmp_path: Path, form: str, block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (scene_file, stylized_ply):
+    for module in (scene_format, stylized_ply):
         monkeypatch.setattr(module, "BLOCK_ROWS", block)
     file = simple(5, degree=1, form=form)
     behind = b"" if form == "ascii" else b"bytes behind the last element \xff\r\n"
@@ -218,7 +219,7 @@ def test_only_color_bytes_change(tmp_path: Path, form: str, block: int, monkeypa
 def test_children_of_split_gaussians_inherit_all_properties(
     tmp_path: Path, form: str, dropped: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (scene_file, stylized_ply):
+    for module in (scene_format, stylized_ply):
         monkeypatch.setattr(module, "BLOCK_ROWS", 2)
     file = simple(5, degree=1, form=form)
     properties, rows = file.elements[0][1], file.elements[0][2]

@@ -12,7 +12,8 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sgsst_core.errors import SceneError
-from sgsst_core.files import scene_file, stylized_ply
+from sgsst_core.files import stylized_ply
+from sgsst_core.files.formats import scene_format
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
@@ -27,7 +28,7 @@ ATTENUATIONS = (1e-9, 0.25, 0.7, 1.0)
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
-    for module in (scene_file, stylized_ply):
+    for module in (scene_format, stylized_ply):
         monkeypatch.setattr(module, "BLOCK_ROWS", 17)
 
 

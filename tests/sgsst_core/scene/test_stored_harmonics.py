@@ -19,7 +19,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SceneError
 from sgsst_core.files import scene_file, stylized_ply
-from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.formats import read_scene_header, scene_format
 from sgsst_core.files.formats.scene_format import SceneHeader
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
@@ -38,7 +38,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the block size, so that small scenes have many blocks, including incomplete ones."""
     monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
     monkeypatch.setattr(scene_file, "READ_BYTES", 3000)
-    for module in (scene_file, stylized_ply):
+    for module in (scene_format, stylized_ply):
         monkeypatch.setattr(module, "BLOCK_ROWS", 17)
 
 
