@@ -299,7 +299,7 @@ def run_with_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str,
     settings, weights = make_settings("standard", steps_coarse=0, steps_sos=20, rebalance=False), tiny_weights()
     plan, _ = make_plan(*inputs, settings, weights=weights, collectives=collectives)
     settings = settings.model_copy(update={"rebalance": rebalance})
-    job = prepare_job(plan, *inputs, style(), settings, weights=weights, collectives=collectives)
+    job = prepare_job(plan, *inputs, Style.of(style()), settings, weights=weights, collectives=collectives)
     stylizer = Stylizer(job)
     forward = stylizer.job.network.forward
 
