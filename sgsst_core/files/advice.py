@@ -65,7 +65,7 @@ class Kind(NamedTuple):
     """Kind of files that cannot be read.
 
     Attributes:
-        text: What they are, and what to do.
+        text: Description of them, and advice.
         head: Check of the first bytes of a file, without a byte order mark and leading blanks.
         suffixes: Ends of the names of such files only, in lower case.
         usual: Ends of the names of such files, which others have too.
