@@ -21,7 +21,7 @@ from sqlalchemy import event, insert, text
 from benchmarks.fleet_parts.demand import KINDS, Demand
 from benchmarks.fleet_parts.simulation import CHECKPOINT_SECONDS, LEASE_SECONDS, POLL_SECONDS
 from service.files.staging import CHECKPOINT
-from service.scheduling.progress import progress_seconds
+from service.scheduling.running import progress_seconds
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import _JOBS, NewJob, _row_of_new_job

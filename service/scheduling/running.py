@@ -7,6 +7,7 @@ import logging
 import queue
 import shutil
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -24,8 +25,7 @@ from service.parameters import stored_parameters
 from service.request import job_spec
 from service.scheduling.child_process import ChildProcess
 from service.scheduling.endings import Ending, Report, StopRequest, attempt_ending, cause_of_error, outage
-from service.scheduling.packing import Grant
-from service.scheduling.progress import ProgressWriter
+from service.scheduling.packing import Grant, estimated_seconds
 from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
 from service.scheduling.selection import Holding
 from service.scheduling.stager import Stager
@@ -35,6 +35,7 @@ from service.store import Store
 from service.store.leases import Lease
 from service.store.retries import Cause, cause_of
 from sgsst_core.errors import SettingsError
+from sgsst_core.progress import Progress
 
 #: Time that a canceled job has to finish its step, in seconds.
 _CANCEL_SECONDS = 8.0
@@ -43,6 +44,10 @@ _REPORT_SECONDS = 0.2
 #: Time limit of each piece of work on files at the start and the end of an attempt, in seconds; the time for the bytes
 #: of large files comes on top. It is longer than the S3 client's own.
 _FILE_SECONDS = 60.0
+
+#: Seconds between writes of progress: in the first minute, and for long-running jobs. More frequent writes would go
+#: unnoticed, and on a large fleet they are most of the database's load.
+_PROGRESS_SECONDS = (1.0, 5.0)
 
 Result = TypeVar("Result")
 
@@ -273,3 +278,44 @@ class RunningAttempt:
         """Remove leftovers of the ended job; housekeeping removes those that remain."""
         with contextlib.suppress(StoreError):
             self._within(self._publisher.sweep)
+
+
+class ProgressWriter:
+    """Writer of an attempt's progress, which starts with the attempt."""
+
+    def __init__(self, lease: Lease, store: Store) -> None:
+        self._lease, self._store = lease, store
+        self._started_at, self._written_at = time.monotonic(), 0.0
+        self._pending: Progress | None = None
+        self._ends_at: float | None = None
+
+    def update(self, progress: Progress) -> None:
+        """Set the progress to be written next."""
+        if progress.is_step and progress.eta_s is not None:
+            self._ends_at = time.monotonic() + progress.eta_s
+        self._pending = progress
+
+    def write(self, *, now: bool = False) -> None:
+        """Write new progress to the store if a write is due; `now` writes it in any case."""
+        time_now = time.monotonic()
+        due = time_now - self._written_at >= progress_seconds(time_now - self._started_at)
+        if self._pending is not None and (now or due):
+            self._store.leases.report_progress(self._lease, self._pending)
+            self._pending, self._written_at = None, time_now
+
+    def holding(self, grant: Grant) -> Holding:
+        """Return the capacity of the attempt with its expected end according to the last step."""
+        ends_at, job = self._ends_at, self._lease.job
+        if ends_at is None:
+            return Holding(grant)
+        until = self._store.database.clock() + ends_at - time.monotonic()
+        if job.attempt > 1:  # it may have resumed from a checkpoint, so its pace is unknown
+            return Holding(grant, until)
+        pace = (ends_at - self._started_at) / estimated_seconds(job, grant.ranks)
+        return Holding(grant, until, pace)
+
+
+def progress_seconds(elapsed: float) -> float:
+    """Return the interval between writes of progress, in seconds, for an attempt that has run this long."""
+    least, most = _PROGRESS_SECONDS
+    return min(max(elapsed / 60, least), most)
