@@ -14,9 +14,8 @@ from httpx_sse import aconnect_sse
 
 from api.client import uploads
 from api.client.answers import Event, Job, RequestError, checked
-from api.client.downloads import Download, Progress
 from api.client.inputs import JobFiles, path_or_url
-from api.client.transport import TRIES, Transport, in_thread
+from api.client.transport import TRIES, Download, Progress, Transport, in_thread
 from service.states import Transition
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import ensure_writable_folder

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from api.client.answers import ApiError, RequestError
-from api.client.downloads import Progress
 from api.client.inputs import InputFile, InputUrl, JobFiles, input_files
-from api.client.transport import Transport, in_thread, json_text
+from api.client.transport import Progress, Transport, in_thread, json_text
 
 #: Maximum bytes of a part; larger files are uploaded in parts.
 PART_BYTES = 16 << 20
