@@ -312,7 +312,16 @@ def mcp(url: UrlOption = None, key: KeyOption = None) -> None:
     serve(url, key)
 
 
-COMMANDS = (submit, status, watch, download, *map(_command_of, ACTIONS), delete, jobs, mcp)
+COMMANDS: tuple[Callable[..., None], ...] = (
+    submit,
+    status,
+    watch,
+    download,
+    *map(_command_of, ACTIONS),
+    delete,
+    jobs,
+    mcp,
+)
 
 # --- shared --------------------------------------------------------------------------------------------------------
 

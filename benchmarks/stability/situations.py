@@ -206,7 +206,7 @@ def reference_error(job: Stylizer) -> tuple[float, float, int]:
         return math.inf, REFERENCE_BOUND, double.flips
     rounding = nearest_weight(job.job.settings.style_loss, job.job.loss.network.unit) * _ROUNDING_OF_COSINES
     error = max(abs(actual.loss - exact.loss) - rounding, 0.0) / max(abs(exact.loss), 1.0)
-    if job.job.loss.style_loss == "sos":
+    if job.job.settings.style_loss == "sos":
         error = max(error, gradient)
         uncertain = max(uncertain, _rounding_of_features(job, exact, given, weight))
     return error, max(REFERENCE_BOUND, min(uncertain, _MOST_UNCERTAIN)), double.flips
