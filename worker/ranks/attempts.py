@@ -14,9 +14,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sgsst_core.errors import ClusterAwayError, RanksFailedError
 from worker.ranks.cluster import Cluster, scene_bytes
-from worker.ranks.failure_policy import FailedAttempt, Failure, GiveUp, RaiseError, decide, first_line
+from worker.ranks.failure_policy import FailedAttempt, Failure, check_retry, first_line
 from worker.ranks.rank import RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
 from worker.ranks.rank_group import (
     AttemptFailedError,
@@ -173,12 +172,7 @@ class _Attempts:
             except AttemptFailedError as error:
                 failure = error.failure
             self._record(failure, progressed=self._relay.farthest != before)
-            decision = decide(self._failed)
-            if isinstance(decision, RaiseError):
-                raise decision.error
-            if isinstance(decision, GiveUp):
-                raise (ClusterAwayError if decision.outage else RanksFailedError)(decision.sentence) from failure.error
-            self._listener.happened(decision.sentence)
+            self._listener.happened(check_retry(self._failed))
             if self._listener.stop():
                 return self._ended(None)
 

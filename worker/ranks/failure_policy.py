@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from sgsst_core.errors import RanksDriftedError, SgsstError
+from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedError, SgsstError
 
 #: Maximum number of attempts in a row without progress.
 MOST_ATTEMPTS = 3
@@ -35,7 +35,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class FailedAttempt:
-    """Outcome of a failed attempt, for `decide`.
+    """Outcome of a failed attempt, for `check_retry`.
 
     Attributes:
         failure: Cause of the failure.
@@ -46,34 +46,6 @@ class FailedAttempt:
     failure: Failure
     last_step: int
     progressed: bool
-
-
-@dataclass(frozen=True)
-class TryAgain:
-    """Decision to start another attempt; `sentence` describes the failure."""
-
-    sentence: str
-
-
-@dataclass(frozen=True)
-class RaiseError:
-    """Decision to end the job with the error that a rank raised."""
-
-    error: Exception
-
-
-@dataclass(frozen=True)
-class GiveUp:
-    """Decision to end the job because another attempt is unlikely to help; `sentence` states the reason.
-
-    The job is not to blame (`outage`) if a machine, the network or Ray has failed.
-    """
-
-    sentence: str
-    outage: bool = False
-
-
-Decision = TryAgain | RaiseError | GiveUp
 
 
 def failure_of(error: Exception, rank: str) -> Failure:
@@ -88,29 +60,33 @@ def failure_of(error: Exception, rank: str) -> Failure:
     return Failure("loss", f"{rank} failed: {first_line(error)}", error)
 
 
-def decide(attempts: Sequence[FailedAttempt]) -> Decision:
-    """Decide how to continue after the last of these attempts.
+def check_retry(attempts: Sequence[FailedAttempt]) -> str:
+    """Return a sentence about the last of these attempts if another one may help.
 
     Args:
         attempts: All failed attempts of the job in order; at least one.
+
+    Raises:
+        Exception: Error that a rank raised, if it is one of the job itself or occurred twice at the same step.
+        RanksFailedError: If another attempt is unlikely to help.
+        ClusterAwayError: If it is unlikely to help because of a machine, the network or Ray.
     """
     last = attempts[-1]
     failure = last.failure
+    give_up = ClusterAwayError if failure.kind == "machine" else RanksFailedError
     if failure.kind == "job" and failure.error is not None:
-        return RaiseError(failure.error)
+        raise failure.error
     if failure.error is not None and not last.progressed and _came_again(attempts):
         if isinstance(failure.error, SgsstError | MemoryError | RuntimeError):
-            return RaiseError(failure.error)
-        sentence = f"{failure.reason}; the same happened twice at step {last.last_step}."
-        return GiveUp(sentence, failure.kind == "machine")
+            raise failure.error
+        raise give_up(f"{failure.reason}; the same happened twice at step {last.last_step}.") from failure.error
     in_vain = _in_vain(attempts)
     if in_vain >= MOST_ATTEMPTS:
         farthest = max(attempt.last_step for attempt in attempts)
-        return GiveUp(
-            f"{in_vain} attempts in a row came no further than step {farthest}. The last one: {failure.reason}.",
-            failure.kind == "machine",
-        )
-    return TryAgain(f"{failure.reason}, after step {last.last_step}.")
+        raise give_up(
+            f"{in_vain} attempts in a row came no further than step {farthest}. The last one: {failure.reason}."
+        ) from failure.error
+    return f"{failure.reason}, after step {last.last_step}."
 
 
 def _came_again(attempts: Sequence[FailedAttempt]) -> bool:
