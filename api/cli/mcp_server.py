@@ -76,7 +76,7 @@ class State(BaseModel):
     status: str
     stage: str | None
     fraction: float | None
-    seconds_left: float | None
+    eta_s: float | None
     queue_position: int | None
     result: dict[str, Any] | None
     error: str | None
@@ -167,7 +167,7 @@ class Tools:
             status=job.status,
             stage=progress.get("stage"),
             fraction=progress.get("fraction"),
-            seconds_left=progress.get("eta_s"),
+            eta_s=progress.get("eta_s"),
             queue_position=job.data["queue_position"],
             result=job.data["result"],
             error=job.error["message"] if job.error else None,
