@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,6 @@ from pydantic import BaseModel
 from service.scheduling.endings import OUTAGE, Ending, Report, cause_of_error, outage
 from service.scheduling.store_workplace import StoreWorkplace
 from service.states import AttemptOutcome
-from service.store.leases import Published
 from service.store.retries import Cause
 from sgsst_core.progress import Progress
 from worker.job import JobSpec, Resume
@@ -116,8 +114,8 @@ class AttemptProcess:
             warn=log,
             stop=self._stopping.is_set,
             finish=self._finishing.is_set,
-            left_out=report_left_out,
-            stored=report_stored,
+            left_out=lambda gpus: send(Report(left_out=tuple(gpus))),
+            stored=lambda file: send(Report(stored=file)),
         )
         options = WorkerOptions(
             checkpoint_seconds=self._task.checkpoint_seconds,
@@ -156,16 +154,6 @@ def report_prepared(prepared: Prepared) -> None:
     for heading, line in prepared.lines:
         log(f"{heading}: {line}")
     send(Report(prepared=True))
-
-
-def report_left_out(gpus: Sequence[str]) -> None:
-    """Report GPUs that the plan does not use."""
-    send(Report(left_out=tuple(gpus)))
-
-
-def report_stored(file: Published) -> None:
-    """Report a file that a rank has put into the file store."""
-    send(Report(stored=file))
 
 
 def failure(error: Exception) -> Ending:
