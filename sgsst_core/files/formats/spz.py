@@ -67,7 +67,7 @@ _READ_BYTES = 1 << 18
 #: Maximum bytes of extensions.
 _EXTENSION_BYTES = 1 << 20
 #: Maximum window of zstd, the default limit of its command-line program: 2^27 bytes.
-_ZSTD_OPTIONS = {zstd.DecompressionParameter.window_log_max: 27}
+_ZSTD_OPTIONS: dict[int, int] = {zstd.DecompressionParameter.window_log_max: 27}
 #: Maximum compression ratio of zstd: a block of at most 128 KiB takes at least four bytes (RFC 8878, section 3.1.1.2).
 _ZSTD_RATIO = (1 << 17) // 4
 
