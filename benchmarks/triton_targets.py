@@ -32,10 +32,10 @@ from sgsst_core.features import pooling_triton_kernels as pooling_kernels
 from sgsst_core.features import statistics_kernels
 from sgsst_core.features.statistics import (
     FLUSH,
+    POSITIONS,
     TILE,
     block_of_channels,
     block_of_entries,
-    positions_of_block,
 )
 from sgsst_core.loss import statistics_terms
 from sgsst_core.loss import statistics_terms_kernels as loss_kernels
@@ -100,7 +100,7 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
     features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
     matrix: dict[str, Any] = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True}
     dtype = _DTYPES[form]
-    block, step = positions_of_block(dtype), statistics_terms.STEPS[dtype.itemsize]
+    block, step = POSITIONS[dtype.itemsize], statistics_terms.STEPS[dtype.itemsize]
     moments = {**matrix, "P": block, "PARTS": FLUSH[dtype.itemsize] // block}
     gradient = {**matrix, "K": block_of_channels(channels, step), "P": statistics_terms.POSITIONS}
     types = {"features": features, "gradient": features}

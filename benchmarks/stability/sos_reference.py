@@ -138,7 +138,7 @@ def sos_reference(
         coverage: [H, W] position weights; None for equal weights.
         content_weights: [H, W] position weights of the content term relative to `content_weight`; None for `coverage`.
         style_loss: Style loss; see `terms`. If it matches features, the style may have at most
-            `nearest.MOST_VECTORS` positions.
+            `nearest.MAX_VECTORS` positions.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         scales: Weight of each scale from full size downwards; empty for equal weights.
     """

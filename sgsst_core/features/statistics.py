@@ -38,6 +38,8 @@ _GPU_PROGRAMS = 1024
 #: Positions after which a program starts a new accumulator of second moments, by bytes per feature. Longer float32
 #: chains round too much: one over 3,500 positions of float32 features is off by 1e-5.
 FLUSH = {2: 256, 4: 128}
+#: Positions per step of a program, by bytes per feature.
+POSITIONS = {2: 64, 4: 32}
 #: Minimum number of feature rows averaged for the shift.
 _SHIFT_ROWS = 64
 #: Channels per block of a program.
@@ -45,7 +47,7 @@ TILE = 64
 #: Matrix entries per program, rounded to whole rows.
 ENTRIES = 512
 #: Minimum channels per block, as required for matrix products. Layers with fewer channels fill part of a block.
-LEAST_CHANNELS = 16
+MIN_CHANNELS = 16
 
 
 @dataclass(frozen=True)
@@ -263,11 +265,6 @@ def layer_statistics_reference(features: Tensor, position_weights: Tensor | None
 # --- on a GPU ---
 
 
-def positions_of_block(dtype: torch.dtype) -> int:
-    """Return the number of positions per block of a program."""
-    return 64 if dtype == torch.bfloat16 else 32
-
-
 def span_positions(positions: int, channels: int) -> int:
     """Return the number of positions per span of a layer."""
     tiles = -(-channels // TILE)
@@ -276,20 +273,20 @@ def span_positions(positions: int, channels: int) -> int:
     return min(max(least, 1 << max(span.bit_length() - 1, 0)), most)
 
 
-def block_of_positions(usual: int) -> int:
-    """Return the number of positions per step of a program: `usual`, or more in Triton's interpreter."""
-    return 4096 if _is_interpreted() else usual
+def block_of_positions(on_gpu: int) -> int:
+    """Return the number of positions per step of a program: `on_gpu`, or more in Triton's interpreter."""
+    return 4096 if _is_interpreted() else on_gpu
 
 
 def block_of_entries(channels: int) -> int:
     """Return the number of matrix entries per program, in whole rows."""
-    channels = max(channels, LEAST_CHANNELS)
+    channels = max(channels, MIN_CHANNELS)
     return min(channels**2, 1 << 18 if _is_interpreted() else max(ENTRIES, channels))
 
 
 def block_of_channels(channels: int, most: int | None = None) -> int:
     """Return the number of channels per step: all of them, or at most `most`."""
-    return min(max(channels, LEAST_CHANNELS), most or max(channels, LEAST_CHANNELS))
+    return min(max(channels, MIN_CHANNELS), most or max(channels, MIN_CHANNELS))
 
 
 def _is_interpreted() -> bool:
@@ -315,7 +312,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     height, width, channels = features.shape
     device, positions = features.device, height * width
     span, tile = span_positions(positions, channels), block_of_channels(channels, TILE)
-    block = block_of_positions(positions_of_block(features.dtype))
+    block = block_of_positions(POSITIONS[features.element_size()])
     shift = None
     if features.dtype != torch.bfloat16:
         shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1))
@@ -359,5 +356,5 @@ def row_cells(features: Tensor) -> int:
 
 def has_kernels(device: torch.device, channels: int) -> bool:
     """Return whether there are kernels on a device for layers with this number of channels."""
-    taken = channels < LEAST_CHANNELS or channels.bit_count() == 1
+    taken = channels < MIN_CHANNELS or channels.bit_count() == 1
     return device.type == "cuda" and taken and triton_runs_on(device)

@@ -21,11 +21,10 @@ from sgsst_core.features.vgg import CONTENT_LAYER
 from sgsst_core.loss.position_term import (
     Objective,
     PositionTerm,
-    PositionWeights,
     ScaledView,
     TermInputs,
 )
-from sgsst_core.loss.targets import ContentFeatures
+from sgsst_core.loss.targets import ContentFeatures, PositionWeights
 
 
 def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:

@@ -10,14 +10,14 @@ import math
 from collections.abc import Sequence
 
 #: Minimum number of steps in a window. If there are fewer views, a window consists of several rounds.
-SHORTEST_WINDOW = 24
+MIN_WINDOW = 24
 #: The loss has converged when it falls by less than this fraction from one window to the next.
-LEAST_FALL = 0.005
+MIN_FALL = 0.005
 
 
 def window_length(round_length: int) -> int:
-    """Return the length of a window: the smallest number of whole rounds with at least `SHORTEST_WINDOW` steps."""
-    return round_length * math.ceil(SHORTEST_WINDOW / round_length)
+    """Return the length of a window: the smallest number of whole rounds with at least `MIN_WINDOW` steps."""
+    return round_length * math.ceil(MIN_WINDOW / round_length)
 
 
 def smoothed(losses: Sequence[float], window: int) -> float:
@@ -49,4 +49,4 @@ def has_converged(losses: Sequence[float], round_length: int) -> bool:
     window = window_length(round_length)
     if len(losses) < 2 * window:
         return False
-    return smoothed(losses, window) > (1 - LEAST_FALL) * smoothed(losses[-2 * window : -window], window)
+    return smoothed(losses, window) > (1 - MIN_FALL) * smoothed(losses[-2 * window : -window], window)

@@ -21,7 +21,7 @@ from sgsst_core.loss.tiling import Division, Tiling
 from sgsst_core.timing import Timer
 
 #: Maximum number of cached graphs. Each takes about 1 MB, in addition to the memory pool that all graphs share.
-MOST_GRAPHS = 256
+MAX_GRAPHS = 256
 #: Number of visits of a view before a graph speeds it up: the first visit warms up the kernels, the second is captured.
 FIRST_VISITS = 2
 #: First version of PyTorch whose allocator recovers from a failed capture.
@@ -104,7 +104,7 @@ class LossGraphs:
         problem: Reason why capturing failed; None if it has not failed.
     """
 
-    def __init__(self, loss: SosLoss, most: int = MOST_GRAPHS) -> None:
+    def __init__(self, loss: SosLoss, most: int = MAX_GRAPHS) -> None:
         if loss.collectives.size > 1:
             raise ValueError("a graph cannot contain communication between ranks")
         self.loss = loss

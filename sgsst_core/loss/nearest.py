@@ -18,7 +18,7 @@ import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import NamedTuple, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -28,18 +28,17 @@ from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.loss.position_term import (
     Objective,
     PositionTerm,
-    PositionWeights,
     ScaledView,
     TermInputs,
 )
-from sgsst_core.loss.targets import StyleVectors, at_least_float32
+from sgsst_core.loss.targets import PositionWeights, StyleVectors, at_least_float32
 from sgsst_core.settings import StyleLossName
 from sgsst_core.timing import Timer
 
 #: Maximum number of style vectors to search. Style images larger than 360 x 360 pixels have more vectors, and are
 #: subsampled evenly. Little is lost, because the receptive fields of neighboring vectors overlap almost completely. A
 #: larger search would take longer than the forward and backward passes of the network.
-MOST_VECTORS = 1 << 13
+MAX_VECTORS = 1 << 13
 #: Number of positions and number of style vectors per block of the search, by device. The similarities of a block fit
 #: in the CPU cache; on a GPU, they take a quarter of a gigabyte.
 _BLOCK = {"cpu": (1 << 10, 1 << 10), "cuda": (1 << 13, 1 << 13)}
@@ -207,14 +206,6 @@ def working_bytes(channels: int, value: int, device: str) -> int:
     return rows * (2 * columns + 3 * channels) * value
 
 
-class _MatchedRegion(NamedTuple):
-    """Style vectors of a region, factor of its distances, and its position weights."""
-
-    vectors: StyleVectors
-    factor: Tensor
-    weights: PositionWeights
-
-
 @dataclass(frozen=True)
 class NearestTerm(PositionTerm):
     """Nearest-neighbor term of one scale of a view.
@@ -224,7 +215,7 @@ class NearestTerm(PositionTerm):
     Attributes:
         layer: First of the matched layers, which all have the same cells.
         rounding: Relative rounding error of the features.
-        regions: Regions whose features are matched.
+        regions: Style vectors, factor of the distances and position weights of each region.
         matches: Matches of each tile, by region.
     """
 
@@ -235,7 +226,7 @@ class NearestTerm(PositionTerm):
     layer: str
     rounding: float
     timer: Timer
-    regions: list[_MatchedRegion]
+    regions: list[tuple[StyleVectors, Tensor, PositionWeights]]
     matches: dict[PartitionTile, list[Matches]] = field(default_factory=dict)
 
     @staticmethod
@@ -248,12 +239,12 @@ class NearestTerm(PositionTerm):
         """Return the term of one scale of a view; None if the loss does not have it."""
         network, layers = inputs.network, cls.layers(inputs.objective)
         regions = []
-        for style, weights in inputs.regions if layers else ():
+        for style in inputs.regions if layers else ():
             if style.vectors is not None:
-                count = inputs.view.count(layers[0], weights)
+                count = inputs.view.count(layers[0], style.positions)
                 weight = style.weight * nearest_weight(inputs.objective.style_loss, network.unit)
                 factor = weight / torch.where(count > 0, count, torch.inf)
-                regions.append(_MatchedRegion(style.vectors, factor, weights))
+                regions.append((style.vectors, factor, style.positions))
         return cls(inputs.view, layers[0], network.rounding, inputs.timer, regions) if regions else None
 
     def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:

@@ -5,20 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.vgg import FeatureNetwork, layer_stride
-from sgsst_core.loss.targets import ContentFeatures, StyleTarget
+from sgsst_core.loss.targets import ContentFeatures, PositionWeights, StyleTarget
 from sgsst_core.parallel.division import Size
 from sgsst_core.settings import Settings, StyleLossName, make_settings
 from sgsst_core.timing import Timer
-
-#: Position weights [H >> k, W >> k] for each power of two 2^k; None for equal weights.
-PositionWeights = Sequence[Tensor] | None
 
 
 @dataclass(frozen=True)
@@ -80,19 +77,12 @@ class Objective:
     settings: Settings = field(default_factory=make_settings)
 
 
-class StyledRegion(NamedTuple):
-    """Region of a view, and the style that its features are compared with."""
-
-    style: StyleTarget
-    weights: PositionWeights
-
-
 @dataclass(frozen=True)
 class TermInputs:
     """Inputs of the terms of one scale of a view.
 
     Attributes:
-        regions: Regions with their styles; a single one for the whole view if the scene has no regions.
+        regions: Style targets with the positions of their regions; a single one if the scene has no regions.
         content: Content features; None without a content term.
         coverage: Position weights of terms that do not depend on the style.
         content_weights: Position weights of the content term, relative to its weight; None for `coverage`.
@@ -101,7 +91,7 @@ class TermInputs:
     view: ScaledView
     network: FeatureNetwork
     objective: Objective
-    regions: Sequence[StyledRegion]
+    regions: Sequence[StyleTarget]
     content: ContentFeatures | None
     coverage: PositionWeights
     content_weights: PositionWeights

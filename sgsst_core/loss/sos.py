@@ -17,7 +17,7 @@ from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.statistics import LayerStatistics, merge
 from sgsst_core.features.vgg import Activations, FeatureNetwork
-from sgsst_core.loss.position_term import Objective, PositionTerm, ScaledView, StyledRegion, TermInputs
+from sgsst_core.loss.position_term import Objective, PositionTerm, ScaledView, TermInputs
 from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.statistics_terms import StatisticsTerms, compared_layers
 from sgsst_core.loss.target_builder import TargetBuilder
@@ -327,10 +327,11 @@ def make_loss(
     )
 
 
-def _styled_regions(style: Sequence[StyleTarget], view: ViewTarget) -> list[StyledRegion]:
+def _styled_regions(style: Sequence[StyleTarget], view: ViewTarget) -> list[StyleTarget]:
     """Return the regions of a view; without regions, the whole view is the only one."""
     if view.regions is None and len(style) == 1:
-        return [StyledRegion(style[0], view.coverage)]
+        return [replace(style[0], positions=view.coverage)]
     if view.regions is None or len(view.regions) != len(style):
         raise ValueError("the view was not prepared for the regions that the style has")
-    return [StyledRegion(*pair) for pair in zip(style, view.regions, strict=True) if pair[0].weight]
+    pairs = zip(style, view.regions, strict=True)
+    return [replace(own, positions=weights) for own, weights in pairs if own.weight]

@@ -33,8 +33,8 @@ from sgsst_core.features.statistics import (
     row_cells,
 )
 from sgsst_core.features.vgg import PIXELS, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.position_term import StyledRegion, TermInputs
-from sgsst_core.loss.targets import LayerTarget
+from sgsst_core.loss.position_term import TermInputs
+from sgsst_core.loss.targets import LayerTarget, StyleTarget
 from sgsst_core.settings import StyleLossName
 
 #: Terms of the statistics: name in files and reports, and display name.
@@ -220,7 +220,7 @@ class StatisticsTerms:
         self._regions = inputs.regions
         self._layers = layers
         #: Gradients by layer, with the regions that they apply to.
-        self._gradients: dict[str, list[tuple[StyleGradient, StyledRegion]]] = {}
+        self._gradients: dict[str, list[tuple[StyleGradient, StyleTarget]]] = {}
 
     def zero(self) -> list[LayerStatistics]:
         """Return statistics of zero pixels, to which those of tiles are added."""
@@ -233,7 +233,7 @@ class StatisticsTerms:
         for region in self._regions:
             for layer in self._layers:
                 in_view, in_tile = tile.owned_cells(layer, self._view.size)
-                owned, weights = features[layer][in_tile.slices], self._view.weights(layer, in_view, region.weights)
+                owned, weights = features[layer][in_tile.slices], self._view.weights(layer, in_view, region.positions)
                 nowhere = self._is_nowhere(weights)
                 zero = LayerStatistics.zero(owned.shape[-1], owned.device) if nowhere else None
                 statistics.append(zero or layer_statistics(owned, weights))
@@ -248,18 +248,18 @@ class StatisticsTerms:
         total = torch.zeros(len(STATISTICS_TERMS), dtype=torch.float64, device=self._view.image.device)
         pairs = [(region, layer) for region in self._regions for layer in self._layers]
         for (region, layer), own in zip(pairs, statistics, strict=True):
-            if layer not in region.style.layers:
+            if layer not in region.layers:
                 continue
             terms, gradient = style_loss(
                 own,
-                region.style.layers[layer],
+                region.layers[layer],
                 feature_eps=self._network.rounding_of(layer),
                 weights=term_weights(layer, self._network.pixel_weight),
             )
             if layer == PIXELS and gradient.matrix.dtype == torch.float64:  # the GPU kernels already do this
                 gradient = gradient.about_rounded_mean()
-            if region.style.weight != 1:
-                terms, gradient = region.style.weight * terms, gradient.times(region.style.weight)
+            if region.weight != 1:
+                terms, gradient = region.weight * terms, gradient.times(region.weight)
             total = total + terms
             self._gradients.setdefault(layer, []).append((gradient, region))
         return dict(zip(STATISTICS_TERMS, total.unbind(), strict=True))
@@ -268,7 +268,7 @@ class StatisticsTerms:
         """Add the gradient with respect to a layer's features of a tile, on the cells that the tile owns, in place."""
         in_view, in_tile = tile.owned_cells(layer, self._view.size)
         for own, region in self._gradients.get(layer, ()):
-            weights = self._view.weights(layer, in_view, region.weights)
+            weights = self._view.weights(layer, in_view, region.positions)
             if not self._is_nowhere(weights):
                 own.add_to(gradient[in_tile.slices], features[in_tile.slices], weights)
 

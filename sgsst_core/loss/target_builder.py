@@ -11,7 +11,7 @@ from sgsst_core.errors import ImageError
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork, layer_stride
-from sgsst_core.loss.nearest import MOST_VECTORS, nearest_layers, positions_in, positions_per_image
+from sgsst_core.loss.nearest import MAX_VECTORS, nearest_layers, positions_in, positions_per_image
 from sgsst_core.loss.position_term import ScaledView
 from sgsst_core.loss.statistics_terms import compared_layers
 from sgsst_core.loss.targets import ContentFeatures, LayerTarget, StyleTarget, StyleTargets, StyleVectors, ViewTarget
@@ -141,7 +141,7 @@ class TargetBuilder:
             return None
         stride = layer_stride(self._matched[0])
         counts = [(size[0] // stride) * (size[1] // stride) for size in map(_size, images)]
-        chosen = positions_per_image(counts, weights, MOST_VECTORS)
+        chosen = positions_per_image(counts, weights, MAX_VECTORS)
         vectors = [
             self._vectors_of(image, chosen_positions(count, some))
             for image, count, some in zip(images, counts, chosen, strict=True)

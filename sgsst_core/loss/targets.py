@@ -81,6 +81,10 @@ def at_least_float32(values: Tensor) -> Tensor:
     return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
+#: Position weights [H >> k, W >> k] for each power of two 2^k; None for equal weights.
+PositionWeights = Sequence[Tensor] | None
+
+
 @dataclass(frozen=True)
 class StyleTarget:
     """Style target of a region, or of a whole view, at one scale.
@@ -89,11 +93,13 @@ class StyleTarget:
         layers: Statistics by layer, for compared layers with at least one cell at this scale.
         vectors: Style vectors for nearest-neighbor matching; None if the loss matches no features.
         weight: Factor of the region's style loss.
+        positions: Position weights of the region in the view that is compared.
     """
 
     layers: Mapping[str, LayerTarget]
     vectors: StyleVectors | None = None
     weight: float = 1.0
+    positions: PositionWeights = None
 
 
 #: Style targets by scale: one for each region of the scene, or a single one for whole views.

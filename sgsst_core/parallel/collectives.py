@@ -1,4 +1,4 @@
-"""Collective operations between the ranks of a job; `ALONE` implements them for a single rank.
+"""Collective operations between the ranks of a job; those of several ranks are in `worker.ranks.process_group`.
 
 Every rank calls the same methods in the same order. Results that are "identical on all ranks" are bit-identical, so all
 ranks reach the same decisions based on such results without further messages.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Literal, Protocol, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 from torch import Tensor
 
@@ -22,27 +22,22 @@ Traffic = Literal["image", "statistics", "gradient"]
 TRAFFIC: tuple[Traffic, ...] = get_args(Traffic)
 
 
-class Collectives(Protocol):
-    """Collective operations of one rank in a group of ranks.
+class Collectives:
+    """Collective operations of one rank in a group of ranks; this class implements them for a single rank.
 
     Attributes:
         rank: Index of this rank in the group.
         local_size: Number of ranks on this machine, including this one.
         gpu_sharing: Largest number of ranks on one GPU; 1 without GPUs.
+        sent: Bytes of tensors sent by this rank so far, assuming ring algorithms; other messages are negligible. The
+            count is shared between this group, its parent group and its subgroups.
     """
 
-    rank: int
-    size: int
-    local_size: int
-    gpu_sharing: int
-
-    @property
-    def sent(self) -> Mapping[Traffic, int]:
-        """Bytes of tensors sent by this rank so far, assuming ring algorithms; other messages are negligible.
-
-        The count is shared between this group, its parent group and its subgroups.
-        """
-        ...
+    rank: int = 0
+    size: int = 1
+    local_size: int = 1
+    gpu_sharing: int = 1
+    sent: Mapping[Traffic, int] = MappingProxyType(dict.fromkeys(TRAFFIC, 0))
 
     def gather_parts(
         self, exchanges: Sequence[ImageExchange], parts: Sequence[Tensor], windows: Sequence[Tensor]
@@ -54,22 +49,27 @@ class Collectives(Protocol):
             parts: [h, w, ...], part of this rank of each image.
             windows: [h, w, ...], window of this rank of each image. Pixels in no part are left unchanged.
         """
-        ...
+        for exchange, part, window in zip(exchanges, parts, windows, strict=True):
+            exchange.in_window(window, 0, 0).copy_(exchange.in_part(part, 0, 0))
 
     def reduce_parts(self, exchanges: Sequence[ImageExchange], windows: Sequence[Tensor]) -> list[Tensor]:
         """Return this rank's part [h, w, ...] of the sum of all ranks' windows, for each image.
 
         This is the adjoint of `gather_parts`.
         """
-        ...
+        totals = []
+        for exchange, window in zip(exchanges, windows, strict=True):
+            totals.append(window.new_zeros((*exchange.parts[0].shape, *window.shape[2:])))
+            exchange.in_part(totals[-1], 0, 0).copy_(exchange.in_window(window, 0, 0))
+        return totals
 
     def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
         """Return the sum over all ranks, identical on all ranks. The argument may be overwritten."""
-        ...
+        return tensor
 
     def union(self, mask: Tensor) -> Tensor:
         """Return the elementwise OR of all ranks' masks [n] bool, identical on all ranks."""
-        ...
+        return mask
 
     def all_reduce_statistics(
         self, parts: Sequence[LayerStatistics], numbers: Tensor
@@ -83,7 +83,7 @@ class Collectives(Protocol):
         Returns:
             Merged statistics in the order of `parts`, and the sums [k] float64.
         """
-        ...
+        return list(parts), numbers
 
     def all_gather(self, value: T) -> list[T]:
         """Return every rank's value in rank order, identical on all ranks.
@@ -91,11 +91,11 @@ class Collectives(Protocol):
         Values should be small. Allowed are scalars, strings, lists, tuples, dicts, paths, arrays, tensors, and this
         project's dataclasses and errors.
         """
-        ...
+        return [value]
 
     def broadcast(self, make: Callable[[], T]) -> T:
         """Call `make` on rank 0 only, and return its result on all ranks; an `SgsstError` is raised on all ranks."""
-        ...
+        return make()
 
     def set_timeout_for(self, iteration_seconds: float) -> None:
         """Set the timeout of collectives for iterations of this length.
@@ -103,68 +103,21 @@ class Collectives(Protocol):
         After this call, all ranks communicate in every iteration, and a rank that is late by much more than an
         iteration counts as failed. Before this call, the timeout is long enough for the preparation of a job.
         """
-        ...
 
     def leading_group(self, count: int) -> Collectives | None:
         """Return the group of the first `count` ranks; return None on ranks outside the group."""
-        ...
+        return self
 
     def split_group(self, groups: int) -> Collectives:
         """Split the ranks into `groups` equal groups of consecutive ranks, and return this rank's group."""
-        ...
+        return self
+
+
+ALONE = Collectives()
 
 
 class RankLeftOut(Exception):  # noqa: N818 (not an error: the job continues without this rank)
     """Exception on a rank that the plan does not use, because it would only add communication."""
-
-
-class _Alone:
-    """Collectives of a single rank."""
-
-    rank, size, local_size, gpu_sharing = 0, 1, 1, 1
-    sent: Mapping[Traffic, int] = MappingProxyType(dict.fromkeys(TRAFFIC, 0))
-
-    def gather_parts(
-        self, exchanges: Sequence[ImageExchange], parts: Sequence[Tensor], windows: Sequence[Tensor]
-    ) -> None:
-        for exchange, part, window in zip(exchanges, parts, windows, strict=True):
-            exchange.in_window(window, 0, 0).copy_(exchange.in_part(part, 0, 0))
-
-    def reduce_parts(self, exchanges: Sequence[ImageExchange], windows: Sequence[Tensor]) -> list[Tensor]:
-        totals = []
-        for exchange, window in zip(exchanges, windows, strict=True):
-            totals.append(window.new_zeros((*exchange.parts[0].shape, *window.shape[2:])))
-            exchange.in_part(totals[-1], 0, 0).copy_(exchange.in_window(window, 0, 0))
-        return totals
-
-    def all_reduce(self, tensor: Tensor, traffic: Traffic = "gradient") -> Tensor:
-        return tensor
-
-    def union(self, mask: Tensor) -> Tensor:
-        return mask
-
-    def all_reduce_statistics(
-        self, parts: Sequence[LayerStatistics], numbers: Tensor
-    ) -> tuple[list[LayerStatistics], Tensor]:
-        return list(parts), numbers
-
-    def all_gather(self, value: T) -> list[T]:
-        return [value]
-
-    def broadcast(self, make: Callable[[], T]) -> T:
-        return make()
-
-    def set_timeout_for(self, iteration_seconds: float) -> None:
-        return None
-
-    def leading_group(self, count: int) -> Collectives | None:
-        return self
-
-    def split_group(self, groups: int) -> Collectives:
-        return self
-
-
-ALONE: Collectives = _Alone()
 
 
 def same_on_all(collectives: Collectives, value: Any) -> bool:

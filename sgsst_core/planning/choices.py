@@ -14,8 +14,8 @@ from torch import Tensor
 
 from sgsst_core.budget import memory_for
 from sgsst_core.decision import VIEWS, Decision
-from sgsst_core.loss.convergence import LEAST_FALL, window_length
-from sgsst_core.loss.nearest import MOST_VECTORS, NEAREST_WEIGHTS
+from sgsst_core.loss.convergence import MIN_FALL, window_length
+from sgsst_core.loss.nearest import MAX_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.number_format import duration
@@ -267,7 +267,7 @@ def about_early_stop(background: PlannedBackground, views: int, settings: Settin
     return [
         Decision(
             "early stop",
-            f"when the mean loss of {window_length(views)} steps is less than {LEAST_FALL:.1%} below that of the same "
+            f"when the mean loss of {window_length(views)} steps is less than {MIN_FALL:.1%} below that of the same "
             "number of steps before",
             "later steps would gain little",
             error="the remaining decrease of the loss",
@@ -312,7 +312,7 @@ def about_network(model: CostModel, probe: Probe, settings: Settings) -> list[De
         weight = NEAREST_WEIGHTS[settings.style_loss]
         what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
         distance = (
-            f"the distance of relu3 features to the nearest of at most {MOST_VECTORS:,} style features {what}, with "
+            f"the distance of relu3 features to the nearest of at most {MAX_VECTORS:,} style features {what}, with "
             f"weight {weight:.3g}; the search takes {duration(work.pairs * network.rate.search, ' ')} per view"
         )
         lines.append(Decision("style loss", distance, f"{settings.style_loss} was requested", error=ANOTHER_LOSS))

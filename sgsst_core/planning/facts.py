@@ -108,7 +108,7 @@ class RasterCost:
         caching_seconds: Time in seconds to compute a view's cached weights; None on the CPU, where it is not measured.
         first_seconds: Additional time in seconds of a view's first render, which computes its tile intersections.
         intersection_bytes: Mean size in bytes of a view's tile intersections; 0 if unknown.
-        most_pairs: Largest number of pairs of Gaussian and raster tile that a GPU sorts for a view; 0 if unknown.
+        max_pairs: Largest number of pairs of Gaussian and raster tile that a GPU sorts for a view; 0 if unknown.
         colors_seconds: Time in seconds for the contribution of spherical harmonics to the colors of a view.
         fixed: Portion of `seconds` that does not depend on the number of pixels. It is measured on a single raster tile
             if there are several ranks, each of which renders a part of a view; 0 otherwise.
@@ -122,7 +122,7 @@ class RasterCost:
     caching_seconds: float | None = None
     first_seconds: float = 0.0
     intersection_bytes: int = 0
-    most_pairs: int = 0
+    max_pairs: int = 0
     colors_seconds: float = 0.0
     fixed: float = 0.0
     first_fixed: float = 0.0

@@ -78,7 +78,7 @@ class PeakMemory:
         measuring, everything = MEASURING_BYTES if plan.measured else 0, probe.scene.gaussians
         held = self._intersections_and_weights() + self._content() + self._colors() + self._novel_views()
         held += gaussians * OPTIMIZER_BYTES
-        pairs = int(probe.raster.most_pairs * self.part.window)
+        pairs = int(probe.raster.max_pairs * self.part.window)
         building = everything * BUILDING_BYTES + pairs * SORTING_BYTES
         if probe.machine.device != "cpu":
             rastering = pairs * _SLOT_BYTES

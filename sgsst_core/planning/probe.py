@@ -290,7 +290,7 @@ def _raster_cost(context: PlanningContext, cameras: Sequence[Camera]) -> RasterC
     known: dict[str, Any] = {
         "first_seconds": cost.preparation_seconds,
         "intersection_bytes": cost.preparation_bytes,
-        "most_pairs": cost.most_pairs,
+        "max_pairs": cost.max_pairs,
         "colors_seconds": _colors_seconds(scene, sample[middle], rasterizer.device),
     }
     if context.machine.ranks > 1:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sgsst_core.features.partition import Rectangle, computed_twice, scaled_region
 from sgsst_core.features.vgg import layer_stride
-from sgsst_core.loss.nearest import MATCH_BYTES, MOST_VECTORS, working_bytes
+from sgsst_core.loss.nearest import MATCH_BYTES, MAX_VECTORS, working_bytes
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Piece, Size
 from sgsst_core.planning.facts import NetworkFacts
@@ -115,7 +115,7 @@ def pairs_of(piece: Piece) -> int:
 def _vectors(size: Size) -> int:
     """Return the number of vectors of a style as large as a scaled view of size (height, width)."""
     stride = layer_stride(_MATCHED)
-    return min((size[0] // stride) * (size[1] // stride), MOST_VECTORS)
+    return min((size[0] // stride) * (size[1] // stride), MAX_VECTORS)
 
 
 def content_bytes(sizes: Iterable[Size], tiling: Tiling, cell: int) -> int:

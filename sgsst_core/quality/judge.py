@@ -37,11 +37,11 @@ JUDGED_SIDE = 1024
 #: Gray values of the backgrounds that each view is judged on: black and white.
 _BACKGROUNDS = (0.0, 1.0)
 #: Minimum coverage of judged views.
-_LEAST_COVERAGE = 1e-3
+_MIN_COVERAGE = 1e-3
 #: Minimum coverage of every pixel that an interior feature sees.
 _INTERIOR = 0.9
 #: Minimum number of interior features of a layer. Layers with fewer are left out of a view's interior measures.
-_LEAST_INTERIOR = 64
+_MIN_INTERIOR = 64
 #: Number of random directions of the sliced Wasserstein distance, and number of quantiles along each.
 _DIRECTIONS, _QUANTILES = 64, 256
 #: Factor that converts color distances to 8-bit levels.
@@ -61,7 +61,7 @@ class Judgment:
         features: 1 - cosine between AlexNet's features of the stylized and the unstylized scene, averaged over layers.
         background_sensitivity: Absolute difference in `style` between black and white background, averaged over views.
         saturated: Fraction of the Gaussians with a color channel outside [0, 1].
-        interior_style: `style` over features that see no background (see `Lpips.least_coverage`), averaged over layers
+        interior_style: `style` over features that see no background (see `Lpips.min_coverage`), averaged over layers
             with enough of them; None if no view has any.
         sliced_features: Sliced Wasserstein distance of order 1 between these features and the style's (Rabin et al.
             2011), relative to the style's mean absolute projection, averaged likewise. It compares whole
@@ -115,7 +115,7 @@ class Judge:
         self.cameras = [
             camera
             for camera in small
-            if min(camera.width, camera.height) >= lpips.minimum_side and self._covered(camera) >= _LEAST_COVERAGE
+            if min(camera.width, camera.height) >= lpips.minimum_side and self._covered(camera) >= _MIN_COVERAGE
         ]
 
     @torch.no_grad()
@@ -264,9 +264,9 @@ class _StyleJudge:
         """
         targets = self._layers((int(coverage.shape[0]), int(coverage.shape[1])))
         distances = []
-        for values, least, target in zip(features, self._lpips.least_coverage(coverage), targets, strict=True):
+        for values, least, target in zip(features, self._lpips.min_coverage(coverage), targets, strict=True):
             inside = values[least >= _INTERIOR][None]  # [1, n, c]
-            if inside.shape[1] >= _LEAST_INTERIOR:
+            if inside.shape[1] >= _MIN_INTERIOR:
                 ones = torch.ones(inside.shape[:2], device=inside.device)
                 sliced = _relative_difference(_quantiles(inside, ones), target.quantiles)
                 distances.append((_relative(_gram(inside, ones), target.gram), sliced))

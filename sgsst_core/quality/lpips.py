@@ -113,7 +113,7 @@ class Lpips:
         """
         return self._layers(image.to(self.device, self.dtype))
 
-    def least_coverage(self, coverage: Tensor) -> list[Tensor]:
+    def min_coverage(self, coverage: Tensor) -> list[Tensor]:
         """Return the smallest coverage inside the receptive field of each feature of AlexNet.
 
         Args:

@@ -38,7 +38,7 @@ from sgsst_core.stylizing.evaluation import ShowViews, show_nothing
 from sgsst_core.stylizing.views import ViewColors
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
-MOST_VIEWS = 4
+MAX_VIEWS = 4
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class NovelViews:
         weighted: bool,
         lpips: Lpips | None = None,
         first: dict[int, float] | None = None,
-        most: int = MOST_VIEWS,
+        most: int = MAX_VIEWS,
         memory: int = 1 << 29,
         rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
         maps: ViewMaps | None = None,

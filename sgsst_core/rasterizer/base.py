@@ -82,13 +82,13 @@ class RenderCost:
         seconds: Time in seconds of one render with gradient of each prepared view.
         preparation_seconds: Mean time in seconds to prepare a view, for example to build its tile intersections.
         preparation_bytes: Mean size in bytes of the prepared data; 0 if unknown.
-        most_pairs: Largest number of pairs of Gaussian and raster tile that a GPU sorts for a view; 0 if unknown.
+        max_pairs: Largest number of pairs of Gaussian and raster tile that a GPU sorts for a view; 0 if unknown.
     """
 
     seconds: list[float]
     preparation_seconds: float
     preparation_bytes: int
-    most_pairs: int = 0
+    max_pairs: int = 0
 
 
 class Rasterizer(ABC):

@@ -48,7 +48,7 @@ class CachedRasterizer(Rasterizer):
             per weight.
         max_bytes: Memory budget for weights; None for no limit. On the CPU, the tile intersections of `uncached` may
             use the rest of this budget. Those of a view are dropped once the weights of the view are cached.
-        least_intersection_bytes: Minimum budget for these tile intersections, regardless of the size of the weights.
+        min_intersection_bytes: Minimum budget for these tile intersections, regardless of the size of the weights.
         at_first_use: Whether to cache weights at first use. If False, only `cache_weights` does, and rendering
             other views does not affect later results.
         device: Device for the default of `uncached`; None for the CPU.
@@ -69,7 +69,7 @@ class CachedRasterizer(Rasterizer):
         *,
         precision: Precision = "float32",
         max_bytes: int | None = None,
-        least_intersection_bytes: int = 0,
+        min_intersection_bytes: int = 0,
         at_first_use: bool = True,
         device: torch.device | str | None = None,
         uncached: Rasterizer | None = None,
@@ -82,7 +82,7 @@ class CachedRasterizer(Rasterizer):
         self.scene, self.device, self.near = scene, uncached.device, uncached.near
         self.precision: Precision = precision
         self.max_bytes = max_bytes
-        self.least_intersection_bytes = least_intersection_bytes
+        self.min_intersection_bytes = min_intersection_bytes
         self._at_first_use = at_first_use
         self._cached: Cache[CameraKey, CachedWeights] = Cache(max_bytes)
         self._temporary: dict[CameraKey, CachedWeights] = {}
@@ -192,7 +192,7 @@ class CachedRasterizer(Rasterizer):
             weights = counted.store(self.precision)
             if self.max_bytes is not None:
                 left = self.max_bytes - self.cached_bytes - weights.nbytes
-                self.uncached.release_view(camera, max(left, self.least_intersection_bytes))
+                self.uncached.release_view(camera, max(left, self.min_intersection_bytes))
             return weights
 
         return counted.nbytes(self.precision), make

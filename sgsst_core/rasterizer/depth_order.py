@@ -18,7 +18,7 @@ from sgsst_core.compiled import compiled, kernel_threads
 
 #: Gaussians per bucket if depths are spread evenly.
 _BUCKET = 16
-_MOST_BUCKETS = 1 << 17
+_MAX_BUCKETS = 1 << 17
 #: Buckets of up to this size are sorted by insertion, larger ones by merging.
 _INSERTED = 48
 
@@ -41,7 +41,7 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
         bits = np.empty(count, dtype=np.int64)
         _gather(depths.view(np.int64), visible, bits)
         lowest, highest = int(bits.min()), int(bits.max())
-        target = min(max(count // _BUCKET, 1), _MOST_BUCKETS)
+        target = min(max(count // _BUCKET, 1), _MAX_BUCKETS)
         shift = max((highest - lowest).bit_length() - target.bit_length(), 0)
         buckets = ((highest - lowest) >> shift) + 1
         chunks = np.linspace(0, count, threads + 1).astype(np.int64)

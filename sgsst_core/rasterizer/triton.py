@@ -125,7 +125,7 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
         """Measure the cost of rendering some views with gradient, and the size of their tile intersections."""
         cost, built = super().probe_cost(cameras), [self.intersections(camera) for camera in cameras]
         pairs = max(len(isects.ranks) for isects in built)
-        return replace(cost, preparation_bytes=sum(isects.nbytes for isects in built) // len(built), most_pairs=pairs)
+        return replace(cost, preparation_bytes=sum(isects.nbytes for isects in built) // len(built), max_pairs=pairs)
 
     def count_weights(self, camera: Camera) -> CountedWeights:
         """Count a view's weights without storing them; takes about as long as one render."""

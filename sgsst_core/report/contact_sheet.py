@@ -26,7 +26,7 @@ _GAP = 12
 _LABEL = 18
 #: Sheet of views without a style: maximum number of views, their longer side, aspect ratio of the sheet, and maximum
 #: number of Gaussians.
-_MOST_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
+_MAX_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
 
 
 def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
@@ -70,7 +70,7 @@ def write_views(
     part = sampled(scene, _VIEW_GAUSSIANS)
     rasterizer = make_rasterizer("cpu", part, background=background, near=near)
     images = []
-    for camera in spread(cameras, _MOST_VIEWS):
+    for camera in spread(cameras, _MAX_VIEWS):
         small = resized(camera, min(camera.side, _VIEW_SIDE))
         colors = scene_colors(part, small)
         images.append((camera.name, _to_image(rasterizer.render(colors, small))))

@@ -20,7 +20,7 @@ AGAINST: tuple[Against, ...] = ("seconds", "steps")
 BINS = 300
 #: Range of values on logarithmic axes. matplotlib searches for ticks some decades beyond it, which must fit float64
 #: too.
-_LEAST, _MOST = 1e-200, 1e200
+_MIN, _MAX = 1e-200, 1e200
 #: Factor by which the x axis extends beyond the first and the last step.
 X_MARGIN = 1.05
 
@@ -158,7 +158,7 @@ def _phases(stages: Sequence[str]) -> list[tuple[str, slice]]:
 
 def drawable(values: Floats) -> NDArray[np.bool_]:
     """Return the mask [n] bool of the values that a logarithmic axis can show."""
-    return np.isfinite(values) & (values >= _LEAST) & (values <= _MOST)
+    return np.isfinite(values) & (values >= _MIN) & (values <= _MAX)
 
 
 def log_limits(values: Floats, margin: float) -> tuple[float, float]:

@@ -404,7 +404,7 @@ def _make_rasterizer(
     return CachedRasterizer(
         rendered,
         max_bytes=budget,
-        least_intersection_bytes=least_intersection_memory(memory),
+        min_intersection_bytes=least_intersection_memory(memory),
         precision="half" if plan.cached_weights == "half" else "float32",
         at_first_use=False,
         uncached=uncached,

@@ -11,7 +11,7 @@ from sgsst_core.errors import ImageError, SettingsError
 from sgsst_core.features.statistics import layer_statistics_reference, merge_all
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.files.images import load_image
-from sgsst_core.loss.nearest import MOST_VECTORS, positions_per_image
+from sgsst_core.loss.nearest import MAX_VECTORS, positions_per_image
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.loss.terms import layers_of
@@ -97,10 +97,10 @@ def test_features_are_matched_with_those_of_all_images(tiny_weights):
 
 
 def test_number_of_vectors_is_limited_in_proportion_to_weights():
-    assert positions_per_image([MOST_VECTORS, MOST_VECTORS], [0.75, 0.25], MOST_VECTORS) == [6144, 2048]
-    assert positions_per_image([3, 10**6], [0.9, 0.1], MOST_VECTORS) == [3, 819]
-    assert positions_per_image([10**6, 10**6], [1 - 1e-9, 1e-9], MOST_VECTORS)[1] == 1
-    assert positions_per_image([3, 4], [0.1, 0.9], MOST_VECTORS) == [3, 4]
+    assert positions_per_image([MAX_VECTORS, MAX_VECTORS], [0.75, 0.25], MAX_VECTORS) == [6144, 2048]
+    assert positions_per_image([3, 10**6], [0.9, 0.1], MAX_VECTORS) == [3, 819]
+    assert positions_per_image([10**6, 10**6], [1 - 1e-9, 1e-9], MAX_VECTORS)[1] == 1
+    assert positions_per_image([3, 4], [0.1, 0.9], MAX_VECTORS) == [3, 4]
 
 
 @pytest.mark.parametrize("weights", [[], [1.0, 0.0], [1.0, -1.0], [float("nan")], [float("inf"), 1.0]])

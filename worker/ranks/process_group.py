@@ -170,7 +170,7 @@ class _Stack:
         )
 
 
-class ProcessGroupCollectives:
+class ProcessGroupCollectives(Collectives):
     """`Collectives` of a torch.distributed group.
 
     Args:

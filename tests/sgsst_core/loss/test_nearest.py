@@ -12,7 +12,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss import nearest
 from sgsst_core.loss.nearest import (
-    MOST_VECTORS,
+    MAX_VECTORS,
     NEAREST_WEIGHTS,
     Matches,
     nearest_layers,
@@ -257,7 +257,7 @@ def test_style_without_vectors_is_refused(tiny_weights: BackboneWeights) -> None
 
 
 def test_large_styles_are_thinned_evenly() -> None:
-    assert chosen_positions(MOST_VECTORS, MOST_VECTORS).tolist() == list(range(MOST_VECTORS))
+    assert chosen_positions(MAX_VECTORS, MAX_VECTORS).tolist() == list(range(MAX_VECTORS))
     places = chosen_positions(1000 * 700, 5000)
     assert len(places) == 5000
     assert (places.diff() >= 0).all()
@@ -272,7 +272,7 @@ def test_large_styles_are_thinned_evenly() -> None:
 def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
     tiny_weights: BackboneWeights, tile_size: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sgsst_core.loss.target_builder.MOST_VECTORS", 200)
+    monkeypatch.setattr("sgsst_core.loss.target_builder.MAX_VECTORS", 200)
     style = synthetic_image(130, 201, seed=3)
     loss = loss_of(tiny_weights, "nnfm", tile_size=tile_size)
     vectors = loss.targets.of_style(Style.of(style), (130, 201))[0][0].vectors

@@ -115,7 +115,7 @@ def test_gpu_memory_includes_rasterizer_and_measurements() -> None:
     # The survey's tile intersections of all views are already in `device_bytes` of the probe.
     assert peak(intersection_bytes=10**8) == plain
     pairs = 10**9  # more than the activations take
-    assert peak(most_pairs=2 * pairs) - peak(most_pairs=pairs) == 36 * pairs
+    assert peak(max_pairs=2 * pairs) - peak(max_pairs=pairs) == 36 * pairs
     views = 4
     assert peak(measured=True) - plain == 6 * (SHAPE_BYTES + 12 * 4 * views) + views * HEIGHT * WIDTH * 80
 

@@ -143,7 +143,7 @@ def test_interior_features_do_not_depend_on_the_background(alex: Lpips) -> None:
     coverage = torch.zeros(200, 240)
     coverage[10:190, 20:210] = 1
     changed = torch.where(coverage[..., None] > 0, image, other)
-    for layer, least in enumerate(alex.least_coverage(coverage)):
+    for layer, least in enumerate(alex.min_coverage(coverage)):
         difference = (alex.features(image)[layer] - alex.features(changed)[layer]).abs().amax(dim=2)
         assert least.shape == difference.shape
         assert bool((least == 1).any())
@@ -165,7 +165,7 @@ def test_interior_measures_agree_with_plain_formulas(alex: Lpips) -> None:
         wanted = [
             lpips.features(resize_area(one, style_size((one.shape[0], one.shape[1]), (180, 240)))) for one in images
         ]
-        for layer, (own, least) in enumerate(zip(lpips.features(image), lpips.least_coverage(coverage), strict=True)):
+        for layer, (own, least) in enumerate(zip(lpips.features(image), lpips.min_coverage(coverage), strict=True)):
             inside = own[least >= 0.9].numpy()
             if len(inside) < 64:
                 continue

@@ -26,7 +26,7 @@ from sgsst_core.planning.measurement_choice import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.novel_cameras import neighbors
-from sgsst_core.quality.novel_views import MOST_VIEWS, NovelViews
+from sgsst_core.quality.novel_views import MAX_VIEWS, NovelViews
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene import pyramid
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
@@ -284,7 +284,7 @@ def test_caching_does_not_change_measurements(network, lpips):
     uncached = novel_views(scene, views, network, weighted=True, lpips=lpips, memory=0)
     moment = cached.measure(scene.sh_dc)
     assert moment == uncached.measure(scene.sh_dc) == cached.measure(scene.sh_dc)
-    assert {gap: len(pairs) for gap, pairs in cached.pairs.items()} == {SHORT_RANGE: MOST_VIEWS, LONG_RANGE: 2}
+    assert {gap: len(pairs) for gap, pairs in cached.pairs.items()} == {SHORT_RANGE: MAX_VIEWS, LONG_RANGE: 2}
 
 
 def test_consistency_ignores_unseen_gaussians(network, lpips):

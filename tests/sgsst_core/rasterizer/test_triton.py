@@ -212,7 +212,7 @@ def test_cost_includes_the_size_of_tile_intersections() -> None:
     cost = rasterizer.probe_cost(views)
     isects = [rasterizer.intersections(view) for view in views]
     assert cost.preparation_bytes == sum(each.nbytes for each in isects) // 2 > 0
-    assert cost.most_pairs == max(len(each.ranks) for each in isects) > 0
+    assert cost.max_pairs == max(len(each.ranks) for each in isects) > 0
 
 
 def test_too_many_intersections_are_refused_before_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
