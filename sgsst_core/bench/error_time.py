@@ -15,7 +15,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -213,21 +212,16 @@ def _prepared(
     base: Settings,
     weights: BackboneWeights | None,
 ) -> tuple[Curve, Stylizer | None]:
-    """Prepare a variant to run.
+    """Prepare a variant to run: the style and every view, as the first steps would.
 
     Returns an empty curve, and the stylizer of the variant. If the variant is skipped, the stylizer is None and the
     curve states the reason.
     """
     settings = base.model_copy(update=variant.settings)
     stylizer = Stylizer.planned(*inputs, settings, weights=weights)
-    reason = _reason_to_leave_out(settings, stylizer)
-    if reason:
+    if settings.precision != stylizer.job.network.precision:
+        reason = next(d.reason for d in stylizer.job.plan.decisions if d.item == "precision")
         return Curve(variant, [], left_out=reason), None
-    return Curve(variant, [], preparation=_prepare(stylizer)), stylizer
-
-
-def _prepare(stylizer: Stylizer) -> float:
-    """Prepare the style and every view as the first steps would; return the elapsed seconds."""
     started = time.perf_counter()
     for index in stylizer.job.views.covered:
         chosen = stylizer.job.scales(index)
@@ -236,14 +230,7 @@ def _prepare(stylizer: Stylizer) -> float:
         stylizer.job.view_targets.target(index, scales, stylizer.drawn_background(index))
         stylizer.cache_weights(index)
         stylizer.job.views.render(index, stylizer.job.views.colors(index, stylizer.sh_dc.detach()))
-    return time.perf_counter() - started
-
-
-def _reason_to_leave_out(settings: Settings, stylizer: Stylizer) -> str | None:
-    wanted = settings.precision
-    if wanted != stylizer.job.network.precision:
-        return next(d.reason for d in stylizer.job.plan.decisions if d.item == "precision")
-    return None
+    return Curve(variant, [], preparation=time.perf_counter() - started), stylizer
 
 
 def pareto_front(curves: Sequence[Curve]) -> list[tuple[str, Point]]:
@@ -271,16 +258,7 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
                 "what": curve.variant.what,
                 "left_out": curve.left_out,
                 "preparation_seconds": round(curve.preparation, 3),
-                "points": [
-                    {
-                        "seconds": round(point.seconds, 3),
-                        "step": point.step,
-                        "relative": point.relative,
-                        "by_scale": {str(scale): value for scale, value in point.by_scale.items()},
-                        "judgment": asdict(point.judgment) if point.judgment else None,
-                    }
-                    for point in curve.points
-                ],
+                "points": [asdict(point) for point in curve.points],
             }
             for curve in curves
         },
@@ -315,24 +293,16 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
         mean, *panels = figure.subplots(1, 1 + len(scales) + len(measures), squeeze=False)[0]
         losses = [_draw_curves(mean, shown, "mean of the scales", lambda point: point.relative)]
         for axes, scale in zip(panels, scales, strict=False):
-            losses.append(_draw_curves(axes, shown, scale_name(scale), partial(_scale_loss, scale)))
+            losses.append(_draw_curves(axes, shown, scale_name(scale), lambda point, s=scale: point.by_scale.get(s)))
         for axes in (mean, *panels[: len(scales)]):
             set_log_y(axes, losses)
         for axes, (name, what) in zip(panels[len(scales) :], measures.items(), strict=True):
-            set_log_y(axes, [_draw_curves(axes, shown, what, partial(_judged, name))])
+            set_log_y(axes, [_draw_curves(axes, shown, what, lambda point, n=name: getattr(point.judgment, n, None))])
         front = [point for _, point in pareto_front(shown)]
         mean.plot([p.seconds for p in front], [p.relative for p in front], "--", color=INK, lw=2.5, alpha=0.35)
         mean.set_ylabel(RELATIVE_LOSS)
         draw_legend(figure, in_row=7)
         figure.suptitle(f"{title} (dashed: Pareto front)")
-
-
-def _scale_loss(scale: int, point: Point) -> float | None:
-    return point.by_scale.get(scale)
-
-
-def _judged(measure: str, point: Point) -> float | None:
-    return getattr(point.judgment, measure, None)
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str, value: Callable[[Point], float | None]) -> Floats:

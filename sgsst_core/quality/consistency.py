@@ -82,6 +82,11 @@ class Consistency:
         """Mean fraction of pixels that could be compared, over all pairs; 0 if there are no pairs."""
         return _mean([pair.compared for pair in self.pairs]) or 0.0
 
+    def as_dict(self) -> dict[str, float | None]:
+        """Return the means as JSON-serializable values."""
+        means = {name: getattr(self, name) for name in ("compared", "rmse", "lpips")}
+        return {"gap": self.gap, "pairs": len(self.pairs), **means}
+
 
 @dataclass(frozen=True)
 class DepthMap:

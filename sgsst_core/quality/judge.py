@@ -133,7 +133,8 @@ class Judge:
             fmean, zip(*(one[:4] for view in views for one in view), strict=True)
         )
         background_sensitivity = fmean(abs(view[0][0] - view[1][0]) for view in views)
-        interior = (_mean_of_known([one[index] for view in views for one in view]) for index in (4, 5))
+        known = ([one[index] for view in views for one in view if one[index] is not None] for index in (4, 5))
+        interior = (fmean(values) if values else None for values in known)
         return Judgment(style, color_distance, content, features, background_sensitivity, saturated(sh_dc), *interior)
 
     @torch.no_grad()
@@ -359,11 +360,6 @@ def _quantiles(features: Tensor, weights: Tensor) -> Tensor:
 def _relative_difference(quantiles: Tensor, target: Tensor) -> float:
     """Return the mean difference of quantiles, relative to the target's mean absolute value."""
     return float((quantiles - target).abs().mean() / target.abs().mean().clamp_min(torch.finfo(target.dtype).tiny))
-
-
-def _mean_of_known(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return fmean(known) if known else None
 
 
 def _change_of_direction(x: Tensor, y: Tensor, coverage: Tensor) -> float:

@@ -59,12 +59,13 @@ class NovelViewMoment:
 
     def as_dict(self, step: int, seconds: float) -> dict[str, Any]:
         """Return the measurement after `step` steps and `seconds` of optimization as JSON-serializable values."""
+        ranges = {"short": self.short, "long": self.long}
         return {
             "step": step,
             "seconds": seconds,
             "gram": {str(scale): value for scale, value in self.gram.items()},
             "gram_relative": self.gram_relative,
-            "consistency": {"short": _consistency_json(self.short), "long": _consistency_json(self.long)},
+            "consistency": {name: pairs and pairs.as_dict() for name, pairs in ranges.items()},
         }
 
 
@@ -184,10 +185,11 @@ class NovelViews:
     def _consistency(self, gap: int, image: Callable[[int], Tensor]) -> Consistency | None:
         if not self.pairs[gap]:
             return None
-        return consistency(gap, self.pairs[gap], image, self._cached_warp, self.lpips)
 
-    def _cached_warp(self, first: int, second: int) -> Warp:
-        return self._warps.get((first, second), partial(self._warp, first, second))
+        def warp(first: int, second: int) -> Warp:
+            return self._warps.get((first, second), partial(self._warp, first, second))
+
+        return consistency(gap, self.pairs[gap], image, warp, self.lpips)
 
     def _warp(self, i: int, j: int) -> Warp:
         """Compute the warp of view j into view i."""
@@ -197,15 +199,3 @@ class NovelViews:
 
 def _mean(gram: dict[int, float]) -> float:
     return sum(gram.values()) / max(len(gram), 1)
-
-
-def _consistency_json(consistency: Consistency | None) -> dict[str, Any] | None:
-    if consistency is None:
-        return None
-    return {
-        "gap": consistency.gap,
-        "pairs": len(consistency.pairs),
-        "compared": consistency.compared,
-        "rmse": consistency.rmse,
-        "lpips": consistency.lpips,
-    }

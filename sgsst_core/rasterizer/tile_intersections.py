@@ -57,15 +57,8 @@ class TileIntersections:
     @property
     def nbytes(self) -> int:
         """Memory use in bytes, including the projection."""
-        arrays = (
-            self.projection.gaussians,
-            self.projection.values,
-            self.starts,
-            self.ranks,
-            self.slots,
-            self.first_slots,
-        )
-        return sum(a.nbytes for a in arrays)
+        projection = self.projection.gaussians, self.projection.values
+        return sum(array.nbytes for array in (*projection, self.starts, self.ranks, self.slots, self.first_slots))
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:
@@ -97,8 +90,7 @@ def build_tile_intersections(
         _count_tiles(values, *size, chunks, threads, counts, positions)
     first_slots = run_starts(counts)
     total = int(first_slots[-1])
-    check_intersections(total, len(counts), camera)
-    _check_memory(total, len(counts), camera)
+    check_intersections(total, len(counts), camera, free=psutil.virtual_memory().available)
     starts = run_starts(positions.sum(axis=0))
     # First position that each chunk writes to in each tile: after the entries of all preceding chunks.
     positions = starts[:-1] + np.cumsum(positions, axis=0) - positions
@@ -143,26 +135,20 @@ def run_starts(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int6
     return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
 
 
-def check_intersections(total: int, gaussians: int, camera: Camera) -> None:
-    """Raise TooManyIntersectionsError if `total` pairs of Gaussian and raster tile cannot be addressed."""
-    if total > MAX_INTERSECTIONS:
-        raise _refusal(total, gaussians, camera, f"more than the {MAX_INTERSECTIONS:,} that can be addressed")
+def check_intersections(total: int, gaussians: int, camera: Camera, *, free: int | None = None) -> None:
+    """Raise TooManyIntersectionsError if `total` pairs of Gaussian and raster tile cannot be addressed.
 
-
-def _check_memory(total: int, gaussians: int, camera: Camera) -> None:
-    """Raise TooManyIntersectionsError if `total` pairs do not fit in free memory.
-
-    Without this check, the allocation would succeed, and the process would be killed when it writes to the memory.
+    If the number of free bytes is given, raise it also if they do not fit. Without this check, the allocation would
+    succeed, and the process would be killed when it writes to the memory.
     """
-    needed, free = total * _PAIR_BYTES, psutil.virtual_memory().available
-    if needed > free:
-        raise _refusal(
-            total, gaussians, camera, f"which takes {needed / 1e9:.1f} GB where {free / 1e9:.1f} GB are free"
-        )
-
-
-def _refusal(total: int, gaussians: int, camera: Camera, reason: str) -> TooManyIntersectionsError:
-    return TooManyIntersectionsError(
+    needed = total * _PAIR_BYTES
+    if total > MAX_INTERSECTIONS:
+        reason = f"more than the {MAX_INTERSECTIONS:,} that can be addressed"
+    elif free is not None and needed > free:
+        reason = f"which takes {needed / 1e9:.1f} GB where {free / 1e9:.1f} GB are free"
+    else:
+        return
+    raise TooManyIntersectionsError(
         f"view {camera.name!r} ({camera.width}x{camera.height}): its {gaussians:,} visible Gaussians touch raster "
         f"tiles {total:,} times, {reason}. Render at a lower resolution, or remove Gaussians so large that they cover "
         "much of the view."

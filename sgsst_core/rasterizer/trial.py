@@ -26,15 +26,6 @@ def drawing_problem(name: str, device: torch.device | str = "cuda") -> str | Non
 
     Takes minutes if this or another process has to compile kernels. The compiled kernels are cached.
     """
-    try:
-        with one_at_a_time(build_folder()):
-            drawn = _draws(name, device)
-    except Exception as error:  # whatever the exception, the rasterizer is unusable
-        return (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return None if drawn else "it draws nothing"
-
-
-def _draws(name: str, device: torch.device | str) -> bool:
     gaussian = Scene(
         torch.tensor([[0.0, 0.0, 2.0]]),
         torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -44,10 +35,15 @@ def _draws(name: str, device: torch.device | str) -> bool:
         torch.zeros(1, 0, 3),
     )
     camera = Camera("trial", RASTER_TILE, RASTER_TILE, 16.0, 16.0, 8.0, 8.0, torch.eye(4, dtype=torch.float64))
-    rasterizer = make_rasterizer(name, gaussian, device=device)
-    image = rasterizer.render(torch.ones(1, 3), camera)
-    gradient = rasterizer.color_gradient(torch.ones_like(image), camera)
-    return float(image.sum()) > 0 and float(gradient.sum()) > 0
+    try:
+        with one_at_a_time(build_folder()):
+            rasterizer = make_rasterizer(name, gaussian, device=device)
+            image = rasterizer.render(torch.ones(1, 3), camera)
+            gradient = rasterizer.color_gradient(torch.ones_like(image), camera)
+            drawn = float(image.sum()) > 0 and float(gradient.sum()) > 0
+    except Exception as error:  # whatever the exception, the rasterizer is unusable
+        return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return None if drawn else "it draws nothing"
 
 
 def build_folder() -> Path:

@@ -60,10 +60,7 @@ class DeviceIntersections:
     @property
     def nbytes(self) -> int:
         """Size on the device in bytes."""
-        return sum(
-            tensor.nbytes
-            for tensor in (self.gaussians, self.values, self.starts, self.ranks, self.slots, self.first_slots)
-        )
+        return sum(tensor.nbytes for tensor in vars(self).values())
 
 
 class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
@@ -208,7 +205,14 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
         from sgsst_core.rasterizer import triton_kernels as kernels
 
         count, block = len(self.scene), kernels.PROJECTED.value
-        view = torch.tensor(_numbers(camera, self.near), dtype=torch.float64).to(self.device, non_blocking=True)
+        intrinsics = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+        numbers = [
+            *camera.world_to_camera.double()[:3].flatten().tolist(),
+            *intrinsics,
+            self.near,
+            *camera.slope_limits,
+        ]
+        view = torch.tensor(numbers, dtype=torch.float64).to(self.device, non_blocking=True)
         values = torch.empty((count, 8), dtype=torch.float64, device=self.device)
         depths = torch.empty(count, dtype=torch.float64, device=self.device)
         counts = torch.empty(count, dtype=torch.int32, device=self.device)
@@ -256,22 +260,6 @@ def add_slots_(gradient: Tensor, slots: Tensor, first_slots: Tensor, gaussians: 
         kernels.add_slots[(-(-len(gaussians) // block),)](
             slots, first_slots, gaussians, gradient, len(gaussians), BLOCK=block, SLOTS=kernels.SLOTS.value
         )
-
-
-def _numbers(camera: Camera, near: float) -> list[float]:
-    """Return the camera parameters in the order that the projection kernel expects."""
-    pose = camera.world_to_camera.double()[:3].flatten().tolist()
-    return [
-        *pose,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        float(camera.width),
-        float(camera.height),
-        near,
-        *camera.slope_limits,
-    ]
 
 
 def tiles_of(camera: Camera) -> tuple[int, int]:

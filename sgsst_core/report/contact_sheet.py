@@ -24,6 +24,9 @@ _CELL_HEIGHT = 330
 _MAX_CELL_WIDTH = 520
 _GAP = 12
 _LABEL = 18
+_LINE = _LABEL + _GAP
+#: Image of a sheet: its left and top edge, the image, and its label, which stands above it.
+_Cell = tuple[int, int, Image.Image, str]
 #: Sheet of views without a style: maximum number of views, their longer side, aspect ratio of the sheet, and maximum
 #: number of Gaussians.
 _MAX_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
@@ -35,18 +38,23 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
     Raises:
         OutputError: If the file cannot be written.
     """
-    views = stylizer.job.views
-    device = views.rasterizer.device
-    pairs = []
+    views, rasterizer = stylizer.job.views, stylizer.job.views.rasterizer
+    columns = []
     with torch.no_grad():
         for index in stylizer.job.evaluation_views:
-            dcs = (views.scene.sh_dc.to(device), stylizer.shown())
             # Call the rasterizer directly, because only one rank writes the sheet and the other ranks do not render.
-            camera = views.cameras[index]
-            renders = [_to_image(views.rasterizer.render(views.colors(index, dc), camera)) for dc in dcs]
-            pairs.append((camera, renders))
-    sheet = _sheet(_stacked([_to_image(image) for style in stylizer.job.styles.all for image in style.images]), pairs)
-    _save(path, sheet)
+            dcs = (views.scene.sh_dc.to(rasterizer.device), stylizer.shown())
+            renders = [rasterizer.render(views.colors(index, dc), views.cameras[index]) for dc in dcs]
+            columns.append((views.cameras[index].name, [_fitted(_to_image(render)) for render in renders]))
+    style = _fitted(_stacked([_to_image(image) for style in stylizer.job.styles.all for image in style.images]))
+    second = _LINE + max(images[0].height for _, images in columns) + _LINE
+    cells: list[_Cell] = [(_GAP, _LINE, style, "style")]
+    left = _GAP + style.width + _GAP
+    for name, (original, stylized) in columns:
+        short = name if len(name) <= 24 else "…" + name[-23:]
+        cells += [(left, _LINE, original, f"{short}: original"), (left, second, stylized, "stylized")]
+        left += original.width + _GAP
+    _save(path, cells)
 
 
 def write_views(
@@ -61,9 +69,6 @@ def write_views(
 
     Large scenes are rendered from a sample of their Gaussians (see `sampled`).
 
-    Args:
-        cameras: Cameras to choose from, at least one.
-
     Raises:
         OutputError: If the file cannot be written.
     """
@@ -72,18 +77,15 @@ def write_views(
     images = []
     for camera in spread(cameras, _MAX_VIEWS):
         small = resized(camera, min(camera.side, _VIEW_SIDE))
-        colors = scene_colors(part, small)
-        images.append((camera.name, _to_image(rasterizer.render(colors, small))))
+        images.append((camera.name, _to_image(rasterizer.render(scene_colors(part, small), small))))
     width = max(image.width for _, image in images) + _GAP
-    height = max(image.height for _, image in images) + _GAP + _LABEL
+    height = max(image.height for _, image in images) + _LINE
     columns = min(len(images), max(1, round(math.sqrt(_SHEET_SHAPE * len(images) * height / width))))
-    rows = -(-len(images) // columns)
-    sheet = Image.new("RGB", (columns * width + _GAP, rows * height + _GAP), PAPER)
-    draw = ImageDraw.Draw(sheet)
+    cells: list[_Cell] = []
     for index, (name, image) in enumerate(images):
         row, column = divmod(index, columns)
-        _draw(sheet, draw, image, _GAP + column * width, _GAP + _LABEL + row * height, name)
-    _save(path, sheet)
+        cells.append((_GAP + column * width, _LINE + row * height, image, name))
+    _save(path, cells)
 
 
 def write_rows(path: Path, style: Tensor, rows: Sequence[tuple[str, Sequence[Tensor]]]) -> None:
@@ -92,25 +94,30 @@ def write_rows(path: Path, style: Tensor, rows: Sequence[tuple[str, Sequence[Ten
     Raises:
         OutputError: If the file cannot be written.
     """
-    named = [
-        (name, [_fitted(_to_image(render), _MAX_CELL_WIDTH, _CELL_HEIGHT) for render in renders])
-        for name, renders in [("style", [style]), *rows]
-    ]
-    line = _LABEL + _GAP
-    widths = [sum(image.width + _GAP for image in images) for _, images in named]
-    heights = [max(image.height for image in images) + line for _, images in named]
-    sheet = Image.new("RGB", (max(widths) + _GAP, sum(heights) + _GAP), PAPER)
-    draw, top = ImageDraw.Draw(sheet), line
-    for (name, images), height in zip(named, heights, strict=True):
-        left = _GAP
+    cells: list[_Cell] = []
+    top = _LINE
+    for name, renders in [("style", [style]), *rows]:
+        images, left = [_fitted(_to_image(render)) for render in renders], _GAP
         for index, image in enumerate(images):
-            _draw(sheet, draw, image, left, top, "" if index else name)
+            cells.append((left, top, image, "" if index else name))
             left += image.width + _GAP
-        top += height
-    _save(path, sheet)
+        top += max(image.height for image in images) + _LINE
+    _save(path, cells)
 
 
-def _save(path: Path, sheet: Image.Image) -> None:
+def _save(path: Path, cells: Sequence[_Cell]) -> None:
+    """Write a sheet of images as a JPEG that is large enough for all of them."""
+    width, height = (
+        max(left + image.width for left, _, image, _ in cells),
+        max(top + image.height for _, top, image, _ in cells),
+    )
+    sheet = Image.new("RGB", (width + _GAP, height + _GAP), PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=_LABEL - 4)
+    for left, top, image, label in cells:
+        sheet.paste(image, (left, top))
+        while label and draw.textlength(label, font) > image.width:  # narrow portrait views
+            label = label[:-1]
+        draw.text((left, top - _LABEL), label, INK, font)
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
 
@@ -121,50 +128,18 @@ def _to_image(image: Tensor) -> Image.Image:
 
 
 def _stacked(images: Sequence[Image.Image]) -> Image.Image:
-    """Stack images vertically, all at the width of the widest; a single image is unchanged."""
-    if len(images) == 1:
-        return images[0]
+    """Stack images vertically, all at the width of the widest."""
     width = max(image.width for image in images)
-    fitted = [_fitted(image, width, max(1, round(image.height * width / image.width))) for image in images]
-    whole = Image.new("RGB", (width, sum(image.height for image in fitted)), PAPER)
-    top = 0
+    fitted = [image.resize((width, max(1, round(image.height * width / image.width)))) for image in images]
+    whole, top = Image.new("RGB", (width, sum(image.height for image in fitted)), PAPER), 0
     for image in fitted:
         whole.paste(image, (0, top))
         top += image.height
     return whole
 
 
-def _fitted(image: Image.Image, width: int, height: int) -> Image.Image:
-    """Resize an image to the largest size that fits a box, enlarging it if needed."""
-    factor = min(width / image.width, height / image.height)
+def _fitted(image: Image.Image) -> Image.Image:
+    """Resize an image to the largest size that fits a cell, enlarging it if needed."""
+    factor = min(_MAX_CELL_WIDTH / image.width, _CELL_HEIGHT / image.height)
     size = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
     return image.resize(size, Image.Resampling.LANCZOS)
-
-
-def _sheet(style: Image.Image, pairs: Sequence[tuple[Camera, list[Image.Image]]]) -> Image.Image:
-    style = _fitted(style, _MAX_CELL_WIDTH, _CELL_HEIGHT)
-    columns = [
-        (camera.name, [_fitted(image, _MAX_CELL_WIDTH, _CELL_HEIGHT) for image in images]) for camera, images in pairs
-    ]
-    heights = [max(images[row].height for _, images in columns) for row in (0, 1)]
-    widths = [style.width, *(images[0].width for _, images in columns)]
-    line = _LABEL + _GAP
-    size = (sum(widths) + _GAP * (len(widths) + 1), max(sum(heights) + 2 * line, style.height + line) + _GAP)
-    sheet = Image.new("RGB", size, PAPER)
-    draw = ImageDraw.Draw(sheet)
-    _draw(sheet, draw, style, _GAP, line, "style")
-    left = _GAP + style.width + _GAP
-    for name, images in columns:
-        short = name if len(name) <= 24 else "…" + name[-23:]
-        _draw(sheet, draw, images[0], left, line, f"{short}: original")
-        _draw(sheet, draw, images[1], left, line + heights[0] + line, "stylized")
-        left += images[0].width + _GAP
-    return sheet
-
-
-def _draw(sheet: Image.Image, draw: ImageDraw.ImageDraw, image: Image.Image, left: int, top: int, label: str) -> None:
-    sheet.paste(image, (left, top))
-    font = ImageFont.load_default(size=_LABEL - 4)
-    while label and draw.textlength(label, font) > image.width:  # narrow portrait views
-        label = label[:-1]
-    draw.text((left, top - _LABEL), label, INK, font)

@@ -63,6 +63,7 @@ def build_report(
         before: Loss of the unstylized scene on the stylizer's `evaluation_views`.
         after: Loss of the last round of views (`round_evaluation`).
     """
+    graphs = stylizer.job.graphs
     return {
         **_outcome_json(stylizer, stopped, before, after),
         "findings": [asdict(finding) for finding in findings],
@@ -74,7 +75,7 @@ def build_report(
             "peak_bytes": peak_memory(),
             "device_peak_bytes": device_peak(stylizer.job.network.device),
         },
-        "graphs": _graphs_json(stylizer),
+        "graphs": graphs and {"captured": graphs.captured, "problem": graphs.problem},
         "machine": machine(stylizer.job.network.device),
         "history": [_record_json(record, before, stylizer.job.loss.weights) for record in stylizer.history],
     }
@@ -192,12 +193,6 @@ def _refined_json(plan: Plan) -> dict[str, Any] | None:
 def plan_json(plan: Plan) -> dict[str, Any]:
     """Return a plan as JSON-serializable values."""
     return {"version": PLAN_VERSION, **plan.as_dict()}
-
-
-def _graphs_json(stylizer: Stylizer) -> dict[str, Any] | None:
-    """Return the state of the CUDA graphs of the loss; None if the plan does not use any."""
-    graphs = stylizer.job.graphs
-    return None if graphs is None else {"captured": graphs.captured, "problem": graphs.problem}
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:

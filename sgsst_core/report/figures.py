@@ -248,7 +248,9 @@ def inline(figure: Figure, name: str, label: str) -> str:
         for child in list(parent):
             if _NAMESPACE.sub("", child.tag) == "style":  # it would apply to the whole page
                 parent.remove(child)
-    used = _references(root)
+    links = [(key, value) for element in root.iter() for key, value in element.attrib.items()]
+    used = {value.removeprefix("#") for key, value in links if _NAMESPACE.sub("", key) == "href"}
+    used.update(reference for _, value in links for reference in _REFERENCE.findall(value))
     for element in root.iter():
         element.tag = _NAMESPACE.sub("", element.tag)
         element.attrib = {
@@ -258,16 +260,6 @@ def inline(figure: Figure, name: str, label: str) -> str:
         }
     root.attrib = {"viewBox": root.attrib["viewBox"], "role": "img", "aria-label": label}
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def _references(root: ElementTree.Element) -> set[str]:
-    used = set()
-    for element in root.iter():
-        for key, value in element.attrib.items():
-            if _NAMESPACE.sub("", key) == "href":
-                used.add(value.removeprefix("#"))
-            used.update(_REFERENCE.findall(value))
-    return used
 
 
 def _rewritten(key: str, value: str, name: str) -> tuple[str, str]:

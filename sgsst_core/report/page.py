@@ -77,7 +77,7 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         sheet: Contact sheet as JPEG; None omits it.
         views: Sheet of all views as JPEG; None omits it.
     """
-    figures = draw_figures(report)
+    figures, approximations = draw_figures(report), report.get("approximations")
     return _ENVIRONMENT.get_template("report.html").render(
         scene=PurePath(report["scene"]["path"]).name,
         style=_style_names(report),
@@ -101,7 +101,11 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         decisions=decision_table(report),
         predictions=prediction_table(report),
         findings=finding_table(report),
-        approximations=_approximations(report),
+        approximations=approximations
+        and {
+            "what": ", ".join(approximations.get("what") or []),
+            "table": approximation_table(report),
+        },
         everything=_everything(report),
         program=f"{report['program']['name']} {report['program']['version']}",
         created=report["created"],
@@ -109,8 +113,8 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
 
 
 def _style_names(report: dict[str, Any]) -> str:
-    """Return the file names of the style images. Reports of older versions have a single image, under "style"."""
-    styles = report.get("styles", [report["style"]])
+    """Return the file names of the style images."""
+    styles = report["styles"]
     names = [PurePath(style["path"]).name for style in styles]
     if len(names) == 1:
         return names[0]
@@ -197,11 +201,6 @@ def _loss_over_time(report: dict[str, Any]) -> dict[str, Any] | None:
 
 
 # --- other parts ---------------------------------------------------------------------------------------------------
-
-
-def _approximations(report: dict[str, Any]) -> dict[str, Any] | None:
-    entry = report.get("approximations")
-    return {"what": ", ".join(entry.get("what") or []), "table": approximation_table(report)} if entry else None
 
 
 def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:

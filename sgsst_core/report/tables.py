@@ -11,19 +11,18 @@ from sgsst_core.report.history import consistency_at, novel_view_moments
 
 
 @dataclass(frozen=True)
-class Column:
-    """Column of a table; numbers are right-aligned."""
-
-    title: str
-    number: bool = False
-
-
-@dataclass(frozen=True)
 class Table:
-    """Table of text, with one cell per column in each row."""
+    """Table of text, with one cell per column in each row.
 
-    columns: Sequence[Column]
+    Attributes:
+        columns: Titles of the columns.
+        rows: Cells of each row.
+        texts: Titles of the columns of text; all others hold numbers, which are right-aligned.
+    """
+
+    columns: Sequence[str]
     rows: Sequence[Sequence[str]]
+    texts: Sequence[str] = ("",)
 
 
 def loss_table(report: dict[str, Any]) -> Table:
@@ -34,7 +33,7 @@ def loss_table(report: dict[str, Any]) -> Table:
         after = loss["after"]["scales"].get(scale, {})
         rows.append([f"scale {scale}", before["total"], after.get("total"), loss["relative_by_scale"].get(scale)])
     return Table(
-        [Column(""), Column("unstylized", True), Column("stylized", True), Column("relative", True)],
+        ["", "unstylized", "stylized", "relative"],
         [[name, *(number(value) for value in values)] for name, *values in rows],
     )
 
@@ -58,7 +57,7 @@ def novel_views_table(report: dict[str, Any]) -> Table | None:
         columns[f"LPIPS, {reach} range"] = [number(entry.get("lpips")) for entry in consistencies]
         columns[f"compared, {reach} range"] = [percent(entry.get("compared")) for entry in consistencies]
     columns = {title: cells for title, cells in columns.items() if any(cell != NOTHING for cell in cells)}
-    return Table([Column(title, True) for title in columns], list(zip(*columns.values(), strict=True)))
+    return Table(list(columns), list(zip(*columns.values(), strict=True)))
 
 
 #: Title and text format of each measure in the judgment of a result.
@@ -81,33 +80,17 @@ def judged_table(report: dict[str, Any]) -> Table | None:
         return None
     before, after = judged["before"], judged["after"]
     rows = [[title, text(before[name]), text(after[name])] for name, (title, text) in _JUDGED.items()]
-    return Table([Column(""), Column("unstylized", True), Column("stylized", True)], rows)
+    return Table(["", "unstylized", "stylized"], rows)
 
 
 def decision_table(report: dict[str, Any]) -> Table:
     """Return the plan's decisions with their reasons, savings and costs."""
-    columns = [
-        Column("item"),
-        Column("decision"),
-        Column("reason"),
-        Column("saves per step", True),
-        Column("saves memory", True),
-        Column("error"),
+    texts = ["item", "decision", "reason", "error"]
+    rows = [
+        [*(entry[name] for name in texts[:3]), duration(entry["seconds"]), byte_count(entry["bytes"]), entry["error"]]
+        for entry in report["plan"]["decisions"]
     ]
-    return Table(
-        columns,
-        [
-            [
-                entry["item"],
-                entry["decision"],
-                entry["reason"],
-                duration(entry["seconds"]),
-                byte_count(entry["bytes"]),
-                entry["error"],
-            ]
-            for entry in report["plan"]["decisions"]
-        ],
-    )
+    return Table([*texts[:3], "saves per step", "saves memory", "error"], rows, texts)
 
 
 #: Titles of rows about first visits. The other rows apply to views visited before.
@@ -145,8 +128,7 @@ def prediction_table(report: dict[str, Any]) -> Table:
         waiting = predicted["communication"], measured.get("communication")
         rows.append(_beside("waiting for other ranks, per step", *waiting, duration))
         rows.append(_beside("speedup over one rank", one_rank / seconds, measured.get("speed_up"), number))
-    columns = [Column(""), Column("predicted", True), Column("measured", True), Column("measured / predicted", True)]
-    return Table(columns, rows)
+    return Table(["", "predicted", "measured", "measured / predicted"], rows)
 
 
 def _fraction(part: float, whole: float) -> float | None:
@@ -172,8 +154,8 @@ def finding_table(report: dict[str, Any]) -> Table | None:
         ]
         for entry in findings
     ]
-    columns = [Column("input"), Column("finding"), Column("count", True), Column("worst"), Column("consequence")]
-    return Table(columns, rows) if rows else None
+    texts = ["input", "finding", "worst", "consequence"]
+    return Table(["input", "finding", "count", "worst", "consequence"], rows, texts) if rows else None
 
 
 def approximation_table(report: dict[str, Any]) -> Table | None:
@@ -195,13 +177,5 @@ def approximation_table(report: dict[str, Any]) -> Table | None:
                 number(exact / taken if taken and exact is not None else None),
             ]
         )
-    columns = [
-        Column("step", True),
-        Column("view"),
-        Column("relative error of the gradient", True),
-        Column("cosine to the exact gradient", True),
-        Column("time", True),
-        Column("exact time", True),
-        Column("speedup", True),
-    ]
-    return Table(columns, rows) if rows else None
+    errors = ["relative error of the gradient", "cosine to the exact gradient"]
+    return Table(["step", "view", *errors, "time", "exact time", "speedup"], rows, ["view"]) if rows else None
