@@ -33,7 +33,7 @@ _LITTLE_MEMORY = 2.0
 
 
 @dataclass(frozen=True)
-class Finding:
+class Diagnosis:
     """Finding about one topic.
 
     Attributes:
@@ -46,7 +46,7 @@ class Finding:
     text: str
 
 
-def examine(limit: float = LIMIT) -> Iterator[Finding]:
+def examine(limit: float = LIMIT) -> Iterator[Diagnosis]:
     """Yield findings about this machine, as a separate process makes them.
 
     The process is killed after `limit` seconds. A GPU that hangs or a driver that crashes therefore becomes a finding.
@@ -61,7 +61,7 @@ def examine(limit: float = LIMIT) -> Iterator[Finding]:
         reader.start()
         try:
             for line in process.stdout or ():
-                yield Finding(**json.loads(line))
+                yield Diagnosis(**json.loads(line))
             status = process.wait()
         finally:
             timer.cancel()
@@ -69,20 +69,20 @@ def examine(limit: float = LIMIT) -> Iterator[Finding]:
             reader.join()
     if status and time.monotonic() - started >= limit:
         text = f"not all checks ended within {limit:.0f} seconds. Run the command again: what was compiled is cached."
-        yield Finding("time", "warning", text)
+        yield Diagnosis("time", "warning", text)
     elif status:
         last = (errors[0].strip().splitlines() or ["no message"])[-1]
-        yield Finding("program", "problem", f"the examination ended with status {status}: {last}")
+        yield Diagnosis("program", "problem", f"the examination ended with status {status}: {last}")
 
 
-def findings() -> Iterator[Finding]:
+def findings() -> Iterator[Diagnosis]:
     """Yield findings about this machine, made in this process."""
     yield _weights()
     yield from _caches()
     import torch
 
     versions = f"Python {sys.version.split()[0]}, PyTorch {torch.__version__}, Triton {package_version('triton')}"
-    yield Finding("program", "works", versions)
+    yield Diagnosis("program", "works", versions)
     yield _gpu()
     gpu = torch.cuda.is_available()
     device = torch.device("cuda", torch.cuda.current_device()) if gpu else torch.device("cpu")
@@ -93,24 +93,24 @@ def findings() -> Iterator[Finding]:
     yield from _results(rasterizer, device)
 
 
-def _weights() -> Finding:
+def _weights() -> Diagnosis:
     from sgsst_core.features.network_weights import list_network_weights
     from sgsst_core.features.weight_files import damage_of
 
     installed = [entry for entry in list_network_weights() if entry.path is not None]
     for entry in installed:
         if entry.path is not None and (damage := damage_of(entry.path, entry.name)):
-            return Finding("weights", "problem", damage)
+            return Diagnosis("weights", "problem", damage)
     networks = [entry.name for entry in installed if entry.name in ("vgg19", "vgg16")]
     if not networks:
         text = (
             "no network is installed. Run `sgsst weights fetch vgg19` (575 MB) or `sgsst weights fetch vgg16` (64 MB)."
         )
-        return Finding("weights", "problem", text)
-    return Finding("weights", "works", f"{' and '.join(networks)} installed and undamaged")
+        return Diagnosis("weights", "problem", text)
+    return Diagnosis("weights", "works", f"{' and '.join(networks)} installed and undamaged")
 
 
-def _caches() -> Iterator[Finding]:
+def _caches() -> Iterator[Diagnosis]:
     """Yield a finding for each folder that cannot be written; if all can be, a single finding."""
     from sgsst_core.compiled import kernel_folders
     from sgsst_core.errors import OutputError
@@ -126,19 +126,19 @@ def _caches() -> Iterator[Finding]:
     }
     unwritable = not kernel_folders()
     if unwritable:
-        yield Finding("cache", "warning", "no folder for compiled kernels can be written. Set NUMBA_CACHE_DIR.")
+        yield Diagnosis("cache", "warning", "no folder for compiled kernels can be written. Set NUMBA_CACHE_DIR.")
     for folder, variable in variables.items():
         try:
             ensure_writable_folder(folder)
         except (OutputError, OSError):
             unwritable = True
             text = f"{folder} cannot be written, so every process compiles or downloads again. Set {variable}."
-            yield Finding("cache", "warning", text)
+            yield Diagnosis("cache", "warning", text)
     if not unwritable:
-        yield Finding("cache", "works", f"{cache_folder()} and the folders of compiled kernels can be written")
+        yield Diagnosis("cache", "works", f"{cache_folder()} and the folders of compiled kernels can be written")
 
 
-def _gpu() -> Finding:
+def _gpu() -> Diagnosis:
     import torch
 
     if torch.cuda.is_available():
@@ -147,17 +147,17 @@ def _gpu() -> Finding:
         driver = (*nvidia_smi(device, "driver_version"), "unknown")[0]
         name, library = torch.cuda.get_device_name(device), torch.version.cuda or torch.version.hip
         text = f"{torch.cuda.device_count()} x {name}, compute capability {capability}, CUDA {library}, driver {driver}"
-        return Finding("GPU", "works", text)
+        return Diagnosis("GPU", "works", text)
     if not any(Path(path).exists() for path in ("/dev/nvidia0", "/proc/driver/nvidia/version", "/dev/kfd")):
-        return Finding("GPU", "works", "there is none; jobs run on the CPU")
+        return Diagnosis("GPU", "works", "there is none; jobs run on the CPU")
     if torch.version.cuda is None and torch.version.hip is None:
         text = "there is one, but this PyTorch is built for CPUs only. Install a build for its CUDA or ROCm version."
-        return Finding("GPU", "warning", text)
+        return Diagnosis("GPU", "warning", text)
     try:
         torch.zeros(1, device="cuda")
     except Exception as error:  # whatever the exception, it says why
-        return Finding("GPU", "warning", f"PyTorch cannot use it: {str(error).splitlines()[0]} Update its driver.")
-    return Finding("GPU", "warning", "PyTorch sees none. Check CUDA_VISIBLE_DEVICES and the driver.")
+        return Diagnosis("GPU", "warning", f"PyTorch cannot use it: {str(error).splitlines()[0]} Update its driver.")
+    return Diagnosis("GPU", "warning", "PyTorch sees none. Check CUDA_VISIBLE_DEVICES and the driver.")
 
 
 def nvidia_smi(device: torch.device, *fields: str) -> list[str]:
@@ -188,18 +188,18 @@ def package_version(name: str) -> str | None:
         return None
 
 
-def _memory(device: torch.device) -> Finding:
+def _memory(device: torch.device) -> Diagnosis:
     from sgsst_core.budget import default_memory_limit
 
     gigabytes = default_memory_limit(device) / 1e9
     where = "of the GPU's" if device.type == "cuda" else "of"
     text = f"jobs plan with {gigabytes:.1f} GB {where} memory"
     if gigabytes >= _LITTLE_MEMORY:
-        return Finding("memory", "works", text)
-    return Finding("memory", "warning", f"{text}, enough for small views only. End other programs.")
+        return Diagnosis("memory", "works", text)
+    return Diagnosis("memory", "warning", f"{text}, enough for small views only. End other programs.")
 
 
-def _rasterizer(*, gpu: bool) -> tuple[str, Finding]:
+def _rasterizer(*, gpu: bool) -> tuple[str, Diagnosis]:
     """Return the rasterizer of jobs on this machine, and the finding about it."""
     from sgsst_core.parallel.collectives import ALONE
     from sgsst_core.planning.context import gpu_problems
@@ -209,13 +209,13 @@ def _rasterizer(*, gpu: bool) -> tuple[str, Finding]:
     name = rasterizer_for("cuda" if gpu else "cpu", problems)
     texts = [f"{RASTERIZERS[each].title} cannot be used: {problem}" for each, problem in problems.items()]
     if not gpu:
-        return name, Finding("rasterizer", "works", "views are rendered on the CPU")
+        return name, Diagnosis("rasterizer", "works", "views are rendered on the CPU")
     if not RASTERIZERS[name].on_gpu:
-        return name, Finding("rasterizer", "warning", f"views are rendered on the CPU; {'; '.join(texts)}")
-    return name, Finding("rasterizer", "works", "; ".join([f"{RASTERIZERS[name].title} works here", *texts]))
+        return name, Diagnosis("rasterizer", "warning", f"views are rendered on the CPU; {'; '.join(texts)}")
+    return name, Diagnosis("rasterizer", "works", "; ".join([f"{RASTERIZERS[name].title} works here", *texts]))
 
 
-def _results(rasterizer: str, device: torch.device) -> Iterator[Finding]:
+def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:
     """Yield a finding for each wrong result; if all are right, a single finding."""
     import torch
 
@@ -229,12 +229,12 @@ def _results(rasterizer: str, device: torch.device) -> Iterator[Finding]:
         if not check.passed:
             wrong += 1
             text = f"wrong {check.name}: {check.error:.3g} exceeds {check.bound:.3g}"
-            yield Finding("results", "problem", f"{text}. Do not trust results of this machine.")
+            yield Diagnosis("results", "problem", f"{text}. Do not trust results of this machine.")
     if not wrong:
-        yield Finding("results", "works", f"{total} checks agree with float64 references, and repeat bit by bit")
+        yield Diagnosis("results", "works", f"{total} checks agree with float64 references, and repeat bit by bit")
 
 
-def _precision(device: torch.device) -> Finding:
+def _precision(device: torch.device) -> Diagnosis:
     from sgsst_core.features.vgg import has_bfloat16, has_tf32
     from sgsst_core.planning.context import convolution_ratio
 
@@ -244,7 +244,7 @@ def _precision(device: torch.device) -> Finding:
         texts.append(f"TF32 convolutions are {convolution_ratio('tf32', kind):.1f} times as fast as float32")
     if has_bfloat16(device):
         texts.append(f"bfloat16 convolutions are {convolution_ratio('bfloat16', kind):.1f} times as fast as float32")
-    return Finding("precision", "works", "; ".join(texts) or "float32 only")
+    return Diagnosis("precision", "works", "; ".join(texts) or "float32 only")
 
 
 def main() -> None:

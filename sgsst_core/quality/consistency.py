@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.quality.lpips import Lpips
+from sgsst_core.quality.lpips import MIN_SIDE, Lpips
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
@@ -306,7 +306,7 @@ def compare(
         return PairConsistency(first, second, compared, None, None)
     rmse = float((image[valid].double() - warped[valid].double()).square().mean().sqrt())
     distance = None
-    if lpips is not None and min(valid.shape) >= lpips.minimum_side:
+    if lpips is not None and min(valid.shape) >= MIN_SIDE:
         # Fill invalid pixels with the view's own image: holes would add edges to the features of valid pixels.
         filled = torch.where(valid[..., None], warped, image)
         distances = lpips.distance(image, filled).map

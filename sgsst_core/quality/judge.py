@@ -22,7 +22,7 @@ from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.quality.consistency import shown
-from sgsst_core.quality.lpips import Lpips, unit_features
+from sgsst_core.quality.lpips import MIN_SIDE, Lpips, unit_features
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
@@ -115,7 +115,7 @@ class Judge:
         self.cameras = [
             camera
             for camera in small
-            if min(camera.width, camera.height) >= lpips.minimum_side and self._covered(camera) >= _MIN_COVERAGE
+            if min(camera.width, camera.height) >= MIN_SIDE and self._covered(camera) >= _MIN_COVERAGE
         ]
 
     @torch.no_grad()
@@ -283,7 +283,7 @@ class _StyleJudge:
     def _features(self, image: Tensor, view: tuple[int, int]) -> list[Tensor]:
         """Return the features of one style image, resized as in the loss, but not below AlexNet's minimum size."""
         height, width = style_size((image.shape[0], image.shape[1]), view)
-        enlarged = max(1.0, self._lpips.minimum_side / min(height, width))
+        enlarged = max(1.0, MIN_SIDE / min(height, width))
         return self._lpips.features(resize_area(image, (round(height * enlarged), round(width * enlarged))))
 
     def _target(self, layers: tuple[Tensor, ...]) -> _LayerTarget:

@@ -10,23 +10,17 @@ with learned weights w >= 0 (version 0.1 of the published weights, which papers 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.errors import SettingsError, WeightsError
-from sgsst_core.features.network_weights import list_network_weights, load_network_weights, load_perceptual
-from sgsst_core.features.vgg import FeatureNetwork, layer_stride
+from sgsst_core.features.network_weights import list_network_weights, load_perceptual
 
-LpipsNetwork = Literal["alex", "vgg16"]
-
-#: Layers that LPIPS compares: the last ReLU of each block.
-_VGG16_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
+#: Name of the network in reports.
+LPIPS_NETWORK = "alex"
 #: (stride, padding) of AlexNet's convolutions (Krizhevsky 2014, the one-tower version of torchvision).
 _ALEX_CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
 #: Kernel sizes of these convolutions.
@@ -34,7 +28,7 @@ _ALEX_KERNELS = (11, 5, 3, 3, 3)
 #: Convolutions of AlexNet that follow a 3x3 max pool of stride 2, counted from 1.
 _ALEX_POOLED = (2, 3)
 #: Minimum length in pixels of the shorter side. On smaller images, the output of the deepest layer is empty.
-_MINIMUM_SIDE = {"alex": 31, "vgg16": layer_stride("relu5_3")}
+MIN_SIDE = 31
 #: Term added to the length of feature vectors, as in the published code: zero vectors stay zero instead of becoming
 #: 0/0.
 _LENGTH_EPS = 1e-10
@@ -55,63 +49,58 @@ class PerceptualDistance:
 
 
 class Lpips:
-    """LPIPS network.
+    """LPIPS with AlexNet, which the authors recommend as a metric.
 
     Args:
-        network: "alex", which the authors recommend as a metric, or "vgg16".
         dtype: torch.float32, or torch.float64 for the reference.
         folder: Folder of the weights; None for the cache folder.
 
     Raises:
-        SettingsError: If the network is unknown.
-        WeightsError: If the weights are missing or corrupt, or if the installed VGG16 differs in channels from the
-            published one.
+        WeightsError: If the weights are missing or corrupt.
     """
 
     def __init__(
         self,
-        network: LpipsNetwork = "alex",
         *,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
         folder: Path | None = None,
     ) -> None:
-        if network not in _MINIMUM_SIDE:
-            raise SettingsError(f"LPIPS has no network called {network!r}: use alex or vgg16.")
-        self.network = network
         self.dtype = dtype
         self.device = torch.device(device)
-        #: Minimum length in pixels of an image's shorter side.
-        self.minimum_side = _MINIMUM_SIDE[network]
-        tensors = {name: tensor.to(self.device, dtype) for name, tensor in load_perceptual(network, folder).items()}
-        self._heads = [tensors[f"linear{layer}.weight"] for layer in range(1, 6)]
-        self._layers: Callable[[Tensor], list[Tensor]] = (
-            _alexnet(tensors) if network == "alex" else _vgg16(self._heads, folder, dtype, self.device)
-        )
+        self._tensors = {name: tensor.to(self.device, dtype) for name, tensor in load_perceptual(folder).items()}
+        self._heads = [self._tensors[f"linear{layer}.weight"] for layer in range(1, 6)]
 
     @torch.no_grad()
     def distance(self, first: Tensor, second: Tensor) -> PerceptualDistance:
         """Compute the distance between two images [H, W, 3] of the same size, with values 0 to 1 in any floating dtype.
 
         Raises:
-            ValueError: If the shapes differ or are not those of images, or a side is shorter than `minimum_side`.
+            ValueError: If the shapes differ or are not those of images, or a side is shorter than `MIN_SIDE`.
         """
         if first.shape != second.shape or first.ndim != 3 or first.shape[2] != 3:
             raise ValueError(f"LPIPS of shapes {tuple(first.shape)} and {tuple(second.shape)}: two images [H, W, 3]")
         size = (int(first.shape[0]), int(first.shape[1]))
-        if min(size) < self.minimum_side:
-            raise ValueError(
-                f"LPIPS ({self.network}) of {size[1]} x {size[0]} pixels: {self.minimum_side} are the least"
-            )
+        if min(size) < MIN_SIDE:
+            raise ValueError(f"LPIPS of {size[1]} x {size[0]} pixels: {MIN_SIDE} are the least")
         return self.between(self.features(first), self.features(second), size)
 
     @torch.no_grad()
     def features(self, image: Tensor) -> list[Tensor]:
         """Return the features [h, w, c] of the five layers for an image [H, W, 3] with values 0 to 1.
 
-        The sides of the image must be at least `minimum_side`.
+        The sides of the image must be at least `MIN_SIDE`.
         """
-        return self._layers(image.to(self.device, self.dtype))
+        tensors, outputs = self._tensors, []
+        rgb = image.to(self.device, self.dtype)
+        x = (rgb * tensors["input_scale"] + tensors["input_shift"]).permute(2, 0, 1).unsqueeze(0)
+        for layer, (stride, padding) in enumerate(_ALEX_CONVOLUTIONS, start=1):
+            if layer in _ALEX_POOLED:
+                x = F.max_pool2d(x, 3, 2)
+            weight, bias = tensors[f"conv{layer}.weight"], tensors[f"conv{layer}.bias"]
+            x = F.conv2d(x, weight, bias, stride, padding).relu_()
+            outputs.append(x[0].permute(1, 2, 0))
+        return outputs
 
     def min_coverage(self, coverage: Tensor) -> list[Tensor]:
         """Return the smallest coverage inside the receptive field of each feature of AlexNet.
@@ -154,37 +143,3 @@ def unit_features(features: Tensor) -> Tensor:
     """Scale features [h, w, c] to unit length at every position."""
     lengths: Tensor = torch.linalg.vector_norm(features, dim=2, keepdim=True)
     return features / (lengths + _LENGTH_EPS)
-
-
-def _alexnet(tensors: dict[str, Tensor]) -> Callable[[Tensor], list[Tensor]]:
-    """Return a function from pixels [H, W, 3] to AlexNet's five ReLU outputs [h, w, c]."""
-
-    def features(rgb: Tensor) -> list[Tensor]:
-        x = (rgb * tensors["input_scale"] + tensors["input_shift"]).permute(2, 0, 1).unsqueeze(0)
-        outputs = []
-        for layer, (stride, padding) in enumerate(_ALEX_CONVOLUTIONS, start=1):
-            if layer in _ALEX_POOLED:
-                x = F.max_pool2d(x, 3, 2)
-            weight, bias = tensors[f"conv{layer}.weight"], tensors[f"conv{layer}.bias"]
-            x = F.conv2d(x, weight, bias, stride, padding).relu_()
-            outputs.append(x[0].permute(1, 2, 0))
-        return outputs
-
-    return features
-
-
-def _vgg16(
-    heads: list[Tensor], folder: Path | None, dtype: torch.dtype, device: torch.device
-) -> Callable[[Tensor], list[Tensor]]:
-    """Return a function from pixels [H, W, 3] to the output [h, w, c] of the last ReLU of each VGG16 block."""
-    network = FeatureNetwork(load_network_weights("vgg16", folder), _VGG16_LAYERS, dtype, device)
-    if [network.channels(layer) for layer in _VGG16_LAYERS] != [len(head) for head in heads]:
-        raise WeightsError(
-            "LPIPS needs the channels of the published VGG16, but the installed one has others. Use the network alex."
-        )
-
-    def features(rgb: Tensor) -> list[Tensor]:
-        outputs = network.forward(rgb, cache=False).features
-        return [outputs[layer] for layer in _VGG16_LAYERS]
-
-    return features

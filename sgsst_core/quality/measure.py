@@ -22,7 +22,7 @@ from sgsst_core.planning.measurement_choice import (
 )
 from sgsst_core.quality.float32_reference import ExactLoss, Float32Reference, approximations, rasterizer_beside
 from sgsst_core.quality.judge import Judge
-from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
+from sgsst_core.quality.lpips import LPIPS_NETWORK, Lpips, load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViews
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
@@ -168,7 +168,7 @@ class Measurements:
         stylizer, novel_views = self._stylizer, self._novel_views_of_job()
         if own:
             own["novel_view_names"] = [novel_views.cameras[index].name for index in novel_views.views]
-            own["lpips"] = novel_views.lpips.network if novel_views.lpips else None
+            own["lpips"] = LPIPS_NETWORK if novel_views.lpips else None
             own["approximated"] = self.approximated
         if not novel_views.views:
             return None

@@ -93,8 +93,8 @@ class Votes(_File):
 
 
 @dataclass(frozen=True)
-class Share:
-    """Share of the votes that one variant received.
+class VoteShare:
+    """VoteShare of the votes that one variant received.
 
     Attributes:
         votes: Number of its votes.
@@ -160,7 +160,7 @@ def write_study(
         write_json(key, Key(study=study, variants=list(names), views=tokens).model_dump())  # no page without its key
 
 
-def count_votes(key: Path, files: Sequence[Path]) -> list[Share]:
+def count_votes(key: Path, files: Sequence[Path]) -> list[VoteShare]:
     """Return the fraction of votes of each variant, in descending order.
 
     A file that was saved twice counts once: the longer one of the same voter.
@@ -189,7 +189,7 @@ def count_votes(key: Path, files: Sequence[Path]) -> list[Share]:
     if not chosen:
         raise StudyError("There are no votes in these files.")
     shares = [
-        Share(name, chosen.count(name), len(chosen), *wilson_interval(chosen.count(name), len(chosen)))
+        VoteShare(name, chosen.count(name), len(chosen), *wilson_interval(chosen.count(name), len(chosen)))
         for name in known.variants
     ]
     return sorted(shares, key=lambda share: -share.votes)

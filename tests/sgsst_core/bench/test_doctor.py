@@ -15,7 +15,7 @@ from torch import Tensor
 from api.cli.main import main
 from sgsst_core.bench import doctor
 from sgsst_core.bench.device_checks import Check, CheckSizes, Step, check_device, leave_nan
-from sgsst_core.bench.doctor import Finding, examine
+from sgsst_core.bench.doctor import Diagnosis, examine
 from sgsst_core.bench.synthetic import random_weights, surface_scene, views
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 
@@ -108,8 +108,8 @@ def test_hanging_or_crashed_examination_is_a_finding(monkeypatch: pytest.MonkeyP
     )
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setattr(sys, "executable", str(program))
-    first = Finding("a", "works", "b")
-    crashed = Finding("program", "problem", "the examination ended with status 4: no driver")
+    first = Diagnosis("a", "works", "b")
+    crashed = Diagnosis("program", "problem", "the examination ended with status 4: no driver")
     assert list(examine()) == [first, crashed]
     program.write_text(program.read_text().replace("exit 4", "exec sleep 100"))
     findings = list(examine(limit=1.0))
@@ -123,6 +123,6 @@ def test_hanging_or_crashed_examination_is_a_finding(monkeypatch: pytest.MonkeyP
 def test_exit_code_follows_from_the_worst_finding(
     states: list[Any], code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "examine", lambda: [Finding("topic", state, "text") for state in states])
+    monkeypatch.setattr(doctor, "examine", lambda: [Diagnosis("topic", state, "text") for state in states])
     assert main(["doctor"]) == code
     assert len(capsys.readouterr().out.splitlines()) == len(states)

@@ -11,7 +11,15 @@ import torch
 from PIL import Image
 
 from sgsst_core.bench.error_time import choose_variants
-from sgsst_core.bench.quality import TRANSFER, UNSTYLIZED, Outcome, Quality, compare_quality, write_plot, write_sheet
+from sgsst_core.bench.quality import (
+    TRANSFER,
+    UNSTYLIZED,
+    Quality,
+    VariantResult,
+    compare_quality,
+    write_plot,
+    write_sheet,
+)
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from tests.small_scenes import cameras, style, wall
@@ -48,7 +56,7 @@ def test_variants_are_compared_with_scene_and_color_transfer(quality: Quality) -
 
 
 def test_pareto_front_contains_undominated_outcomes(quality: Quality) -> None:
-    def outcome(name: str, style: float, content: float) -> Outcome:
+    def outcome(name: str, style: float, content: float) -> VariantResult:
         judgment = replace(quality.outcomes[0].judgment, style=style, content=content)
         return replace(quality.outcomes[0], name=name, judgment=judgment)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import safetensors
 import safetensors.torch
+import torch
 
 from sgsst_core.errors import WeightsError
 from sgsst_core.features import network_weights
@@ -26,8 +27,8 @@ from sgsst_core.features.weight_files import (
 
 @pytest.fixture
 def folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
-    """Return a folder with a copy of the package's small weight file, which a test may damage."""
-    shutil.copy(cache_folder() / "lpips_vgg16.safetensors", tmp_path)
+    """Return a folder with a copy of the package's smaller weight file, which a test may damage."""
+    shutil.copy(cache_folder() / "lpips_alex.safetensors", tmp_path)
     return tmp_path
 
 
@@ -49,15 +50,17 @@ def test_package_files_match_digests_in_the_code(name: str, vgg16_weights: Backb
     assert metadata["sha256"] == PACKAGE_FILES[name]
 
 
-def test_every_flipped_bit_is_detected(folder: Path) -> None:
-    content = bytearray((folder / "lpips_vgg16.safetensors").read_bytes())
-    verify(io.BytesIO(content), "lpips_vgg16", "file")
+def test_every_flipped_bit_is_detected(tmp_path: Path) -> None:
+    tensors = {"linear1.weight": torch.rand(64)}
+    network_weights._install(tmp_path, {"lpips_alex": tensors}, "a file of the user", "0" * 64)
+    content = bytearray((tmp_path / "lpips_alex.safetensors").read_bytes())
+    verify(io.BytesIO(content), "lpips_alex", "file")
     missed = []
     for position in range(len(content)):
         for bit in range(8):
             content[position] ^= 1 << bit
             try:
-                verify(io.BytesIO(content), "lpips_vgg16", "file")
+                verify(io.BytesIO(content), "lpips_alex", "file")
                 missed.append((position, bit))
             except WeightsError:
                 pass
@@ -67,7 +70,7 @@ def test_every_flipped_bit_is_detected(folder: Path) -> None:
 
 def test_forged_package_weights_are_refused(folder: Path) -> None:
     """The file was damaged before its own digest was computed, so only the digest in the code detects it."""
-    path = folder / "lpips_vgg16.safetensors"
+    path = folder / "lpips_alex.safetensors"
     tensors = safetensors.torch.load_file(path)
     tensors["linear3.weight"][7] += 1
     with safetensors.safe_open(path, "pt") as file:
@@ -77,31 +80,31 @@ def test_forged_package_weights_are_refused(folder: Path) -> None:
     path.write_bytes(safetensors.torch.save(tensors, metadata))
     assert "checksum" in damaged_weights(folder)[0]
     with pytest.raises(WeightsError, match="not those that were published"):
-        network_weights._install(folder, {"lpips_vgg16": tensors}, PACKAGE_SOURCE, PACKAGE_DIGEST)
+        network_weights._install(folder, {"lpips_alex": tensors}, PACKAGE_SOURCE, PACKAGE_DIGEST)
 
 
 def test_damaged_files_are_named_with_a_repair_command(folder: Path, tiny_cache: Path) -> None:
     """Cases are a file of the package, and one that was installed from a file of the user."""
     shutil.copy(tiny_cache / "vgg16.safetensors", folder)
     assert damaged_weights(folder) == []
-    for name in ("vgg16", "lpips_vgg16"):
+    for name in ("vgg16", "lpips_alex"):
         path = folder / f"{name}.safetensors"
         flip(path, path.stat().st_size // 2)
         path.touch()
     damaged = damaged_weights(folder)
     assert len(damaged) == 2
-    for name, damage in zip(("vgg16", "lpips_vgg16"), damaged, strict=True):
+    for name, damage in zip(("vgg16", "lpips_alex"), damaged, strict=True):
         assert damage.startswith(f"{folder / name}.safetensors")
         assert "sgsst weights fetch vgg16" in damage
         assert "--from FILE" in damage
 
 
 def test_replaced_file_is_verified_again(folder: Path, vgg16_weights: BackboneWeights) -> None:
-    path = folder / "lpips_vgg16.safetensors"
+    path = folder / "lpips_alex.safetensors"
     flip(path, -1)
     path.touch()
     assert damaged_weights(folder)
-    shutil.copy(cache_folder() / "lpips_vgg16.safetensors", path)
+    shutil.copy(cache_folder() / "lpips_alex.safetensors", path)
     assert damaged_weights(folder) == []
     assert damaged_weights(folder / "empty") == []
 

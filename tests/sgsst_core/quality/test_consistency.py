@@ -39,7 +39,7 @@ DEPTH = 4.0
 
 @pytest.fixture(scope="module")
 def lpips(vgg16_weights: object) -> Lpips:
-    return Lpips("alex")
+    return Lpips()
 
 
 def plane(half_width: float, half_height: float, depth: float, color: Tensor | None = None) -> Scene:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 
 import numpy as np
@@ -14,9 +13,9 @@ from numpy.typing import NDArray
 from skimage import data
 from torch import Tensor
 
-from sgsst_core.errors import SettingsError, WeightsError
-from sgsst_core.features.network_weights import cache_folder, load_perceptual
-from sgsst_core.quality.lpips import Lpips, load_lpips_or_none
+from sgsst_core.errors import WeightsError
+from sgsst_core.features.network_weights import load_perceptual
+from sgsst_core.quality.lpips import MIN_SIDE, Lpips, load_lpips_or_none
 from tests.sgsst_core.synthetic_images import synthetic_image
 
 Array = NDArray[np.float64]
@@ -25,7 +24,7 @@ Array = NDArray[np.float64]
 @pytest.fixture(scope="module")
 def alex(vgg16_weights: object) -> Lpips:
     """Load LPIPS with AlexNet in float64. Its weights are installed together with VGG16's."""
-    return Lpips("alex", dtype=torch.float64)
+    return Lpips(dtype=torch.float64)
 
 
 def photo(name: str) -> Tensor:
@@ -39,11 +38,9 @@ def box_blurred(image: Tensor, side: int) -> Tensor:
     return blurred[0].permute(1, 2, 0).contiguous()
 
 
-@pytest.mark.parametrize(
-    ("network", "dtype"), [("alex", torch.float32), ("alex", torch.float64), ("vgg16", torch.float32)]
-)
-def test_zero_for_equal_images_and_symmetric(vgg16_weights, network, dtype):
-    lpips = Lpips(network, dtype=dtype)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_zero_for_equal_images_and_symmetric(vgg16_weights, dtype):
+    lpips = Lpips(dtype=dtype)
     first, second = synthetic_image(37, 50, seed=1), synthetic_image(37, 50, seed=2)
     same = lpips.distance(first, first)
     assert same.mean == 0.0
@@ -55,11 +52,9 @@ def test_zero_for_equal_images_and_symmetric(vgg16_weights, network, dtype):
     assert torch.equal(forth.map, back.map)
 
 
-@pytest.mark.parametrize("network", ["alex", "vgg16"])
-def test_float32_agrees_with_float64(vgg16_weights, network):
+def test_float32_agrees_with_float64(alex: Lpips):
     first, second = synthetic_image(45, 61, seed=3), synthetic_image(45, 61, seed=4)
-    reference = Lpips(network, dtype=torch.float64).distance(first, second)
-    result = Lpips(network).distance(first, second)
+    reference, result = alex.distance(first, second), Lpips().distance(first, second)
     assert result.map.dtype == torch.float32
     assert result.mean == pytest.approx(reference.mean, rel=1e-5)
     torch.testing.assert_close(result.map.double(), reference.map, rtol=1e-4, atol=1e-6)
@@ -122,7 +117,7 @@ def test_agrees_with_a_direct_formulation_in_numpy(alex: Lpips):
 
 def lpips_directly(first: Array, second: Array) -> tuple[float, Array]:
     """Compute LPIPS with AlexNet by equation 1 of the paper, with input from -1 to 1 as in the published code."""
-    tensors = {name: tensor.double().numpy() for name, tensor in load_perceptual("alex").items()}
+    tensors = {name: tensor.double().numpy() for name, tensor in load_perceptual().items()}
     total, spatial = 0.0, np.zeros(first.shape[:2])
     pairs = zip(alexnet_directly(first, tensors), alexnet_directly(second, tensors), strict=True)
     for layer, (x, y) in enumerate(pairs, start=1):
@@ -174,37 +169,24 @@ def test_constant_images_are_finite(alex: Lpips):
         assert result.map.isfinite().all()
 
 
-@pytest.mark.parametrize("network", ["alex", "vgg16"])
-def test_minimum_image_size_is_enforced(vgg16_weights, network):
-    lpips = Lpips(network)
-    side = lpips.minimum_side
+def test_minimum_image_size_is_enforced(alex: Lpips):
+    side = MIN_SIDE
     first, second = synthetic_image(side, 64, seed=7), synthetic_image(side, 64, seed=8)
-    assert lpips.distance(first, second).mean > 0
+    assert alex.distance(first, second).mean > 0
     with pytest.raises(ValueError, match=f"64 x {side - 1} pixels: {side} are the least"):
-        lpips.distance(first[1:], second[1:])
+        alex.distance(first[1:], second[1:])
 
 
 def test_wrong_arguments_are_named(alex: Lpips, tmp_path):
     with pytest.raises(ValueError, match=r"two images \[H, W, 3\]"):
         alex.distance(torch.zeros(40, 40, 3), torch.zeros(40, 41, 3))
-    with pytest.raises(SettingsError, match="squeeze"):
-        Lpips("squeeze")  # type: ignore[arg-type]
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
-        Lpips("alex", folder=tmp_path)
-
-
-def test_vgg16_with_other_channels_is_refused(vgg16_weights, tiny_cache, tmp_path):
-    shutil.copy(tiny_cache / "vgg16.safetensors", tmp_path)
-    shutil.copy(cache_folder() / "lpips_vgg16.safetensors", tmp_path)
-    with pytest.raises(WeightsError, match="channels of the published VGG16"):
-        Lpips("vgg16", folder=tmp_path)
+        Lpips(folder=tmp_path)
 
 
 def test_lpips_is_skipped_without_installed_weights(vgg16_weights, tmp_path):
     assert load_lpips_or_none(folder=tmp_path) is None
-    installed = load_lpips_or_none()
-    assert installed is not None
-    assert installed.network == "alex"
+    assert load_lpips_or_none() is not None
     (tmp_path / "lpips_alex.safetensors").write_bytes(b"no weights")
     with pytest.raises(WeightsError, match="damaged"):
         load_lpips_or_none(folder=tmp_path)

@@ -197,7 +197,7 @@ def network(tiny_weights) -> FeatureNetwork:
 
 @pytest.fixture(scope="module")
 def lpips(vgg16_weights) -> Lpips:
-    return Lpips("alex")
+    return Lpips()
 
 
 #: Shorter side of the coarsest scale in tests that need two scales of their small views.
