@@ -39,8 +39,7 @@ from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradie
 from sgsst_core.settings import make_settings
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
-#: Kernel launches of a step with a fully cached view of 980x545 in bfloat16, and those of its loss at three scales, as
-#: counted by `device_counts`.
+#: Kernel launches of a step with a fully cached view of 980x545 in bfloat16, and those of its loss at three scales.
 LAUNCHES, LOSS_LAUNCHES = 485, 456
 #: Launches to compute a view's tile intersections: two multi-pass sorts, a multi-pass sum, kernels and copies.
 LIST_LAUNCHES = 40

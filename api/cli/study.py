@@ -11,7 +11,7 @@ from torch import Tensor
 from api.cli.arguments import local_path
 from sgsst_core.errors import OutputError
 from sgsst_core.files.images import load_image
-from sgsst_core.quality.study import Share, check_names, write_study
+from sgsst_core.quality.study import VoteShare, check_names, write_study
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
@@ -74,7 +74,7 @@ def _render(source: SceneRequest, cameras: Sequence[Camera], background: tuple[f
     return [rasterizer.render(scene_colors(scene, camera), camera) for camera in cameras]
 
 
-def share_table(shares: Sequence[Share]) -> Table:
+def share_table(shares: Sequence[VoteShare]) -> Table:
     """Return a table with each variant's fraction of the votes and its 95 % interval."""
     table = Table("variant", "votes", "share", "95 % interval", title=f"{shares[0].total} votes")
     for share in shares:

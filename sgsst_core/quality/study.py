@@ -94,7 +94,7 @@ class Votes(_File):
 
 @dataclass(frozen=True)
 class VoteShare:
-    """VoteShare of the votes that one variant received.
+    """Fraction of the votes that one variant received.
 
     Attributes:
         votes: Number of its votes.

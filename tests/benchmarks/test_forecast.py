@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -21,7 +19,6 @@ from benchmarks.forecast import (
     step_seconds,
     style_gradient,
 )
-from benchmarks.machine import RESULTS
 from benchmarks.work import Counted, Work, meta
 
 #: GPU of these tests.
@@ -64,14 +61,6 @@ def test_launches_are_counted_with_their_bytes() -> None:
     assert added == Work(0, 3 * 48 * 3 * 4)
     assert convolved == Work(2 * 9 * 4 * 16 * 48, 4 * (4 * 48 + 16 * 4 * 9 + 16 * 48))
     assert last == Work(0, 2 * 5 * 2)
-
-
-def test_launches_of_a_step_are_those_counted() -> None:
-    """A step was counted on a small view. Only its loss launches more kernels on a large one."""
-    counted = json.loads((RESULTS / "device_counts.json").read_text())["scene, bfloat16"]
-    loss = counted["launches of the loss"]
-    assert loss["980x545"] == forecast.LOSS_LAUNCHES
-    assert counted["steady"]["launches"] - loss["64x64"] + loss["980x545"] == forecast.LAUNCHES
 
 
 def test_slower_of_compute_and_memory_determines_time() -> None:

@@ -27,10 +27,6 @@ class Counts:
         for counter in (self.launches, self.waits, self.copies):
             counter.clear()
 
-    def copy(self) -> Counts:
-        """Return a copy of the counters."""
-        return Counts(Counter(self.launches), Counter(self.waits), Counter(self.copies))
-
 
 def calling_line() -> str:
     """Return the innermost line of the project on the call stack."""
