@@ -159,46 +159,6 @@ def convolutions(device: torch.device, *, tf32: bool = False) -> Iterator[None]:
         _CUDNN.benchmark, _CUDNN.deterministic, _CUDNN.conv.fp32_precision = before
 
 
-@dataclass(frozen=True)
-class _Input:
-    """Map from the pixels of an image to the values that the first convolution reads.
-
-    Attributes:
-        scale, shift: [3], float32 or float64: in bfloat16, each of the 256 gray levels would be rounded twice.
-        gray: Whether the network sees the image's luminance.
-    """
-
-    scale: Tensor
-    shift: Tensor
-    gray: bool
-
-    @staticmethod
-    def of(weights: BackboneWeights, device: torch.device, dtype: torch.dtype) -> _Input:
-        """Create the map for a network that computes in `dtype`."""
-        precision = torch.promote_types(dtype, torch.float32)
-        return _Input(
-            weights.input_scale.to(device, precision), weights.input_shift.to(device, precision), weights.gray
-        )
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the pixels and of their gradient."""
-        return self.scale.dtype
-
-    def pixels(self, rgb: Tensor) -> Tensor:
-        """Return an image [h, w, 3] as the network sees it, before normalization."""
-        rgb = rgb.to(self.scale)
-        return gray(rgb) if self.gray else rgb
-
-    def normalized(self, pixels: Tensor) -> Tensor:
-        """Return the values that the first convolution reads, [h, w, 3]."""
-        return pixels * self.scale + self.shift
-
-    def gradient(self, pixels: Tensor) -> Tensor:
-        """Return the gradient of the image, given that of `pixels`."""
-        return gray_gradient(pixels) if self.gray else pixels
-
-
 class FeatureNetwork:
     """VGG up to the deepest requested layer.
 
@@ -234,7 +194,12 @@ class FeatureNetwork:
         self.tf32 = tf32
         self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
         self.pixel_weight = weights.scales.get(PIXELS, 1.0) ** 2
-        self._input = _Input.of(weights, self.device, dtype)
+        # Map from pixels to the values that the first convolution reads. In bfloat16, each of the 256 gray levels would
+        # be rounded twice.
+        precision = torch.promote_types(dtype, torch.float32)
+        self._scale = weights.input_scale.to(self.device, precision)
+        self._shift = weights.input_shift.to(self.device, precision)
+        self._gray = weights.gray
         self._steps = self._build(weights)
         self._fuse()
         self._channels = {f"relu{name[4:]}": len(bias) for name, (_, bias) in weights.convolutions.items()}
@@ -304,7 +269,7 @@ class FeatureNetwork:
 
     def rounding_of(self, layer: str) -> float:
         """Return the relative rounding error of a layer's features."""
-        return torch.finfo(self._input.dtype).eps if layer == PIXELS else self.rounding
+        return torch.finfo(self._scale.dtype).eps if layer == PIXELS else self.rounding
 
     def channels(self, layer: str) -> int:
         """Return the number of channels of a layer."""
@@ -324,12 +289,14 @@ class FeatureNetwork:
             Activations. A layer whose stride exceeds the image has zero cells (a dimension of size 0).
         """
         height, width = int(rgb.shape[0]), int(rgb.shape[1])
-        pixels = self._input.pixels(rgb)
+        pixels = rgb.to(self._scale)
+        if self._gray:
+            pixels = gray(pixels)
         activations = Activations({}, size=(height, width))
         if PIXELS in self.layers:
             activations.features[PIXELS] = pixels * PIXEL_UNIT
         # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
-        x = self._input.normalized(pixels).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
+        x = (pixels * self._scale + self._shift).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         with convolutions(self.device, tf32=self.tf32):
             self._forward_steps(x, activations, cache, until)
         for layer in self.layers:
@@ -390,14 +357,14 @@ class FeatureNetwork:
             gradient = self._backward_steps(activations, feature_gradient)
         shape = (*activations.size, 3)
         if gradient is None:
-            pixels = torch.zeros(shape, dtype=self._input.dtype, device=self.device)
+            pixels = torch.zeros(shape, dtype=self._scale.dtype, device=self.device)
         else:
-            pixels = gradient[0].permute(1, 2, 0).to(self._input.dtype) * self._input.scale
+            pixels = gradient[0].permute(1, 2, 0).to(self._scale.dtype) * self._scale
         if (features := activations.features.pop(PIXELS, None)) is not None:
-            own = torch.zeros(shape, dtype=self._input.dtype, device=self.device)
+            own = torch.zeros(shape, dtype=self._scale.dtype, device=self.device)
             feature_gradient(PIXELS, features, own)
             pixels = torch.add(pixels, own, alpha=PIXEL_UNIT)
-        return self._input.gradient(pixels)
+        return gray_gradient(pixels) if self._gray else pixels
 
     def _backward_steps(self, activations: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
         """Return the gradient [1, 3, h, w] of the first step's input; None if no layer has a gradient."""
@@ -433,7 +400,7 @@ class FeatureNetwork:
             else:
                 held += size * int(step.weight.shape[0]) / stride**2
         if PIXELS in self.layers:
-            held += 3 * torch.finfo(self._input.dtype).bits / 8
+            held += 3 * torch.finfo(self._scale.dtype).bits / 8
         return held
 
     def working_bytes_per_pixel(self) -> float:

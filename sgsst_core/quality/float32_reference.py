@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import time
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -47,28 +46,20 @@ def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
 
 
 @dataclass(frozen=True)
-class GradientError:
-    """Error of a color gradient relative to the exact one.
+class GradientError(Difference):
+    """Error of a color gradient relative to the exact one, over all optimized Gaussians.
 
     Attributes:
         step: Number of steps before the measurement.
         view: Name of the camera.
-        relative_error: |g - exact| / |exact| in the Euclidean norm, over the gradients g of all optimized Gaussians.
-        cosine: Cosine of the angle between the two gradients.
         seconds: Seconds to compute the gradient with the job's approximations.
         seconds_exact: Seconds to compute the exact gradient.
     """
 
     step: int
     view: str
-    relative_error: float
-    cosine: float
     seconds: float
     seconds_exact: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON-serializable values."""
-        return asdict(self)
 
 
 class ExactLoss:
@@ -163,11 +154,5 @@ class Float32Reference(ExactLoss):
             approximate, seconds = stylizer.gradient(index, scales)
         exact, seconds_exact = self.gradient(index, colors, scales)
         difference = Difference.of(approximate, exact[self.seen])
-        return GradientError(
-            0 if start else stylizer.step,
-            stylizer.job.views.cameras[index].name,
-            difference.relative_error,
-            difference.cosine,
-            seconds,
-            seconds_exact,
-        )
+        step, view = 0 if start else stylizer.step, stylizer.job.views.cameras[index].name
+        return GradientError(difference.relative_error, difference.cosine, step, view, seconds, seconds_exact)

@@ -217,17 +217,9 @@ def _interior(
     return gram, sliced
 
 
-@dataclass(frozen=True)
-class _LayerTarget:
-    """A style's features of one layer.
-
-    Attributes:
-        gram: Gram matrix [c, c].
-        quantiles: Quantiles of the features along random directions, [_QUANTILES, _DIRECTIONS].
-    """
-
-    gram: Tensor
-    quantiles: Tensor
+#: A style's Gram matrix [c, c] of one layer, and quantiles of its features along random directions,
+#: [_QUANTILES, _DIRECTIONS].
+_LayerTarget = tuple[Tensor, Tensor]
 
 
 class _StyleJudge:
@@ -252,8 +244,8 @@ class _StyleJudge:
         """
         targets = self._layers((int(weights.shape[0]), int(weights.shape[1])))
         return fmean(
-            _relative(_gram(values, _pooled(weights, values)), target.gram)
-            for values, target in zip(features, targets, strict=True)
+            _relative(_gram(values, _pooled(weights, values)), gram)
+            for values, (gram, _) in zip(features, targets, strict=True)
         )
 
     def interior(self, features: list[Tensor], coverage: Tensor) -> tuple[float, float] | None:
@@ -265,12 +257,15 @@ class _StyleJudge:
         """
         targets = self._layers((int(coverage.shape[0]), int(coverage.shape[1])))
         distances = []
-        for values, least, target in zip(features, self._lpips.min_coverage(coverage), targets, strict=True):
-            inside = values[least >= _INTERIOR][None]  # [1, n, c]
+        minima = self._lpips.min_coverage(coverage)
+        for values, covered, (gram, quantiles) in zip(features, minima, targets, strict=True):
+            inside = values[covered >= _INTERIOR][None]  # [1, n, c]
             if inside.shape[1] >= _MIN_INTERIOR:
                 ones = torch.ones(inside.shape[:2], device=inside.device)
-                sliced = _relative_difference(_quantiles(inside, ones), target.quantiles)
-                distances.append((_relative(_gram(inside, ones), target.gram), sliced))
+                # Mean difference of quantiles, relative to the style's mean absolute value.
+                size = quantiles.abs().mean().clamp_min(torch.finfo(quantiles.dtype).tiny)
+                sliced = float((_quantiles(inside, ones) - quantiles).abs().mean() / size)
+                distances.append((_relative(_gram(inside, ones), gram), sliced))
         return (fmean(gram for gram, _ in distances), fmean(sliced for _, sliced in distances)) if distances else None
 
     def _layers(self, view: tuple[int, int]) -> list[_LayerTarget]:
@@ -295,7 +290,7 @@ class _StyleJudge:
         weights = torch.cat(
             [(weight / one.numel() * one).flatten() for (_, weight), one in zip(parts, ones, strict=True)]
         )
-        return _LayerTarget(gram, _quantiles(together, weights[None]))
+        return gram, _quantiles(together, weights[None])
 
 
 def saturated(sh_dc: Tensor) -> float:
@@ -355,11 +350,6 @@ def _quantiles(features: Tensor, weights: Tensor) -> Tensor:
     wanted = (fractions[:, None] * cumulative[-1]).T.contiguous()
     indices = torch.searchsorted(cumulative.T.contiguous(), wanted).T
     return ordered.gather(0, indices.clamp_max(len(ordered) - 1)).double()
-
-
-def _relative_difference(quantiles: Tensor, target: Tensor) -> float:
-    """Return the mean difference of quantiles, relative to the target's mean absolute value."""
-    return float((quantiles - target).abs().mean() / target.abs().mean().clamp_min(torch.finfo(target.dtype).tiny))
 
 
 def _change_of_direction(x: Tensor, y: Tensor, coverage: Tensor) -> float:

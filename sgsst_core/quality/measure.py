@@ -145,7 +145,7 @@ class Measurements:
     def _measure(self, *, start: bool) -> None:
         """Measure the current colors or the unstylized scene, and append an entry."""
         stylizer, started = self._stylizer, time.perf_counter()
-        approximation = self.exact.gradient_error(start=start).as_dict() if self.approximated else None
+        approximation = asdict(self.exact.gradient_error(start=start)) if self.approximated else None
         own: dict[str, Any] = {}
         if not stylizer.measured:
             stylized = stylizer.stylized()  # timed as part of this moment; later calls return the cached colors

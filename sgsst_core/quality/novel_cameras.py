@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import torch
 
@@ -60,21 +59,6 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
     return in_order if 2 * len(in_order) >= len(cameras) - 1 else max(in_order, pairs(walk), key=len)
 
 
-@dataclass(frozen=True)
-class NovelCameras:
-    """Novel cameras of a job, and those that are measured.
-
-    Attributes:
-        cameras: All novel cameras.
-        views: Indices of the views whose Gram distance is measured. If empty, there is nothing to measure.
-        pairs: Pairs of views to compare, by gap.
-    """
-
-    cameras: list[Camera]
-    views: list[int]
-    pairs: dict[int, list[tuple[int, int]]]
-
-
 def choose_novel_cameras(
     cameras: list[Camera],
     scene: Scene,
@@ -82,7 +66,7 @@ def choose_novel_cameras(
     *,
     most: int,
     rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
-) -> NovelCameras:
+) -> tuple[list[Camera], list[int], dict[int, list[tuple[int, int]]]]:
     """Place a camera halfway between neighbors, and choose what to measure: evenly spread, never inside an object.
 
     Args:
@@ -90,6 +74,10 @@ def choose_novel_cameras(
         most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
         rasterizer_of: Function that creates a rasterizer for a sample of the Gaussians, used to check depth and
             coverage in large scenes; None uses the whole scene.
+
+    Returns:
+        All novel cameras, the indices of the views whose Gram distance is measured (if there are none, there is nothing
+        to measure), and pairs of views to compare, by gap.
     """
     parents = neighbors(cameras)
     novel = [between(*pair) for pair in parents]
@@ -109,7 +97,7 @@ def choose_novel_cameras(
         return outlooks[key]
 
     clear = {index for index in used if _is_clear(novel[index], parents[index], outlook)}
-    return NovelCameras(
+    return (
         novel,
         [index for index in views if index in clear],
         {gap: [pair for pair in chosen if clear.issuperset(pair)] for gap, chosen in pairs.items()},

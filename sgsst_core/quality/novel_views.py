@@ -128,10 +128,9 @@ class NovelViews:
             coarsest=loss.tiling.coarsest,
             scales=loss.weights,
         )
-        chosen = choose_novel_cameras(
+        self.cameras, self.views, self.pairs = choose_novel_cameras(
             [cameras[index] for index in covered], scene, rasterizer, most=most, rasterizer_of=rasterizer_of
         )
-        self.cameras, self.views, self.pairs = chosen.cameras, chosen.views, chosen.pairs
         self._colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 8)
         self._coverage: Cache[int, Tensor] = Cache(memory // 8, tensor_bytes)
         self._warps: Cache[tuple[int, int], Warp] = Cache(memory // 2, lambda warp: warp.nbytes)
@@ -187,14 +186,13 @@ class NovelViews:
             return None
 
         def warp(first: int, second: int) -> Warp:
-            return self._warps.get((first, second), partial(self._warp, first, second))
+            return self._warps.get((first, second), partial(find, first, second))
+
+        def find(i: int, j: int) -> Warp:
+            depth, other = (expected_depth(self.scene, self.cameras[k], self.rasterizer) for k in (i, j))
+            return find_warp(other, self.cameras[j], depth, self.cameras[i])
 
         return consistency(gap, self.pairs[gap], image, warp, self.lpips)
-
-    def _warp(self, i: int, j: int) -> Warp:
-        """Compute the warp of view j into view i."""
-        depth, other = (expected_depth(self.scene, self.cameras[k], self.rasterizer) for k in (i, j))
-        return find_warp(other, self.cameras[j], depth, self.cameras[i])
 
 
 def _mean(gram: dict[int, float]) -> float:

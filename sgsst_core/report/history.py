@@ -85,7 +85,8 @@ def history_of(report: dict[str, Any]) -> History:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         relative = {scale: _of_scale(records, scale, "total") / starts[scale] for scale in scales}
     moments = novel_view_moments(report)
-    terms = _terms_there(records)
+    split = [terms for record in records for terms in record["scales"].values()]
+    terms = [term for term in TERMS if any(own.get(term) for own in split)] or list(TERMS)  # those that are not 0
     return History(
         x=x,
         limits={
@@ -132,12 +133,6 @@ def consistency_at(moment: dict[str, Any], reach: str) -> dict[str, Any]:
 def moment_positions(moments: Sequence[dict[str, Any]], against: Against) -> Floats:
     """Return the x positions [n] of measurements."""
     return column([moment.get("seconds" if against == "seconds" else "step") for moment in moments])
-
-
-def _terms_there(records: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the terms that are nonzero in any record, or all terms if none is."""
-    split = [terms for record in records for terms in record["scales"].values()]
-    return [term for term in TERMS if any(terms.get(term) for terms in split)] or list(TERMS)
 
 
 def _of_scale(records: Sequence[dict[str, Any]], scale: int, term: str) -> Floats:
