@@ -273,9 +273,9 @@ def span_positions(positions: int, channels: int) -> int:
     return min(max(least, 1 << max(span.bit_length() - 1, 0)), most)
 
 
-def block_of_positions(on_gpu: int) -> int:
-    """Return the number of positions per step of a program: `on_gpu`, or more in Triton's interpreter."""
-    return 4096 if _is_interpreted() else on_gpu
+def block_of_positions(default: int) -> int:
+    """Return the number of positions per step of a program: `default`, or more in Triton's interpreter."""
+    return 4096 if _is_interpreted() else default
 
 
 def block_of_entries(channels: int) -> int:

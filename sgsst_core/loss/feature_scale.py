@@ -21,7 +21,7 @@ from torch import Tensor
 
 from sgsst_core.features.network_sources import CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import PIXELS, FeatureNetwork
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, FeatureNetwork
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.settings import FeatureScale, Settings
 
@@ -49,7 +49,6 @@ PUBLISHED = {
     "relu4_2": 418235.7188,
     "relu5_1": 6.568603,
 }
-_CONTENT = "relu4_2"
 #: Longer side in pixels of the images in the published run.
 _SIDE = 512
 
@@ -101,13 +100,19 @@ def paper_scales(weights: BackboneWeights) -> dict[str, float]:
         small = painting.convert("RGB").resize((size[0], size[1]), Image.Resampling.LANCZOS)
     pixels = torch.from_numpy(np.array(small, dtype=np.float32)) / 255
     nothing = (torch.tensor(CAFFE_MEAN) / 255).expand(pixels.shape)
-    features, of_nothing = _features(weights, pixels), _features(weights, nothing)
+    network = FeatureNetwork(weights, tuple(PUBLISHED), torch.float32)
+    features, of_nothing = (network.forward(image, cache=False).features for image in (pixels, nothing))
+
+    def gram(values: Tensor) -> Tensor:
+        flat = values.flatten(0, 1).double()
+        return flat.T @ flat / flat.numel()
+
     scales = {}
     for layer, published in PUBLISHED.items():
-        if layer == _CONTENT:
+        if layer == CONTENT_LAYER:
             factor = (published / float((features[layer] - of_nothing[layer]).square().mean())) ** (1 / 2)
         else:
-            difference = _gram(features[layer]) - _gram(of_nothing[layer])
+            difference = gram(features[layer]) - gram(of_nothing[layer])
             factor = (published / float(difference.square().mean())) ** (1 / 4)
         scales[layer] = float(f"{factor:.2g}")
     return scales
@@ -126,15 +131,3 @@ def with_scales(weights: BackboneWeights, scales: Mapping[str, float]) -> Backbo
         convolutions[layer] = (weight.double() * (factor / before)).float(), (bias.double() * factor).float()
         before = factor
     return replace(weights, convolutions=convolutions, scales=dict(scales))
-
-
-def _features(weights: BackboneWeights, image: Tensor) -> dict[str, Tensor]:
-    """Return the features [h, w, c] of the published layers for an image [H, W, 3]."""
-    network = FeatureNetwork(weights, tuple(PUBLISHED), torch.float32)
-    return network.forward(image, cache=False).features
-
-
-def _gram(features: Tensor) -> Tensor:
-    """Return the Gram matrix / (h w c) of features [h, w, c] in float64."""
-    values = features.flatten(0, 1).double()
-    return values.T @ values / values.numel()

@@ -23,7 +23,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from sgsst_core.features.network_sources import BLOCKS
+from sgsst_core.features.network_sources import BLOCKS, KAPPA
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.loss.position_term import (
     Objective,
@@ -44,11 +44,9 @@ MAX_VECTORS = 1 << 13
 _BLOCK = {"cpu": (1 << 10, 1 << 10), "cuda": (1 << 13, 1 << 13)}
 #: Bytes stored per matched position.
 MATCH_BYTES = 8 + 4 + 4
-#: Factor from features of ImageNet-normalized input, for which ARF's weights are meant, to features of a 0-255 input.
-_FEATURE_UNITS = 255 * 0.226
 #: w_n for `nnfm`. With content_weight 1, the nearest-neighbor and content terms are balanced as in ARF for 360-degree
 #: scenes (content weight 5e-3 in units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
-NNFM_WEIGHT = _FEATURE_UNITS**2 / 5e-3
+NNFM_WEIGHT = KAPPA**2 / 5e-3
 #: w_n for `mixed`. Within 20 to 30 steps, the color gradient of the statistics terms falls to a tenth. With this
 #: weight, the color gradient of the nearest-neighbor term then has the same norm. Four pairs of scene and painting need
 #: 1.8e8 to 1.7e9; the constant is their geometric mean. It does not depend on the scene, so that a job has the same
