@@ -293,11 +293,19 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
         mean, *panels = figure.subplots(1, 1 + len(scales) + len(measures), squeeze=False)[0]
         losses = [_draw_curves(mean, shown, "mean of the scales", lambda point: point.relative)]
         for axes, scale in zip(panels, scales, strict=False):
-            losses.append(_draw_curves(axes, shown, scale_name(scale), lambda point, s=scale: point.by_scale.get(s)))
+
+            def loss(point: Point, scale: int = scale) -> float | None:
+                return point.by_scale.get(scale)
+
+            losses.append(_draw_curves(axes, shown, scale_name(scale), loss))
         for axes in (mean, *panels[: len(scales)]):
             set_log_y(axes, losses)
         for axes, (name, what) in zip(panels[len(scales) :], measures.items(), strict=True):
-            set_log_y(axes, [_draw_curves(axes, shown, what, lambda point, n=name: getattr(point.judgment, n, None))])
+
+            def judged(point: Point, name: str = name) -> float | None:
+                return getattr(point.judgment, name, None)
+
+            set_log_y(axes, [_draw_curves(axes, shown, what, judged)])
         front = [point for _, point in pareto_front(shown)]
         mean.plot([p.seconds for p in front], [p.relative for p in front], "--", color=INK, lw=2.5, alpha=0.35)
         mean.set_ylabel(RELATIVE_LOSS)

@@ -230,16 +230,13 @@ class FeatureNetwork:
 
     @torch.no_grad()
     def _fuse(self) -> None:
-        """Use cuDNN's fused convolution with bias and ReLU wherever a test on a small image shows that it works."""
+        """Use cuDNN's fused convolution with bias and ReLU wherever a test shows that it works."""
         if not _is_nvidia(self.device) or not torch.backends.cudnn.is_available():
             return
         with convolutions(self.device, tf32=self.tf32):
-            for step in [step for step in self._steps if isinstance(step, _Convolution)]:
-                generator = torch.Generator().manual_seed(0)
-                x = torch.randn((1, int(step.weight.shape[1]), _TRIAL_SIDE, _TRIAL_SIDE), generator=generator)
-                x = x.to(step.weight).contiguous(memory_format=torch.channels_last)
-                step.tried = _TRIAL_SIDE**2
-                step.fused = _tried_convolution(x, step) is not None
+            for step in self._steps:
+                if isinstance(step, _Convolution):
+                    _try_fusing(step)
 
     @property
     def precision(self) -> str:
@@ -415,6 +412,15 @@ def _fused_convolution(x: Tensor, step: _Convolution) -> Tensor:
     return result
 
 
+def _try_fusing(step: _Convolution) -> None:
+    """Fuse a convolution if that works on a small image."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn((1, int(step.weight.shape[1]), _TRIAL_SIDE, _TRIAL_SIDE), generator=generator)
+    x = x.to(step.weight).contiguous(memory_format=torch.channels_last)
+    step.tried = _TRIAL_SIDE**2
+    step.fused = _tried_convolution(x, step) is not None
+
+
 def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     """Return the result of the fused convolution; None if cuDNN fails or disagrees with the separate operations.
 
@@ -423,7 +429,7 @@ def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     """
     expected = F.conv2d(x, step.weight, step.bias, padding=1).relu_()
     largest = float(expected.amax())  # none is negative
-    torch.full_like(expected, torch.nan)  # freed at once: the allocator reuses the memory for the next such tensor
+    _leave_nan(expected)
     try:
         output = _fused_convolution(x, step)
     except RuntimeError:  # cuDNN has no engine for it
@@ -431,3 +437,8 @@ def _tried_convolution(x: Tensor, step: _Convolution) -> Tensor | None:
     same_layout = output.stride() == expected.stride()
     difference = float(expected.sub_(output).abs_().amax())
     return output if same_layout and difference <= _TRIAL_TOLERANCE * largest else None
+
+
+def _leave_nan(like: Tensor) -> None:
+    """Fill memory that the allocator reuses for the next tensor of this size with NaN."""
+    torch.full_like(like, torch.nan)

@@ -133,7 +133,8 @@ class Judge:
             fmean, zip(*(one[:4] for view in views for one in view), strict=True)
         )
         background_sensitivity = fmean(abs(view[0][0] - view[1][0]) for view in views)
-        known = ([one[index] for view in views for one in view if one[index] is not None] for index in (4, 5))
+        every = ([one[index] for view in views for one in view] for index in (4, 5))
+        known = ([value for value in values if value is not None] for values in every)
         interior = (fmean(values) if values else None for values in known)
         return Judgment(style, color_distance, content, features, background_sensitivity, saturated(sh_dc), *interior)
 
