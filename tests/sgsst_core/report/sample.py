@@ -33,6 +33,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
         "backbone": {"name": "vgg16", "source": "package index", "sha256": "0123456789abcdef" * 4},
         "scene": {"path": "folder/garden.ply", "gaussians": 123_456, "sh_degree": 3, "dropped": 0},
         "style": {"path": "styles/wave.jpg", "width": 800, "height": 600},
+        "styles": [{"path": "styles/wave.jpg", "width": 800, "height": 600, "weight": 1.0}],
         "cameras": {
             "path": None,
             "source": "orbit",

@@ -272,7 +272,7 @@ def test_both_axes_of_the_loss_are_logarithmic() -> None:
 def test_hostile_names_are_escaped() -> None:
     report = sample_report()
     report["scene"]["path"] = f"folder/{HOSTILE.replace('/', '∕')}.ply"
-    report["style"]["path"] = "<img src=x onerror=alert(1)>.jpg"
+    report["styles"][0]["path"] = "<img src=x onerror=alert(1)>.jpg"
     report["cameras"]["names"][1] = HOSTILE
     report["cameras"]["seeing_nothing"] = [HOSTILE]
     report["findings"][0]["worst"] = HOSTILE
