@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from sgsst_core.errors import InfrastructureError, SgsstError
 
@@ -100,7 +101,7 @@ class ProblemType:
     retry_after: int | None = None
     headers: Mapping[str, str] = field(default_factory=dict)
     error: type[ServiceError] = ServiceError
-    example: Mapping[str, object] = field(default_factory=dict)
+    example: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(
         self, message: str = "", *, code: str = "", retry_after: int | None = None, **values: object

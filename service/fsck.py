@@ -38,7 +38,7 @@ What = Literal["input", "result", "checkpoint", "upload"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class Fault:
     """File that is inconsistent with the database.
 
     Attributes:
@@ -85,7 +85,7 @@ class FileCheck:
         #: Number of files read so far.
         self.checked = 0
 
-    def findings(self, *, mend: bool = False) -> Iterator[Finding]:
+    def findings(self, *, mend: bool = False) -> Iterator[Fault]:
         """Yield all files that are inconsistent with the database.
 
         Args:
@@ -100,12 +100,12 @@ class FileCheck:
                         yield finding
         yield from self._orphans(mend=mend and not self._database.rolled_back)
 
-    def _examine(self, file: _File, *, mend: bool) -> Finding | None:
+    def _examine(self, file: _File, *, mend: bool) -> Fault | None:
         # The second check rules out that a running service has just replaced or removed the file and its row.
         kind = file.fault() and file.is_current() and file.fault()
         if not kind:
             return None
-        finding = Finding(kind, file.what, file.name, file.holders())
+        finding = Fault(kind, file.what, file.name, file.holders())
         if not mend:
             return finding
         done = ""
@@ -226,11 +226,11 @@ class FileCheck:
 
     # --- files that no row refers to -------------------------------------------------------------------------------
 
-    def _orphans(self, *, mend: bool) -> Iterator[Finding]:
+    def _orphans(self, *, mend: bool) -> Iterator[Fault]:
         for objects, what, name in self._unknown():
             if mend:
                 objects.remove(name)
-            yield Finding("orphaned", what, name, mended="deleted" if mend else "")
+            yield Fault("orphaned", what, name, mended="deleted" if mend else "")
 
     def _unknown(self) -> Iterator[tuple[ObjectStore, What, str]]:
         """Yield files that no database row refers to or will refer to.

@@ -14,26 +14,22 @@ from fastapi import FastAPI
 from starlette.types import ASGIApp
 
 from api.http.context import Context
-from api.http.deadline import Deadlines
 from api.http.documentation import complete
 from api.http.event_hub import Hub
 from api.http.fetching import Fetcher
-from api.http.metrics import Metrics
-from api.http.middleware import Methods, Observed, Proxied
+from api.http.limits import Rates, SignIns
+from api.http.middleware import Deadlines, Methods, Observed, Proxied
+from api.http.monitoring import Metrics, Readiness
 from api.http.problems import Problem, add_handlers
-from api.http.rates import Rates
-from api.http.readiness import Readiness
 from api.http.receipts import Receipts
-from api.http.routes import artifacts, blends, events, inputs, jobs, operations, session, shares, uploads, videos
+from api.http.routes import artifacts, events, inputs, jobs, operations, session, shares, submission, uploads
+from api.http.routes.submission import JobFromUploads
 from api.http.schemas import ANSWERS
-from api.http.sign_ins import SignIns
 from api.http.static import add_static
-from api.http.submission import JobFromUploads
-from api.http.threads import OwnerThreads
 from service.errors import DamagedWeightsError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
-from service.files.threads import FileThreads
+from service.files.threads import FileThreads, OwnerLimit
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
 from service.inspection.video_maker import VideoMaker
@@ -43,6 +39,8 @@ from service.weights import check_weights
 
 #: Number of threads for requests that read the database.
 _THREADS = 40
+#: Maximum number of these threads that read long lists of one owner at the same time.
+_READERS_PER_OWNER = 2
 #: Time limit of a piece of work on files, relative to the deadline of its request: the error then names what hangs.
 _FILES_FRACTION = 0.9
 #: Seconds that a request waits for a locked database, and for each response of the database server.
@@ -76,7 +74,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             rates=Rates(),
             receipts=Receipts(store.inputs, blobs, threads),
             threads=threads,
-            readers=OwnerThreads(),
+            readers=OwnerLimit(_READERS_PER_OWNER),
             fetcher=Fetcher(settings, blobs, threads),
             metrics=Metrics(store, settings.folder),
             readiness=Readiness(
@@ -115,7 +113,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         redoc_url=None,
     )
     app.settings = settings
-    modules = (jobs, events, inputs, blends, artifacts, videos, shares, uploads, session, operations)
+    modules = (submission, jobs, events, inputs, artifacts, shares, uploads, session, operations)
     for module in modules:
         app.include_router(module.router)
     add_static(app)

@@ -18,20 +18,18 @@ from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
+from pydantic import BeforeValidator
 
 from api.http.documentation import raises
 from api.http.event_hub import Hub
 from api.http.fetching import Fetcher
-from api.http.metrics import Metrics
-from api.http.rates import Rates
-from api.http.readiness import Readiness
+from api.http.limits import Rates, SignIns
+from api.http.monitoring import Metrics, Readiness
 from api.http.receipts import Receipts
-from api.http.sign_ins import SignIns
-from api.http.threads import OwnerThreads
 from service import problems
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
-from service.files.threads import FileThreads
+from service.files.threads import FileThreads, OwnerLimit
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
 from service.inspection.video_maker import VideoMaker
@@ -68,7 +66,7 @@ class Context:
     rates: Rates
     receipts: Receipts
     threads: FileThreads
-    readers: OwnerThreads
+    readers: OwnerLimit
     fetcher: Fetcher
 
 
@@ -206,3 +204,19 @@ _ID = re.compile(r"[a-z]{3}_[0-9a-f]{8,36}")
 def is_id(text: str) -> bool:
     """Return whether a text has the format of an id. Other texts need no database query."""
     return _ID.fullmatch(text) is not None
+
+
+def _digits(text: object) -> object:
+    """Check that a text has decimal digits only, and return it.
+
+    Raises:
+        ValueError: If the text contains anything else, such as a sign, spaces, underscores, or digits of another
+            script. `int` accepts all of these, but a proxy in front of the service may read them as another number.
+    """
+    if isinstance(text, str) and not re.fullmatch("[0-9]+", text):
+        raise ValueError("Input should be decimal digits")
+    return text
+
+
+#: A whole number, written in decimal digits only.
+Digits = Annotated[int, BeforeValidator(_digits)]

@@ -1,6 +1,7 @@
 """Parts of the OpenAPI document that route types do not cover: headers of responses, and errors with examples.
 
-Examples of bodies are defined with their models (`api.http.schemas`, `api.http.submission`, `service.parameters`).
+Examples of bodies are defined with their models (`api.http.schemas`, `api.http.routes.submission`,
+`service.parameters`).
 """
 
 from __future__ import annotations

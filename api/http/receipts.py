@@ -15,7 +15,7 @@ from typing import Self
 from service.errors import DatabaseUnavailableError, StoreError
 from service.files.blobs import Blobs
 from service.files.threads import FileThreads
-from service.store.inputs import GRACE_SECONDS, Inputs
+from service.store.inputs import GRACE_SECONDS, InputRows
 from service.store.quotas import Quotas
 
 #: Seconds between two renewals. If a process dies, its receipts and partial files expire.
@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 class Receipts:
     """Receipts of this process. A background task renews each one until its request has ended."""
 
-    def __init__(self, inputs: Inputs, blobs: Blobs, threads: FileThreads) -> None:
+    def __init__(self, inputs: InputRows, blobs: Blobs, threads: FileThreads) -> None:
         self.inputs, self._blobs, self._threads = inputs, blobs, threads
         self.active: set[str] = set()
         self._renewing: asyncio.Task[None] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
@@ -15,7 +16,6 @@ from pydantic import BaseModel
 
 from api.http.documentation import Responses, headers, raises
 from api.http.request_memory import memory
-from api.http.threads import OwnerThreads
 from service import problems
 from service.examples import SHA256
 from service.files.threads import FileThreads
@@ -141,8 +141,7 @@ async def send_list(
     read: ReadEntries,
     cursor: str | None,
     limit: int,
-    threads: OwnerThreads,
-    owner: str,
+    turn: asyncio.Semaphore,
     *,
     at_once: int = 250,
 ) -> Response:
@@ -153,12 +152,16 @@ async def send_list(
         read: Function that reads entries.
         cursor: Cursor of the page; None for the first one.
         limit: Maximum number of entries on the page.
-        threads: Threads for reading, of which an owner occupies few.
-        owner: Owner of the list.
+        turn: Semaphore of the list's owner, who occupies few threads at once.
         at_once: Number of entries to read at once.
     """
     pieces = _pieces(name, read, cursor, limit, at_once)
-    first, second = [await threads.run(owner, _following, pieces) for _ in range(2)]
+
+    async def following() -> bytes | None:
+        async with turn:
+            return await asyncio.to_thread(next, pieces, None)
+
+    first, second = [await following() for _ in range(2)]
     if second is None:
         return Response(first, media_type="application/json")
 
@@ -167,14 +170,9 @@ async def send_list(
         yield first or b""
         while piece is not None:
             yield piece
-            piece = await threads.run(owner, _following, pieces)
+            piece = await following()
 
     return StreamingResponse(body(), media_type="application/json")
-
-
-def _following(pieces: Iterator[bytes]) -> bytes | None:
-    """Return the next piece; None after the last one."""
-    return next(pieces, None)
 
 
 def _pieces(name: str, read: ReadEntries, cursor: str | None, limit: int, at_once: int) -> Iterator[bytes]:

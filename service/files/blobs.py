@@ -25,7 +25,7 @@ from typing import IO, Protocol
 from service import problems
 from service.errors import NotFoundError, StoreError
 from service.files.objects import CHUNK, ObjectStore
-from service.store.inputs import Inputs, check_offset
+from service.store.inputs import InputRows, check_offset
 from service.store.tables import BlobRow, UploadRow
 from sgsst_core.errors import OutputError
 
@@ -126,7 +126,7 @@ class Blobs(ABC):
         objects: File store that holds the blobs, under `BLOBS`.
     """
 
-    def __init__(self, folder: Path, inputs: Inputs, min_free: int, objects: ObjectStore) -> None:
+    def __init__(self, folder: Path, inputs: InputRows, min_free: int, objects: ObjectStore) -> None:
         self.objects = objects
         self.incoming = folder / "incoming"
         self.incoming.mkdir(parents=True, exist_ok=True)
@@ -260,7 +260,7 @@ class Blobs(ABC):
 class BlobFolder(Blobs):
     """Inputs as files in the data folder."""
 
-    def __init__(self, folder: Path, inputs: Inputs, min_free_bytes: int) -> None:
+    def __init__(self, folder: Path, inputs: InputRows, min_free_bytes: int) -> None:
         super().__init__(folder, inputs, min_free_bytes, ObjectStore(f"file://{folder}"))
         self._blobs, self.uploads = folder / BLOBS, folder / UPLOADS
         for path in (self._blobs, self.uploads):
@@ -370,7 +370,7 @@ class _FileWriter:
     Each writer locks the file, so that only one writer per upload is open at a time across all processes.
     """
 
-    def __init__(self, path: Path, inputs: Inputs, upload: UploadRow, seconds: float) -> None:
+    def __init__(self, path: Path, inputs: InputRows, upload: UploadRow, seconds: float) -> None:
         self._inputs, self._upload, self._seconds = inputs, upload, seconds
         self._offset = self._saved = upload.offset
         try:

@@ -16,7 +16,7 @@ from service.files.blobs import BLOBS, UPLOADS, BlobFolder, Blobs, PartWriter, w
 from service.files.cache import FileCache, file_digest
 from service.files.objects import ObjectStore
 from service.settings import ServiceSettings
-from service.store.inputs import Inputs
+from service.store.inputs import InputRows
 from service.store.tables import BlobRow, UploadPartRow, UploadRow
 
 #: Age in seconds at which objects without a database row are removed; younger objects may not have their row yet.
@@ -27,7 +27,7 @@ _SEARCH_SECONDS = 3600.0
 _log = logging.getLogger(__name__)
 
 
-def open_blobs(settings: ServiceSettings, inputs: Inputs, artifacts: Artifacts) -> Blobs:
+def open_blobs(settings: ServiceSettings, inputs: InputRows, artifacts: Artifacts) -> Blobs:
     """Return the store of inputs: the data folder if the file store is a local folder, otherwise the file store."""
     if artifacts.local:
         return BlobFolder(settings.folder, inputs, settings.min_free_bytes)
@@ -42,7 +42,7 @@ def open_cache(settings: ServiceSettings) -> FileCache:
 class StoredBlobs(Blobs):
     """Inputs as objects of the file store."""
 
-    def __init__(self, settings: ServiceSettings, inputs: Inputs, objects: ObjectStore) -> None:
+    def __init__(self, settings: ServiceSettings, inputs: InputRows, objects: ObjectStore) -> None:
         super().__init__(settings.folder, inputs, settings.min_free_bytes, objects)
         self._cache = open_cache(settings)
         self._local = settings.folder / "blobs"  # inputs from a time when the file store was local
@@ -230,7 +230,9 @@ class StoredBlobs(Blobs):
 class _ObjectWriter:
     """Writer of an upload's bytes: a file on this host buffers them until they are saved to the store."""
 
-    def __init__(self, folder: Path, objects: ObjectStore, inputs: Inputs, upload: UploadRow, seconds: float) -> None:
+    def __init__(
+        self, folder: Path, objects: ObjectStore, inputs: InputRows, upload: UploadRow, seconds: float
+    ) -> None:
         self._objects, self._inputs, self._upload, self._seconds = objects, inputs, upload, seconds
         self._path = folder / f"{secrets.token_hex(12)}.part"
         self._file = self._path.open("wb", buffering=0)

@@ -24,7 +24,7 @@ from service.deadlines import LEAST_RATE, extend
 #: Number of threads, and maximum number per owner. Threads mostly wait for the disk or the network.
 _THREADS, _THREADS_PER_OWNER = 16, 4
 
-Result = TypeVar("Result")
+Returned = TypeVar("Returned")
 
 
 class OwnerLimit:
@@ -55,7 +55,7 @@ class FileThreads:
         self._limit = OwnerLimit(_THREADS_PER_OWNER)
         self._cleaning: set[asyncio.Task[Any]] = set()
 
-    async def run(self, owner: str, function: Callable[..., Result], *arguments: Any, size: int = 0) -> Result:
+    async def run(self, owner: str, function: Callable[..., Returned], *arguments: Any, size: int = 0) -> Returned:
         """Call a function in a thread as soon as the owner has a free one, and return its result.
 
         Args:
@@ -93,7 +93,7 @@ class FileThreads:
         finally:
             await self.clean_up(self.run(owner, folder.cleanup))
 
-    async def clean_up(self, work: Coroutine[Any, Any, Result]) -> Result:
+    async def clean_up(self, work: Coroutine[Any, Any, Returned]) -> Returned:
         """Await some work, which continues in the background if the request that waits for it is canceled."""
         task = asyncio.ensure_future(work)
         self._cleaning.add(task)  # the event loop itself holds weak references only

@@ -9,7 +9,7 @@ from service.errors import DatabaseUnavailableError
 from service.settings import ServiceSettings
 from service.store.clocks import Clock
 from service.store.database import ANSWER_SECONDS, Database
-from service.store.inputs import Inputs
+from service.store.inputs import InputRows
 from service.store.jobs import Jobs
 from service.store.keys import Keys, Sessions
 from service.store.leases import Leases
@@ -36,7 +36,7 @@ class Store:
         policy = RetryPolicy(settings.max_attempts, settings.retry_seconds)
         self.leases = Leases(self.database, settings.lease_seconds, policy, settings.retention_seconds)
         self.retention = Retention(self.database, settings.retention_seconds)
-        self.inputs = Inputs(self.database)
+        self.inputs = InputRows(self.database)
         self.keys = Keys(self.database)
         self.sessions = Sessions(self.database, settings.session_seconds)
         self.shares = Shares(self.database)

@@ -40,7 +40,7 @@ def check_offset(upload: UploadRow, offset: int) -> None:
         raise problems.WRONG_OFFSET(given=offset, offset=upload.offset)
 
 
-class Inputs:
+class InputRows:
     """Database rows of blobs, uploads, receipts and inspections."""
 
     def __init__(self, database: Database) -> None:

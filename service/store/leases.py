@@ -16,7 +16,7 @@ from sqlalchemy import Delete, and_, bindparam, delete, func, or_, select, updat
 from sqlalchemy.orm import Session
 
 from service import problems
-from service.errors import LeaseLostError
+from service.errors import ServiceError
 from service.states import ACTIVE, AttemptOutcome, JobStatus, Transition
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, observe, upsert
@@ -396,7 +396,7 @@ def _delete_old_progress() -> Delete:
 _DELETE_OLD_PROGRESS = _delete_old_progress()
 
 
-def _lost(lease: Lease) -> LeaseLostError:
+def _lost(lease: Lease) -> ServiceError:
     return problems.LEASE_LOST(job_id=lease.job_id, epoch=lease.epoch, dispatcher=lease.dispatcher)
 
 

@@ -1,4 +1,4 @@
-"""`/v1/jobs/{id}/artifacts`: the files that a job has made."""
+"""`/v1/jobs/{id}/artifacts`, `/blends`, `/video`: files that a job has made, and files made of its result."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ import asyncio
 import re
 from functools import partial
 from pathlib import PurePosixPath
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from api.http.context import Caller, CallerDep, Context, ContextDep
-from api.http.documentation import Responses, links
-from api.http.numbers import Digits
+from api.http.context import Caller, CallerDep, Context, ContextDep, Digits
+from api.http.documentation import Responses, headers, links
+from api.http.multipart import json_body
+from api.http.progress import VIDEO, answer_work
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import ArtifactList, ArtifactView, artifact_view
+from api.http.schemas import ArtifactList, ArtifactView, BlendRequest, artifact_view
 from api.http.sending import (
     ConditionsDep,
     SentFile,
@@ -27,9 +28,11 @@ from service import problems
 from service.errors import LostFileError
 from service.files.artifacts import media_type
 from service.files.staging import RESULT
+from service.inspection.derived import Blend
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import EXTRA_FORMATS, ResultName, by_name, listed, result_name
 from sgsst_core.files.formats.ply import PLY
+from worker.options import JobVideo
 
 router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
 
@@ -69,7 +72,7 @@ async def list_artifacts(
         following = page[most - 1].name if len(page) > most else None
         return [artifact_view(row) for row in page[:most] if not row.name.startswith(".")], following
 
-    return await send_list("artifacts", read, cursor, limit, context.readers, caller.owner)
+    return await send_list("artifacts", read, cursor, limit, context.readers.of(caller.owner))
 
 
 #: Media types of results (`service.files.artifacts`), and how the content of each starts.
@@ -168,3 +171,64 @@ def _file_name(job_name: str, name: str) -> str:
     """Return the file name to suggest for a result. It includes the job's name, so that results of jobs differ."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", job_name).strip("._")[:60]
     return f"{plain}-{PurePosixPath(name).name}" if plain else PurePosixPath(name).name
+
+
+@router.post(
+    "/{job_id}/blends",
+    status_code=201,
+    response_model=ArtifactView,
+    responses={
+        201: {
+            "description": "The blend exists. The same request returns the same file.",
+            "headers": headers("Location"),
+            "links": links("get_artifact", "head_artifact", job_id="$request.path.job_id", name="$response.body#/name"),
+        },
+    },
+    operation_id="create_blend",
+)
+async def create_blend(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    body: Annotated[BlendRequest, Depends(json_body(BlendRequest))],
+) -> Response:
+    """Blend a finished job's scene with its result, and store the blend among the job's artifacts."""
+    others = {part.job_id: part.weight for part in body.others}
+    if len({job_id, *others}) != 1 + len(body.others):
+        raise problems.INVALID_REQUEST("others: A job is named twice. Give each job one weight.")
+    job = await asyncio.to_thread(_find_owned, context, caller, job_id, others)
+    row = await context.derived.blended(job, Blend(body.weight, others, by_name(body.format)), caller.quotas)
+    view = artifact_view(row)
+    return Response(view.model_dump_json(), 201, {"Location": view.url}, media_type="application/json")
+
+
+def _find_owned(context: Context, caller: Caller, job_id: str, others: dict[str, float]) -> JobRow:
+    """Return the caller's job; raise an error unless the caller owns the jobs in `others` too."""
+    for other in others:
+        find(context, caller, other)
+    return find(context, caller, job_id)
+
+
+@router.post(
+    "/{job_id}/video",
+    response_model=ArtifactView,
+    responses={200: VIDEO},
+    operation_id="make_video",
+)
+async def make_video(
+    request: Request,
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    options: Annotated[JobVideo, Depends(json_body(JobVideo))],
+) -> Response:
+    """Render a video of the result as `video.mp4`, which replaces an earlier one. It takes minutes.
+
+    The video is completed even if the client closes the connection; repeat the request to wait for it again.
+    """
+    job = await asyncio.to_thread(find, context, caller, job_id)
+
+    async def work(show: Any) -> ArtifactView:
+        return artifact_view(await context.videos.make(job, options, caller.quotas, show))
+
+    return await answer_work(request, work, "rendering", "video")

@@ -9,9 +9,8 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Response
 from fastapi.responses import StreamingResponse
 
-from api.http.context import CallerDep, ContextDep
+from api.http.context import CallerDep, ContextDep, Digits
 from api.http.documentation import headers
-from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import ProgressView, example_of
 from service.examples import SHA256

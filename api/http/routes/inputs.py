@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from functools import partial
 from pathlib import PurePosixPath
 from typing import Annotated, Any
@@ -10,10 +11,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from api.http.context import Caller, CallerDep, Context, ContextDep
+from api.http.context import Caller, CallerDep, Context, ContextDep, Digits
 from api.http.documentation import Responses, links
-from api.http.input_references import find_input
-from api.http.numbers import Digits
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import InputFileView, InputList, input_views
 from api.http.sending import (
@@ -26,7 +25,9 @@ from api.http.sending import (
 from service import problems
 from service.errors import LostFileError
 from service.files.blobs import BLOBS
-from service.store.tables import BlobRow
+from service.states import JobStatus
+from service.store.jobs import Jobs
+from service.store.tables import BlobRow, JobRow
 
 router = APIRouter(prefix="/v1/jobs", tags=["inputs"])
 
@@ -38,6 +39,7 @@ _KINDS = {
     ".webp": "image/webp",
     ".json": "application/json",
 }
+_INPUT = re.compile(r"([a-z]{1,10})(?::([0-9]{1,6}))?", re.ASCII)
 #: Content-Security-Policy of inputs. Users provide these files, so no script in them may run.
 _POLICY = "sandbox; default-src 'none'"
 
@@ -81,7 +83,7 @@ async def list_inputs(
         page = context.store.jobs.input_page(job_id, position, most + 1)
         return input_views(job_id, page[:most]), str(position + most) if len(page) > most else None
 
-    return await send_list("inputs", read, str(cursor), limit, context.readers, caller.owner)
+    return await send_list("inputs", read, str(cursor), limit, context.readers.of(caller.owner))
 
 
 @router.head("/{job_id}/inputs/{role}", operation_id="head_input", response_class=Response, responses=_ANSWERS)
@@ -145,3 +147,15 @@ def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tup
         if row is not None:
             return entry, row
     raise problems.NO_INPUT(job_id=job.id, name=role[:40])
+
+
+def parse_input(name: str) -> tuple[str, int] | None:
+    """Return role and index of an input such as "scene" or "style:1", or None if it is not such a name."""
+    match = _INPUT.fullmatch(name)
+    return (match[1], int(match[2] or 0)) if match else None
+
+
+def find_input(jobs: Jobs, job: JobRow, name: str) -> dict[str, Any] | None:
+    """Return a job's entry for an input such as "scene" or "style:1"; None if it is missing or was released."""
+    place = parse_input(name)
+    return None if place is None or job.status == JobStatus.EXPIRED else jobs.input(job.id, *place)

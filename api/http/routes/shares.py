@@ -12,10 +12,9 @@ from fastapi.responses import StreamingResponse
 from api.http.addresses import address
 from api.http.context import CallerDep, Context, ContextDep, check_site, is_id
 from api.http.documentation import Responses, headers, links, raises
-from api.http.input_references import find_input
 from api.http.multipart import json_body
 from api.http.routes.artifacts import check_artifact
-from api.http.routes.inputs import check_input
+from api.http.routes.inputs import check_input, find_input
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import SHARED_RESULTS, NewShare, ShareCreated, SharedView, ShareList, ShareView, shared_view
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+import hashlib
+import threading
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from email.utils import format_datetime
@@ -12,15 +15,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Path, Request, Response
 
 from api.http.addresses import address
-from api.http.context import CallerDep, Context, ContextDep, is_id
+from api.http.context import CallerDep, Context, ContextDep, Digits, is_id
 from api.http.documentation import headers, links, raises
-from api.http.input_references import uploaded_name
 from api.http.multipart import body_blocks, check_media_type, media_type
-from api.http.numbers import Digits
-from api.http.receiving import ALGORITHMS, append_body, longer_than_declared, parse_checksum
-from api.http.routes.jobs import IdempotencyHeader
 from api.http.schemas import UploadView, upload_view
 from service import problems
+from service.errors import ServiceError, StoreError
 from service.examples import UPLOAD_ID
 from service.files.staging import staged_name
 from service.store.inputs import check_offset
@@ -36,11 +36,25 @@ _UNSUPPORTED = (
     ("Upload-Defer-Length", "", "creation-defer-length"),
     ("Trailer", "upload-checksum", "checksum-trailer"),
 )
+#: Digest algorithms of `Upload-Checksum`.
+_ALGORITHMS = ("sha256", "sha1", "md5")
+#: Number of bytes after which an upload's state is saved. A crash loses at most this many bytes.
+_SAVE_BYTES = 64 << 20
 #: Media type of a part of a file.
 _PART_TYPE = "application/offset+octet-stream"
 _HEADERS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 
 
+IdempotencyHeader = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=180,
+        description="Unique key of the request. Repeating it within a day creates nothing twice.",
+        examples=["5f0c9a52-9a3b-4c39-8a1c-0d9a2b8b6d1e"],
+    ),
+]
 UploadId = Annotated[str, Path(description="ID of an upload.", examples=[UPLOAD_ID])]
 Tus = Annotated[
     str,
@@ -110,7 +124,7 @@ def describe_uploads(context: ContextDep) -> Response:
         "Tus-Resumable": VERSION,
         "Tus-Version": VERSION,
         "Tus-Extension": EXTENSIONS,
-        "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
+        "Tus-Checksum-Algorithm": ",".join(_ALGORITHMS),
         "Tus-Max-Size": str(context.settings.max_upload_bytes),
     }
     return Response(status_code=204, headers=response_headers)
@@ -257,7 +271,7 @@ async def append_upload(
 ) -> Response:
     """Send the next part. If the connection breaks, received bytes are stored unless a checksum was announced."""
     check_media_type(request, _PART_TYPE)
-    expected = parse_checksum(checksum) if checksum else None
+    expected = _parse_checksum(checksum) if checksum else None
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     if row.sha256 is not None and offset != row.length:
         raise problems.CONFLICT(f"The upload is complete with {row.length} bytes.", offset=row.length)
@@ -267,10 +281,10 @@ async def append_upload(
         finish, seconds = context.blobs.finish_upload, context.settings.upload_hours * 3600
         await context.threads.run(caller.owner, finish, row, seconds, size=row.length)
     elif row.sha256 is None:
-        expires = await append_body(request, context, row, expected)
+        expires = await _append_body(request, context, row, expected)
     else:
         async for _ in body_blocks(request, context.settings):
-            raise longer_than_declared(row.length)
+            raise _longer_than_declared(row.length)
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     return Response(
         status_code=204,
@@ -295,6 +309,102 @@ async def delete_upload(upload_id: UploadId, context: ContextDep, caller: Caller
     return Response(status_code=204, headers=_HEADERS)
 
 
+async def _append_body(request: Request, context: Context, row: UploadRow, checksum: tuple[str, bytes] | None) -> float:
+    """Append the request's body to the upload, and return the upload's new expiry time.
+
+    Args:
+        checksum: Algorithm and expected digest of the body; None for no check.
+    """
+    run = partial(context.threads.run, row.owner)
+    writer = await run(_Writer, context, row, checksum)
+    try:
+        try:
+            async for block in body_blocks(request, context.settings):
+                await run(writer.write, block, size=_SAVE_BYTES)
+        except StoreError:
+            raise
+        except ServiceError:
+            if checksum is None:
+                await run(writer.save, size=_SAVE_BYTES)  # no checksum can contradict them
+            raise
+        return await run(writer.finish, size=row.length if writer.complete else _SAVE_BYTES)
+    finally:
+        await context.threads.clean_up(run(writer.close))
+
+
+class _Writer:
+    """Writer that checks received bytes and saves them at intervals.
+
+    A thread that hangs and was given up blocks the others, so that no file is closed while it is written to.
+    """
+
+    def __init__(self, context: Context, row: UploadRow, checksum: tuple[str, bytes] | None) -> None:
+        self._context, self._row, self._checksum = context, row, checksum
+        self._lock = threading.RLock()
+        self._seconds = context.settings.upload_hours * 3600
+        self._part = context.blobs.append(row, self._seconds)
+        self._digest = hashlib.new(checksum[0]) if checksum else None
+        self._offset = self._saved = row.offset
+
+    def write(self, block: bytes) -> None:
+        if self._offset + len(block) > self._row.length:
+            raise _longer_than_declared(self._row.length)
+        with self._lock:
+            self._context.blobs.ensure_space(len(block))
+            self._part.write(block)
+            self._offset += len(block)
+            if self._digest is not None:
+                self._digest.update(block)
+            elif self._offset - self._saved >= _SAVE_BYTES:
+                self.save()
+
+    @property
+    def complete(self) -> bool:
+        """Whether all bytes of the upload have been written."""
+        return self._offset == self._row.length
+
+    def save(self) -> float:
+        """Make the received bytes durable, then update the database. Return the upload's new expiry time."""
+        with self._lock:
+            self._saved = self._offset
+            return self._part.save()
+
+    def finish(self) -> float:
+        """Verify and save the bytes of the request. Store the file as a blob if the upload is complete."""
+        if self._digest is not None and self._checksum is not None and self._digest.digest() != self._checksum[1]:
+            self._part.discard()
+            raise problems.CHECKSUM_MISMATCH()
+        expires = self.save()
+        self.close()
+        if self.complete:
+            self._context.blobs.finish_upload(self._row, self._seconds)
+        return expires
+
+    def close(self) -> None:
+        with self._lock:
+            self._part.close()
+
+
+def _longer_than_declared(length: int) -> ServiceError:
+    """Return the error for a part with more bytes than the upload lacks."""
+    return problems.TOO_LARGE(f"The parts have more bytes than the {length:,} of Upload-Length.", limit=length)
+
+
+def _parse_checksum(header: str) -> tuple[str, bytes]:
+    """Return the algorithm and the digest of an `Upload-Checksum` header.
+
+    Raises:
+        MALFORMED_BODY: If the header is malformed.
+    """
+    name, _, value = header.partition(" ")
+    if name not in _ALGORITHMS:
+        raise problems.MALFORMED_BODY(f"Upload-Checksum: {name[:20]!r} is none of {', '.join(_ALGORITHMS)}.")
+    try:
+        return name, base64.b64decode(value, validate=True)
+    except ValueError as error:  # raised for non-ASCII characters too
+        raise problems.MALFORMED_BODY("Upload-Checksum: the digest is not base64.") from error
+
+
 def _remove_files(context: Context, upload_id: str, unused: Sequence[str]) -> None:
     context.blobs.discard_upload(upload_id)
     context.blobs.remove(unused)
@@ -308,3 +418,19 @@ def _find_upload(context: Context, owner: str, upload_id: str) -> UploadRow:
 
 def _http_date(seconds: float) -> str:
     return format_datetime(datetime.fromtimestamp(seconds, UTC), usegmt=True)
+
+
+def uploaded_name(metadata: str) -> str:
+    """Return the `filename` in an `Upload-Metadata` header, which has the format `key base64, key base64`.
+
+    Raises:
+        MALFORMED_BODY: If it is not base64 of UTF-8.
+    """
+    for pair in metadata.split(","):
+        key, _, value = pair.strip().partition(" ")
+        if key in ("filename", "name"):
+            try:
+                return base64.b64decode(value, validate=True).decode()
+            except ValueError as error:  # raised for non-ASCII characters too
+                raise problems.MALFORMED_BODY(f"Upload-Metadata: {key!r} is not base64 of UTF-8.") from error
+    return ""

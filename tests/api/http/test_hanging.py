@@ -16,7 +16,7 @@ import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
-from api.http.deadline import Deadlines
+from api.http.middleware import Deadlines
 from service import problems
 from service.deadlines import suspended
 from service.errors import StoreError

@@ -18,7 +18,7 @@ import httpx
 import pytest
 
 from api.http.app import create_app
-from api.http.sign_ins import MOST_FAILURES
+from api.http.limits import MOST_FAILURES
 from service.examples import SHARE_ID, SHARE_TOKEN
 from service.settings import ServiceSettings
 from service.store import Store, open_store

@@ -14,7 +14,7 @@ from typing import Any
 import httpx
 import pytest
 
-from api.http.rates import Rates
+from api.http.limits import Rates
 from service import problems
 from service.errors import ServiceError
 from service.settings import ServiceSettings

@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.http.sign_ins import MOST_FAILURES, WITHIN_SECONDS, SignIns
+from api.http.limits import MOST_FAILURES, WITHIN_SECONDS, SignIns
 from service import problems
 from service.settings import ServiceSettings
 from service.store import Store, open_store
