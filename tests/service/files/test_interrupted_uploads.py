@@ -19,7 +19,7 @@ from service.errors import StoreError
 from service.files.blobs import BlobFolder
 from service.settings import ServiceSettings
 from service.store import open_store
-from service.store.inputs import Inputs
+from service.store.inputs import InputRows
 from tests.api.service import Service
 from tests.raised import raises_problem
 from tests.small_scenes import wall, write_files
@@ -117,7 +117,7 @@ def unprivileged() -> Iterator[None]:
 
 
 @contextmanager
-def blob_folder(tmp_path: Path) -> Iterator[tuple[Inputs, BlobFolder]]:
+def blob_folder(tmp_path: Path) -> Iterator[tuple[InputRows, BlobFolder]]:
     """Yield a database and a store of inputs, in which another user may read."""
     store = open_store(ServiceSettings(data=tmp_path))
     with tempfile.TemporaryDirectory() as folder:  # other users may not enter `tmp_path`
