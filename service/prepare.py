@@ -11,10 +11,9 @@ import sys
 import time
 
 from service.errors import DatabaseUnavailableError, StoreError
-from service.file_permissions import keep_private
 from service.files.objects import ObjectStore
-from service.logs import set_up
 from service.settings import ServiceSettings
+from service.startup import keep_private, set_up
 from service.store import open_store
 
 _RETRY_SECONDS = 2.0

@@ -177,7 +177,7 @@ def _service_settings() -> ServiceSettings:
 def _open_store(data: Path | None) -> Store:
     if data is not None:
         os.environ["SGSST_DATA"] = str(data.absolute())
-    from service.file_permissions import keep_private
+    from service.startup import keep_private
     from service.store import open_store
 
     settings = _service_settings()

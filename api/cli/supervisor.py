@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import FrameType
 
-from service.file_permissions import keep_private
 from service.optional import missing_extras
 from service.settings import ServiceSettings
+from service.startup import keep_private
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError
 

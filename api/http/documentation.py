@@ -20,7 +20,7 @@ from starlette.routing import BaseRoute
 from api.http.problems import MEDIA_TYPE, from_service
 from service import problems
 from service.errors import ProblemType, ServiceError
-from service.examples import JOB_ID, SHA256
+from service.problems import JOB_ID, SHA256
 from sgsst_core.errors import (
     CameraError,
     ImageError,

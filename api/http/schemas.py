@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from api.http.addresses import address
-from service.examples import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.files.artifacts import media_type
 from service.parameters import JobName, JobParameters
+from service.problems import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.jobs import ShownJob
 from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
@@ -513,10 +513,6 @@ ANSWERS: tuple[type[BaseModel], ...] = (
     UploadView,
     PlanView,
     Health,
-    SignIn,
-    NewShare,
-    JobChange,
-    BlendRequest,
 )
 
 

@@ -17,8 +17,8 @@ from pydantic import BaseModel
 from api.http.documentation import Responses, headers, raises
 from api.http.request_memory import memory
 from service import problems
-from service.examples import SHA256
 from service.files.threads import FileThreads
+from service.problems import SHA256
 
 #: Maximum size in bytes of two chunks. Sending 64 kB at a time takes several times as much CPU time per byte.
 _MOST_BYTES = 1 << 20

@@ -13,9 +13,8 @@ import uvicorn
 
 from api.http.app import create_app
 from api.http.connection import Connection, Reader
-from service.file_permissions import keep_private
-from service.logs import set_up
 from service.settings import ServiceSettings
+from service.startup import keep_private, set_up
 
 #: Seconds that open requests have to finish at a shutdown.
 _GRACE = 10

@@ -58,14 +58,10 @@ class ObjectStore:
         self.url = url
         self._files, self.root = fsspec.core.url_to_fs(url, **_options(url))
         self.local = isinstance(self._files, LocalFileSystem)
-        self._s3 = "s3" in self._protocols()
+        self._s3 = "s3" in self._files.protocol  # a name, or a tuple of names
         self._checked: OrderedDict[str, tuple[Stamp, str, float]] = OrderedDict()
         if self._s3:
             self._files.retries = 1
-
-    def _protocols(self) -> tuple[str, ...]:
-        protocol = self._files.protocol
-        return (protocol,) if isinstance(protocol, str) else tuple(protocol)
 
     def put(self, source: Path, name: str) -> None:
         """Upload a file atomically; it must not change during the upload."""
@@ -301,7 +297,8 @@ class ObjectStore:
         except Exception as error:
             if self.local:
                 raise
-            raise problems.STORE_UNAVAILABLE() from _cause(name, error)
+            error.add_note(f"store of files: {name}")  # for the operator's log
+            raise problems.STORE_UNAVAILABLE() from error
 
 
 def _uninterrupted(read: Callable[[], T]) -> T:
@@ -316,12 +313,6 @@ def _uninterrupted(read: Callable[[], T]) -> T:
             if not left or time.monotonic() - started > _ANSWER_SECONDS:
                 raise
     raise AssertionError
-
-
-def _cause(name: str, error: Exception) -> Exception:
-    """Add the object's name to an error, for the operator's log."""
-    error.add_note(f"store of files: {name}")
-    return error
 
 
 def _options(url: str) -> dict[str, Any]:

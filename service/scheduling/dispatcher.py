@@ -17,10 +17,8 @@ import time
 from types import FrameType
 
 from service.errors import DamagedWeightsError, DatabaseUnavailableError, LeaseLostError
-from service.file_permissions import keep_private
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
-from service.logs import set_up
 from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.housekeeping import Housekeeper
 from service.scheduling.lease_keeper import RENEW_FRACTION, LeaseKeeper
@@ -31,6 +29,7 @@ from service.scheduling.selection import JobSelector
 from service.scheduling.stager import Stager
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
+from service.startup import keep_private, set_up
 from service.store import Store, open_store
 from service.store.leases import Lease
 from service.weights import check_weights

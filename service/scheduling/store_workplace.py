@@ -23,7 +23,6 @@ from typing import Any
 
 from service import problems
 from service.errors import DamagedFileError, LostFileError, ServiceError
-from service.file_permissions import keep_private
 from service.files.artifacts import Artifacts
 from service.files.cache import file_digest
 from service.files.objects import ObjectStore
@@ -31,6 +30,7 @@ from service.files.staging import CHECKPOINT, RESULT, stage
 from service.files.stored_blobs import open_cache
 from service.scheduling.publishing import Outbox, put_patiently
 from service.settings import ServiceSettings
+from service.startup import keep_private
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.weight_files import cache_folder

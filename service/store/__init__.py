@@ -7,17 +7,16 @@ import time
 
 from service.errors import DatabaseUnavailableError
 from service.settings import ServiceSettings
+from service.store.access import Keys, Sessions, Shares
 from service.store.clocks import Clock
 from service.store.database import ANSWER_SECONDS, Database
 from service.store.inputs import InputRows
 from service.store.jobs import Jobs
-from service.store.keys import Keys, Sessions
 from service.store.leases import Leases
 from service.store.operations import Operations
 from service.store.quotas import Usage
 from service.store.retention import Retention
 from service.store.retries import RetryPolicy
-from service.store.shares import Shares
 
 #: Interval between attempts to connect to an unavailable database, in seconds.
 _RETRY_SECONDS = 1.0

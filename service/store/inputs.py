@@ -171,7 +171,8 @@ class InputRows:
                 known = session.get(UploadRow, used_key.created_id) if used_key.created_id else None
                 if known is not None:
                     return known
-            if _count_open_uploads(session, owner) >= most:
+            unfinished = (UploadRow.owner == owner, UploadRow.sha256.is_(None), ~IS_RECEIPT)
+            if (session.scalar(select(func.count()).select_from(UploadRow).where(*unfinished)) or 0) >= most:
                 raise problems.TOO_MANY_UPLOADS(limit=most)
             row = UploadRow(id=new_id("upl", now), owner=owner, length=length, offset=0, filename=filename)
             row.metadata_header, row.created_at, row.expires_at = header, now, now + seconds
@@ -360,8 +361,3 @@ def _hold_for_upload(session: Session, upload_id: str, sha256: str, size: int) -
     session.execute(use.on_conflict_do_nothing())
     receipt = update(UploadRow).where(UploadRow.id == upload_id, IS_RECEIPT).values(length=UploadRow.length - size)
     session.execute(receipt.execution_options(synchronize_session=False))
-
-
-def _count_open_uploads(session: Session, owner: str) -> int:
-    count = select(func.count()).select_from(UploadRow)
-    return session.scalar(count.where(UploadRow.owner == owner, UploadRow.sha256.is_(None), ~IS_RECEIPT)) or 0

@@ -131,8 +131,6 @@ class RetryPolicy:
             repeated = next((number for number, cause in enumerate(causes) if cause == Cause.JOB), len(causes))
         if failed:
             return Verdict(Transition.FAIL, count)
+        wait = min(self.retry_seconds * 2.0 ** max(repeated - 1, 0), MAX_RETRY_SECONDS)
         # a lost attempt has already cost the duration of a lease
-        return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else self._wait(repeated))
-
-    def _wait(self, times: int) -> float:
-        return min(self.retry_seconds * 2.0 ** max(times - 1, 0), MAX_RETRY_SECONDS)
+        return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else wait)

@@ -13,7 +13,7 @@ from api.http.context import CallerDep, ContextDep, Digits
 from api.http.documentation import headers
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import ProgressView, example_of
-from service.examples import SHA256
+from service.problems import SHA256
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

@@ -29,9 +29,9 @@ from api.http.schemas import (
 )
 from api.http.sending import IfNoneMatch, names_etag, send_list
 from service import problems
-from service.examples import JOB_ID
 from service.files.staging import default_job_name
 from service.parameters import JobParameters, stored_parameters
+from service.problems import JOB_ID
 from service.store.tables import JobRow
 from service.weights import check_weights
 

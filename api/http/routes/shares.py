@@ -20,10 +20,10 @@ from api.http.schemas import SHARED_RESULTS, NewShare, ShareCreated, SharedView,
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file
 from service import problems
 from service.errors import NoJobError, NoShareError
-from service.examples import SHARE_ID, SHARE_TOKEN
+from service.problems import SHARE_ID, SHARE_TOKEN
+from service.store.access import Shared
 from service.store.jobs import ShownJob
 from service.store.quotas import Quotas
-from service.store.shares import Shared
 
 router = APIRouter(tags=["shares"])
 

@@ -41,10 +41,10 @@ from api.http.schemas import (
 from service import problems
 from service.deadlines import suspended
 from service.errors import NoJobError
-from service.examples import UPLOAD_ID
 from service.files.staging import MOST_STYLES, check_roles, default_job_name, staged_name
 from service.inspection.inspector import Show
 from service.parameters import JobParameters
+from service.problems import UPLOAD_ID
 from service.scheduling.webhooks import check_url
 from service.states import JobStatus
 from service.store.jobs import Idempotency, NewJob

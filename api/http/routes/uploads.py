@@ -21,8 +21,8 @@ from api.http.multipart import body_blocks, check_media_type, media_type
 from api.http.schemas import UploadView, upload_view
 from service import problems
 from service.errors import ServiceError, StoreError
-from service.examples import UPLOAD_ID
 from service.files.staging import staged_name
+from service.problems import UPLOAD_ID
 from service.store.inputs import check_offset
 from service.store.tables import UploadRow
 

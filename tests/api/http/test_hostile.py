@@ -30,9 +30,9 @@ from PIL import Image, ImageCms, PngImagePlugin
 from api.cli.options import kind_of
 from api.http.connection import MAX_HEAD_BYTES, MAX_HEADERS
 from api.http.context import SESSION_COOKIE
-from service.examples import SHARE_ID, UPLOAD_ID
 from service.files.artifacts import Artifacts
 from service.parameters import JobParameters
+from service.problems import SHARE_ID, UPLOAD_ID
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob

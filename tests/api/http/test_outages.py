@@ -19,7 +19,7 @@ import pytest
 
 from api.http.app import create_app
 from api.http.limits import MOST_FAILURES
-from service.examples import SHARE_ID, SHARE_TOKEN
+from service.problems import SHARE_ID, SHARE_TOKEN
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from tests.api.http.test_api import TUS, form, refused

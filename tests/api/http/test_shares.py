@@ -15,7 +15,7 @@ from api.client import Client
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.shares import MOST_SHARES
+from service.store.access import MOST_SHARES
 from service.store.tables import CounterRow, ShareRow
 from tests.api.service import Service, check_documented
 from tests.small_scenes import wall, write_files

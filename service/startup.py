@@ -1,15 +1,27 @@
-"""Log formats of the service: lines of text, or of JSON with the job's id as a separate field."""
+"""Start of a process of the service: its log, as lines of text or of JSON, and the permissions of its files."""
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import re
+import stat
 import sys
 import textwrap
 import time
+from pathlib import Path
 
+from sqlalchemy.engine import make_url
+
+from service.files.objects import ObjectStore
+from service.settings import ServiceSettings
+
+#: Suffixes of the files that SQLite creates for a database.
+_BESIDE = ("", "-wal", "-shm")
 _FIELDS = ("job", "attempt", "method", "path", "status", "seconds", "request_id", "owner")
+
+_log = logging.getLogger(__name__)
 
 
 class JsonFormatter(logging.Formatter):
@@ -65,3 +77,32 @@ def set_up(log_format: str) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
     for noisy in ("httpx", "httpcore", "alembic", "botocore", "uvicorn.access"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def keep_private(settings: ServiceSettings) -> None:
+    """Create the data folder, restrict it and the database to the owner, and set a umask for everything written later.
+
+    Paths that belong to another user and cannot be restricted are logged.
+    """
+    os.umask(0o077)
+    settings.folder.mkdir(parents=True, exist_ok=True)
+    for path in [settings.folder, *_result_folder(settings), *_database_files(settings)]:
+        mode = stat.S_IMODE(path.stat().st_mode)
+        if mode & 0o077:
+            try:
+                path.chmod(mode & 0o700)
+            except PermissionError:
+                _log.warning("file readable by other users, and owned by another user: path=%s", path)
+
+
+def _result_folder(settings: ServiceSettings) -> list[Path]:
+    store = ObjectStore(settings.artifacts_url)
+    folder = Path(store.root)
+    return [folder] if store.local and folder.is_dir() else []
+
+
+def _database_files(settings: ServiceSettings) -> list[Path]:
+    url = make_url(settings.database_url)
+    if url.get_backend_name() != "sqlite" or not url.database:
+        return []
+    return [path for ending in _BESIDE if (path := Path(url.database + ending)).exists()]
