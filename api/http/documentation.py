@@ -137,7 +137,8 @@ _UNUSABLE = (
         "can be addressed. Render at a lower resolution.",
     ),
 )
-#: Problems of single operations, beyond those that follow from their paths and dependencies (`raises`).
+#: Problems of single operations, beyond those that follow from their paths and dependencies (`raises`). Operations
+#: `head_...` have those of `get_...`.
 _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
     "create_job": (
         *(problems.INVALID_INPUT(message, code=code, input=role) for code, role, message in _UNUSABLE),
@@ -185,9 +186,7 @@ _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
     ),
     "delete_job": (problems.NOT_ENDED,),
     "get_artifact": (*_MAKING, _UNWRITABLE),
-    "head_artifact": (*_MAKING, _UNWRITABLE),
     "get_input": (*_READING, problems.NO_INPUT),
-    "head_input": (*_READING, problems.NO_INPUT),
     "create_blend": (
         *_MAKING,
         _UNWRITABLE,
@@ -201,7 +200,6 @@ _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
     "make_video": _MAKING,
     "create_share": (problems.NO_RESULT, problems.TOO_MANY_SHARES),
     "get_shared_file": (*_READING, problems.NO_SHARED_FILE),
-    "head_shared_file": (*_READING, problems.NO_SHARED_FILE),
     "create_upload": (
         problems.MALFORMED_BODY,
         problems.TOO_LARGE,
@@ -271,7 +269,7 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
     invalid = [each for parameter in operation.get("parameters", []) if (each := _invalid(parameter))]
     if "requestBody" in operation and operation["operationId"] != "append_upload":
         invalid.append(_invalid_request("body", "is not JSON: Expecting value: line 1 column 1 (char 0)."))
-    raised += [*invalid[:1], *_OF_OPERATIONS.get(operation["operationId"], ())]
+    raised += [*invalid[:1], *_OF_OPERATIONS.get(operation["operationId"].replace("head_", "get_"), ())]
     responses = operation["responses"]
     responses.pop("422", None)  # FastAPI's own error schema
     for problem in raised:
