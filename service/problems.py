@@ -65,6 +65,12 @@ TOO_LARGE = ProblemType(
         "limit": 4_000_000_000,
     },
 )
+METHOD_NOT_ALLOWED = ProblemType(
+    "method-not-allowed",
+    405,
+    "{path!r} does not support {method}. Use one of {allowed}.",
+    headers={"Allow": "{allowed}"},
+)
 INVALID_REQUEST = ProblemType("invalid-request", 422, members=("input", "errors"))
 UNAUTHORIZED = ProblemType(
     "unauthorized",

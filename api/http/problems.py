@@ -61,10 +61,7 @@ class Problem(BaseModel):
     detail: str = Field(description="What was wrong and what to do, for people.")
 
 
-def problem(
-    status: int, code: str, detail: str, headers: dict[str, str] | None = None, **extra: object
-) -> JSONResponse:
-    """Return a problem document as a response."""
+def _response(status: int, code: str, detail: str, headers: dict[str, str], **extra: object) -> JSONResponse:
     title = _TITLES.get(status) or HTTPStatus(status).phrase
     body = Problem(title=title, status=status, code=code, detail=detail, **extra)
     return JSONResponse(body.model_dump(mode="json"), status, headers, media_type=MEDIA_TYPE)
@@ -86,7 +83,7 @@ def from_service(error: ServiceError) -> JSONResponse:
     headers = dict(error.headers)
     if error.retry_after is not None:
         headers["Retry-After"] = str(error.retry_after)
-    return problem(error.status, error.code, str(error), headers, **error.extra)
+    return _response(error.status, error.code, str(error), headers, **error.extra)
 
 
 async def _service_error(request: Request, error: Exception) -> JSONResponse:
@@ -96,7 +93,7 @@ async def _service_error(request: Request, error: Exception) -> JSONResponse:
 
 async def _invalid_input(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, InvalidInputError)
-    return problem(422, error.code, str(error))
+    return from_service(problems.INVALID_INPUT(str(error), code=error.code))
 
 
 async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
@@ -119,21 +116,15 @@ def _unknown(at: str) -> str:
 
 async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
-    path, headers = request.scope["path"][:_SHOWN], dict(error.headers or {})
+    path = request.scope["path"][:_SHOWN]
     if error.status_code == 404:
-        detail = f"There is nothing at {path!r}. {address('/docs')} lists all paths."
-        return problem(404, "not-found", detail, headers)
-    if error.status_code == 405:
-        headers["Allow"] = ", ".join(_allowed(request.scope))  # the router lists only the methods of the first route
-        detail = f"{path!r} does not support {request.method[:_SHOWN]}. Use one of {headers['Allow']}."
-        return problem(405, "method-not-allowed", detail, headers)
-    return problem(error.status_code, "http-error", str(error.detail), headers)
-
-
-def _allowed(scope: Scope) -> list[str]:
-    """Return the methods that a request's path supports. HEAD is supported wherever GET is."""
-    routed = routed_methods(scope)
-    return [method for method in METHODS if method in routed or (method == "HEAD" and "GET" in routed)]
+        return from_service(problems.NOT_FOUND(f"There is nothing at {path!r}. {address('/docs')} lists all paths."))
+    if error.status_code == 405:  # the router's own header lists only the methods of the first route
+        routed = routed_methods(request.scope)
+        allowed = [method for method in METHODS if method in routed or (method == "HEAD" and "GET" in routed)]
+        method = request.method[:_SHOWN]
+        return from_service(problems.METHOD_NOT_ALLOWED(path=path, method=method, allowed=", ".join(allowed)))
+    return _response(error.status_code, "http-error", str(error.detail), dict(error.headers or {}))
 
 
 def routed_methods(scope: Scope) -> list[str]:
