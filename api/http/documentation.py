@@ -267,7 +267,7 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
             operation["requestBody"] = {"required": True, "content": {"application/json": body}}
     raised += [problem for part, problem in _OF_PATHS.items() if part in route.path]
     invalid = [each for parameter in operation.get("parameters", []) if (each := _invalid(parameter))]
-    if "requestBody" in operation and operation["operationId"] != "append_upload":
+    if "application/json" in operation.get("requestBody", {}).get("content", {}):
         invalid.append(_invalid_request("body", "is not JSON: Expecting value: line 1 column 1 (char 0)."))
     raised += [*invalid[:1], *_OF_OPERATIONS.get(operation["operationId"].replace("head_", "get_"), ())]
     responses = operation["responses"]
