@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from service.errors import (
     ConflictError,
     DamagedFileError,
@@ -27,7 +29,11 @@ SHA256 = "3158b524aebf9351a4de9039a6b9b799cfc0452d9cec424a9f867085d0a9a7b5"
 
 _RECOVERY = "If you uploaded it, upload it again; if it is a result, run the job again."
 _EXAMPLE_URL = "https://example.com/scene.ply"
-_OF_JOB = ("job_status",)
+
+_missing = partial(ProblemType, "not-found", 404, error=NotFoundError)
+_conflict = partial(ProblemType, "conflict", 409, error=ConflictError)
+_wrong_status = partial(_conflict, members=("job_status",))
+_unusable = partial(ProblemType, status=422, members=("input",))
 
 # --- requests -------------------------------------------------------------------------------------------------------
 
@@ -90,9 +96,7 @@ FOREIGN_SITE = ProblemType(
     example={"message": "Pages of 'https://example.com' may not use this service without an API key."},
 )
 CROSS_ORIGIN = ProblemType(
-    "cross-origin",
-    403,
-    example={"message": "Pages of 'https://example.com' may not use the sessions of this service."},
+    "cross-origin", 403, example={"message": "Pages of 'https://example.com' may not use the sessions of this service."}
 )
 TOO_MANY_TRIES = ProblemType(
     "too-many-tries", 429, "Too many invalid keys came from this address. Try again later.", retry_after=30
@@ -111,37 +115,19 @@ IDEMPOTENCY_KEY_REUSED = ProblemType(
 
 # --- objects that do not exist --------------------------------------------------------------------------------------
 
-NOT_FOUND = ProblemType("not-found", 404, error=NotFoundError)
-FILE_REMOVED = ProblemType("not-found", 404, "The file has just been removed.", error=NotFoundError)
+NOT_FOUND = _missing()
+FILE_REMOVED = _missing("The file has just been removed.")
 NO_JOB = ProblemType("not-found", 404, "There is no job {job_id}.", error=NoJobError, example={"job_id": JOB_ID})
-NO_ARTIFACT = ProblemType(
-    "not-found",
-    404,
+NO_ARTIFACT = _missing(
     "Job {job_id} has no file {name!r}, or not yet. Its list of artifacts has all files.",
-    error=NotFoundError,
     example={"job_id": JOB_ID, "name": "stylized.ply"},
 )
-NO_INPUT = ProblemType(
-    "not-found",
-    404,
+NO_INPUT = _missing(
     "Job {job_id} has no input {name!r}, or no longer has it. Its list of inputs has all files.",
-    error=NotFoundError,
     example={"job_id": JOB_ID, "name": "style:1"},
 )
-NO_UPLOAD = ProblemType(
-    "not-found",
-    404,
-    "There is no upload {upload_id}, or it has expired.",
-    error=NotFoundError,
-    example={"upload_id": UPLOAD_ID},
-)
-LOST_UPLOAD = ProblemType(
-    "not-found",
-    404,
-    "The bytes of upload {upload_id} are gone. Start a new one.",
-    error=NotFoundError,
-    example={"upload_id": UPLOAD_ID},
-)
+NO_UPLOAD = _missing("There is no upload {upload_id}, or it has expired.", example={"upload_id": UPLOAD_ID})
+LOST_UPLOAD = _missing("The bytes of upload {upload_id} are gone. Start a new one.", example={"upload_id": UPLOAD_ID})
 NO_SHARE = ProblemType("not-found", 404, "This link does not work: it has expired or was revoked.", error=NoShareError)
 NO_SHARED_FILE = ProblemType(
     "no-shared-file", 404, "This result has no file {name!r}.", error=NotFoundError, example={"name": "colors.f16"}
@@ -149,9 +135,7 @@ NO_SHARED_FILE = ProblemType(
 
 # --- inputs of jobs -------------------------------------------------------------------------------------------------
 
-INVALID_INPUT = ProblemType(
-    "invalid-input", 422, members=("input",), example={"message": "The files cannot be read.", "input": "scene"}
-)
+INVALID_INPUT = _unusable("invalid-input", example={"message": "The files cannot be read.", "input": "scene"})
 TOO_MANY_GAUSSIANS = ProblemType(
     "too-many-gaussians",
     422,
@@ -159,146 +143,91 @@ TOO_MANY_GAUSSIANS = ProblemType(
     members=("input", "limit"),
     example={"count": 30_000_000, "note": "", "limit": 20_000_000, "input": "scene"},
 )
-TOO_MANY_VIEWS = ProblemType(
+TOO_MANY_VIEWS = _unusable(
     "too-many-views",
-    422,
-    "There are {count:,} views. At most {limit:,} are allowed.",
-    members=("input",),
+    message="There are {count:,} views. At most {limit:,} are allowed.",
     example={"count": 3000, "limit": 2000, "input": "cameras"},
 )
-TOO_MANY_PIXELS = ProblemType(
+TOO_MANY_PIXELS = _unusable(
     "too-many-pixels",
-    422,
-    "All views have {count:,} pixels. At most {limit:,} are allowed.",
-    members=("input",),
+    message="All views have {count:,} pixels. At most {limit:,} are allowed.",
     example={"count": 30_000_000_000, "limit": 20_000_000_000, "input": "cameras"},
 )
-IMAGE_TOO_LARGE = ProblemType(
+IMAGE_TOO_LARGE = _unusable(
     "image-too-large",
-    422,
-    "{name}: has {width} x {height} pixels. At most {limit:,} are allowed.",
-    members=("input",),
+    message="{name}: has {width} x {height} pixels. At most {limit:,} are allowed.",
     example={"name": "style.jpg", "width": 20_000, "height": 20_000, "limit": 100_000_000, "input": "style"},
 )
 TOO_MANY_FILES = ProblemType(
     "too-many-files", 422, "There are more than {limit} {what}.", example={"limit": 2041, "what": "files"}
 )
-INSPECTION_LIMIT = ProblemType(
+INSPECTION_LIMIT = _unusable(
     "inspection-limit",
-    422,
-    members=("input",),
     example={"message": "Reading the files takes more time or memory than allowed, or crashes the reader."},
 )
-UNKNOWN_UPLOAD = ProblemType(
+UNKNOWN_UPLOAD = _unusable(
     "unknown-upload",
-    422,
-    "{upload_id!r} is not the ID of a usable upload, and {input!r} has no file name. Send an upload's ID, or a file "
-    "with its name.",
-    members=("input",),
+    message="{upload_id!r} is not the ID of a usable upload, and {input!r} has no file name. Send an upload's ID, or a "
+    "file with its name.",
     example={"upload_id": UPLOAD_ID, "input": "scene"},
 )
-UNKNOWN_INPUT = ProblemType(
+UNKNOWN_INPUT = _unusable(
     "unknown-input",
-    422,
-    "Job {job_id} has no input {name!r}, or no longer has it. Upload the file again.",
-    members=("input",),
+    message="Job {job_id} has no input {name!r}, or no longer has it. Upload the file again.",
     example={"job_id": JOB_ID, "name": "style:1", "input": "style"},
 )
-UNFINISHED_UPLOAD = ProblemType(
+UNFINISHED_UPLOAD = _unusable(
     "unfinished-upload",
-    422,
-    "Upload {upload_id} has {offset:,} of {length:,} bytes. Finish it first.",
-    members=("input",),
+    message="Upload {upload_id} has {offset:,} of {length:,} bytes. Finish it first.",
     example={"upload_id": UPLOAD_ID, "offset": 16_384, "length": 42_301, "input": "scene"},
 )
-URLS_OFF = ProblemType(
+URLS_OFF = _unusable(
     "urls-off",
-    422,
-    "Inputs by URL are switched off on this service. Upload the file instead.",
-    members=("input",),
+    message="Inputs by URL are switched off on this service. Upload the file instead.",
     example={"input": "scene"},
 )
-INVALID_URL = ProblemType(
+INVALID_URL = _unusable(
     "invalid-url",
-    422,
-    "{url!r} cannot be fetched: {reason}. Name a file of an allowed host, or upload the file.",
-    members=("input",),
+    message="{url!r} cannot be fetched: {reason}. Name a file of an allowed host, or upload the file.",
     example={
         "url": _EXAMPLE_URL,
         "reason": "'example.com' is not among the hosts that its operator allows",
         "input": "scene",
     },
 )
-URL_NOT_FETCHED = ProblemType(
+URL_NOT_FETCHED = _unusable(
     "url-not-fetched",
-    422,
-    "{url!r} was not fetched: {reason}. Check the URL and try again, or upload the file.",
-    members=("input",),
+    message="{url!r} was not fetched: {reason}. Check the URL and try again, or upload the file.",
     example={"url": _EXAMPLE_URL, "reason": "the server answered 404", "input": "scene"},
 )
-WEBHOOKS_OFF = ProblemType(
-    "webhooks-off",
-    422,
-    "Webhooks are switched off on this service.",
-    members=("input",),
-    example={"input": "webhook"},
+WEBHOOKS_OFF = _unusable(
+    "webhooks-off", message="Webhooks are switched off on this service.", example={"input": "webhook"}
 )
-INVALID_WEBHOOK = ProblemType(
+INVALID_WEBHOOK = _unusable(
     "invalid-webhook",
-    422,
-    "{url!r} cannot be called: {reason}. Give a URL such as 'https://example.com/hook'.",
-    members=("input",),
+    message="{url!r} cannot be called: {reason}. Give a URL such as 'https://example.com/hook'.",
     example={"url": "ftp://example.com", "reason": "its scheme is neither http nor https", "input": "webhook"},
 )
 
 # --- states of jobs and uploads -------------------------------------------------------------------------------------
 
-CONFLICT = ProblemType("conflict", 409, members=("offset",), error=ConflictError)
-CHANGED_MEANWHILE = ProblemType(
-    "conflict",
-    409,
-    "Another request changed or deleted this at the same time. Get its current state, then try again.",
-    error=ConflictError,
+CONFLICT = _conflict(members=("offset",))
+CHANGED_MEANWHILE = _conflict(
+    "Another request changed or deleted this at the same time. Get its current state, then try again."
 )
-NOT_CANCELABLE = ProblemType(
-    "conflict",
-    409,
-    "The job has {job_status} and cannot be canceled.",
-    members=_OF_JOB,
-    error=ConflictError,
-    example={"job_status": "succeeded"},
+NOT_CANCELABLE = _wrong_status("The job has {job_status} and cannot be canceled.", example={"job_status": "succeeded"})
+NOT_RUNNING = _wrong_status(
+    "The job has status {job_status}; only a running job can be finished early.", example={"job_status": "queued"}
 )
-NOT_RUNNING = ProblemType(
-    "conflict",
-    409,
-    "The job has status {job_status}; only a running job can be finished early.",
-    members=_OF_JOB,
-    error=ConflictError,
-    example={"job_status": "queued"},
+NOT_RETRYABLE = _wrong_status(
+    "The job has status {job_status}; only failed or canceled jobs can be retried.", example={"job_status": "running"}
 )
-NOT_RETRYABLE = ProblemType(
-    "conflict",
-    409,
-    "The job has status {job_status}; only failed or canceled jobs can be retried.",
-    members=_OF_JOB,
-    error=ConflictError,
-    example={"job_status": "running"},
-)
-NOT_ENDED = ProblemType(
-    "conflict",
-    409,
+NOT_ENDED = _wrong_status(
     "The job has status {job_status}. {advice}; delete it once it has ended.",
-    members=_OF_JOB,
-    error=ConflictError,
     example={"job_status": "running", "advice": "Cancel it first"},
 )
-NO_RESULT = ProblemType(
-    "conflict",
-    409,
-    "The job has status {job_status}; only results can be shared.",
-    members=_OF_JOB,
-    error=ConflictError,
-    example={"job_status": "running"},
+NO_RESULT = _wrong_status(
+    "The job has status {job_status}; only results can be shared.", example={"job_status": "running"}
 )
 TOO_MANY_SHARES = ProblemType(
     "too-many-shares",
@@ -307,28 +236,18 @@ TOO_MANY_SHARES = ProblemType(
     error=ConflictError,
     example={"limit": 20},
 )
-TOO_MANY_BLENDS = ProblemType(
-    "conflict",
-    409,
+TOO_MANY_BLENDS = _conflict(
     "Job {job_id} already has {limit} blends, the maximum. Blend downloaded scenes with `sgsst blend`.",
     members=("limit",),
-    error=ConflictError,
     example={"job_id": JOB_ID, "limit": 20},
 )
-WRONG_OFFSET = ProblemType(
-    "conflict",
-    409,
+WRONG_OFFSET = _conflict(
     "Upload-Offset is {given}, but the next byte is {offset}.",
     members=("offset",),
-    error=ConflictError,
     example={"given": 0, "offset": 16_384},
 )
-TOO_MANY_UPLOADS = ProblemType(
-    "conflict",
-    409,
-    "There are {limit} unfinished uploads of this key. Finish or delete some.",
-    error=ConflictError,
-    example={"limit": 1000},
+TOO_MANY_UPLOADS = _conflict(
+    "There are {limit} unfinished uploads of this key. Finish or delete some.", example={"limit": 1000}
 )
 UPLOAD_LOCKED = ProblemType(
     "upload-locked", 423, "Another request is writing to this upload. Get its offset and resume from there."
@@ -359,9 +278,7 @@ RANGE_NOT_SATISFIABLE = ProblemType(
     example={"size": 42_301},
 )
 PRECONDITION_FAILED = ProblemType(
-    "precondition-failed",
-    412,
-    "The file is not the one that If-Match names. Get its current ETag with a HEAD request.",
+    "precondition-failed", 412, "The file is not the one that If-Match names. Get its current ETag with a HEAD request."
 )
 
 # --- limits ---------------------------------------------------------------------------------------------------------
@@ -452,11 +369,7 @@ DATABASE_UNAVAILABLE = ProblemType(
     error=DatabaseUnavailableError,
 )
 DATABASE_BUSY = ProblemType(
-    "database-busy",
-    503,
-    "The service's database is busy. Try again later.",
-    retry_after=5,
-    error=DatabaseBusyError,
+    "database-busy", 503, "The service's database is busy. Try again later.", retry_after=5, error=DatabaseBusyError
 )
 LEASE_LOST = ProblemType(
     "lease-lost",
