@@ -8,7 +8,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -172,64 +172,46 @@ async def create_job(
         receipt = await stack.enter_async_context(context.receipts.of(caller.owner, caller.quotas))
         is_json = media_type(request) == "application/json"
         reading = _from_json(request, context) if is_json else _from_form(request, context, receipt)
-        parts = await reading
+        received, parameters, webhook = await reading
+        find_inputs = partial(_find_inputs, context, caller, received, parameters, webhook)
         fetched: dict[str, str] = {}
-        if urls := context.fetcher.urls(parts[0].uploads):
-            await context.threads.run(caller.owner, _find_inputs, context, caller, parts, fetched)
+        if urls := context.fetcher.urls(received.uploads):
+            await context.threads.run(caller.owner, find_inputs, fetched)
             with suspended():  # fetching has its own deadline
                 fetched = await context.fetcher.fetch(urls, receipt)
-        resolved = await context.threads.run(caller.owner, _find_inputs, context, caller, parts, fetched)
-        size = sum(row.size for row in resolved[1].values())
-        job_request = await context.threads.run(
-            caller.owner, _check_files, context, caller, parts, *resolved, size=size
-        )
-        if not job_request.checked:
-            await context.inspector.inspect(
-                "validate", caller.owner, job_request.inputs, job_request.rows, job_request.parameters
-            )
+        inputs, rows = await context.threads.run(caller.owner, find_inputs, fetched)
+        recall = context.inspector.recall
+        if await asyncio.to_thread(recall, "validate", caller.owner, inputs, parameters) is None:
+            size = sum(row.size for row in rows.values())
+            await context.threads.run(caller.owner, _check_files, context, inputs, rows, size=size)
+            await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
-            return await asyncio.to_thread(_queue_job, context, caller, job_request, idempotency_key, receipt)
+            idempotency = _idempotency(idempotency_key, inputs, parameters, webhook)
+            queue_job = partial(_queue_job, context, caller, inputs, parameters, webhook)
+            return await asyncio.to_thread(queue_job, idempotency, receipt)
         stack.pop_all()  # keep the files, which planning needs after this function returns
 
     async def plan(show: Show) -> PlanView:
         async with receipt:
-            findings = await context.inspector.inspect(
-                "plan", caller.owner, job_request.inputs, job_request.rows, job_request.parameters, show
-            )
-        return PlanView(**findings, workers=job_request.parameters.workers)
+            findings = await context.inspector.inspect("plan", caller.owner, inputs, rows, parameters, show)
+        return PlanView(**findings, workers=parameters.workers)
 
     return await answer_work(request, plan, "planning", "plan")
 
 
-@dataclass(frozen=True)
-class _JobRequest:
-    """Job that a client has requested.
-
-    Attributes:
-        inputs: `role`, `name`, `sha256`, `size` of each file.
-        rows: Blobs by SHA-256.
-        checked: Whether the same files have already passed inspection.
-    """
-
-    inputs: list[dict[str, Any]]
-    rows: dict[str, BlobRow]
-    parameters: JobParameters
-    webhook: str | None
-    checked: bool
-
-
-Parts = tuple[Received, JobParameters, str | None]
-
-
 def _find_inputs(
-    context: Context, caller: Caller, parts: Parts, fetched: Mapping[str, str]
+    context: Context,
+    caller: Caller,
+    received: Received,
+    parameters: JobParameters,
+    webhook: str | None,
+    fetched: Mapping[str, str],
 ) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
     """Return the entries of all files of a job and their blobs, after the checks that need no file's content.
 
     Args:
         fetched: SHA-256 of each input by URL; missing ones are entries without a blob.
     """
-    received, parameters, webhook = parts
     check_weights()
     inputs, rows = _resolve_inputs(context, caller, received, fetched)
     regions = parameters.region_requests
@@ -239,28 +221,26 @@ def _find_inputs(
     return inputs, rows
 
 
-def _check_files(
-    context: Context, caller: Caller, parts: Parts, inputs: list[dict[str, Any]], rows: dict[str, BlobRow]
-) -> _JobRequest:
+def _check_files(context: Context, inputs: Sequence[Mapping[str, Any]], rows: dict[str, BlobRow]) -> None:
     """Run all checks of a job's files that need no inspection process."""
-    _, parameters, webhook = parts
-    checked = context.inspector.recall("validate", caller.owner, inputs, parameters) is not None
-    if not checked:
-        with context.blobs.local_files(rows) as paths:
-            for entry in inputs:
-                check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
-    return _JobRequest(inputs, rows, parameters, webhook, checked)
+    with context.blobs.local_files(rows) as paths:
+        for entry in inputs:
+            check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
 
 
 def _queue_job(
-    context: Context, caller: Caller, job_request: _JobRequest, idempotency_key: str | None, receipt: Receipt
+    context: Context,
+    caller: Caller,
+    inputs: list[dict[str, Any]],
+    parameters: JobParameters,
+    webhook: str | None,
+    idempotency: Idempotency | None,
+    receipt: Receipt,
 ) -> Response:
     """Queue a checked job, and return the response."""
-    parameters, webhook = job_request.parameters, job_request.webhook
-    idempotency = _idempotency(idempotency_key, job_request.inputs, parameters, webhook)
     values = parameters.model_dump(mode="json", exclude_unset=True)
-    name = parameters.name or default_job_name(job_request.inputs, parameters.region_requests)
-    new = NewJob(caller.owner, name, caller.priority, values, job_request.inputs, webhook or None)
+    name = parameters.name or default_job_name(inputs, parameters.region_requests)
+    new = NewJob(caller.owner, name, caller.priority, values, inputs, webhook or None)
     jobs = context.store.jobs
     job, created = jobs.create(
         new,
@@ -278,7 +258,11 @@ def _queue_job(
     return Response(body, 202, response_headers, media_type="application/json")
 
 
-async def _from_form(request: Request, context: Context, receipt: Receipt) -> Parts:
+#: Files and texts of a request, with the parameters and the webhook of the job.
+_Parts = tuple[Received, JobParameters, str | None]
+
+
+async def _from_form(request: Request, context: Context, receipt: Receipt) -> _Parts:
     received = await receive(request, context.blobs, context.settings, receipt, context.threads)
     text = received.texts.get("parameters", "").strip() or "{}"
     values = parse_json(text, "parameters")
@@ -289,7 +273,7 @@ async def _from_form(request: Request, context: Context, receipt: Receipt) -> Pa
     return received, parameters, received.texts.get("webhook", "").strip() or None
 
 
-async def _from_json(request: Request, context: Context) -> Parts:
+async def _from_json(request: Request, context: Context) -> _Parts:
     job = JobFromUploads.model_validate(await read_json(request, context.settings, _MAX_JSON))
     job.parameters.settings()
     if len(job.parameters.model_dump_json(exclude_unset=True)) > MAX_TEXT:
