@@ -86,7 +86,7 @@ class ProblemType:
     Attributes:
         code: Stable identifier for programs.
         status: HTTP status of the response.
-        message: What is wrong and what to do, with the names of values in braces.
+        message: Usual message, with the names of values in braces.
         members: Names of the values that are additional members of the problem document.
         retry_after: Seconds after which the request may succeed; None if waiting does not help.
         headers: Further headers of the response, with the names of values in braces.
