@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 from sgsst_core.errors import SettingsError
 from sgsst_core.options import Option
 from sgsst_core.settings import checked
-from worker.options import GROUPS, JobVideo, StylizeOptions
+from worker.options import GROUPS, StylizeOptions
 from worker.region_requests import MOST_REGIONS, NO_CONTROLS, RegionOptions, RegionRequest, region_requests
 from worker.styles import MOST_STYLE_IMAGES
 
@@ -46,12 +46,6 @@ class JobParameters(StylizeOptions):
         max_length=MOST_REGIONS + 1,
         description="Regions of the scene, each with its own style or frozen. Where regions overlap, the later one "
         "wins.",
-    )
-
-    video: Annotated[JobVideo | None, Option(instead="sgsst render --video")] = Field(
-        None,
-        description="Video of the result, rendered at the end of the job as `video.mp4`. A finished job makes one by "
-        "`POST /v1/jobs/{job_id}/video`.",
     )
 
     @property

@@ -51,5 +51,4 @@ def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
         regions=_regions(staged, parameters),
         colors=True,
         style_background=parameters.style_background,
-        video=parameters.video,
     )

@@ -28,7 +28,6 @@ from worker.options import RunOptions
 from worker.outputs import Outputs
 from worker.prepare import Job, Warn
 from worker.previews import Previews
-from worker.video import write_job_video
 
 #: Default seconds between checkpoints. If a rank is lost, at most this much work is repeated.
 CHECKPOINT_SECONDS = RunOptions().checkpoint_seconds
@@ -45,7 +44,6 @@ def execute(
     saved: Callable[[int], None] = lambda step: None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     run_id: str | None = None,
-    show_video: Callable[[int, int], None] = lambda done, total: None,
 ) -> Result:
     """Run a prepared job and write its outputs.
 
@@ -62,7 +60,6 @@ def execute(
         saved: Callback that receives the step of each checkpoint.
         checkpoint_seconds: Seconds between checkpoints. A job that ends early writes one more at its end.
         run_id: Identifier of this run, stored in checkpoints. None generates one.
-        show_video: Callback that receives the numbers of completed and of all frames of the requested video.
 
     Raises:
         OutputError: If the PLY, or the checkpoint of an interrupted job, cannot be written.
@@ -95,25 +92,7 @@ def execute(
     result = _finish(job, stopped, measure)
     if first and preview:
         preview.finish(stylizer)
-    if first:
-        _write_video(job, stop, show_video, warn)
     return result
-
-
-def _write_video(job: Job, stop: Callable[[], bool], show: Callable[[int, int], None], warn: Warn) -> None:
-    """Write the requested video. If it fails or is interrupted, warn: the result is already written."""
-    if job.request.video is None:
-        return
-
-    def progress(done: int, total: int) -> None:
-        if stop():
-            raise InterruptedError("the job was asked to stop")
-        show(done, total)
-
-    try:
-        write_job_video(job.outputs.video, job.stylizer, job.request.source, job.request.video, progress)
-    except Exception as error:
-        warn(f"The video could not be rendered: {error}")
 
 
 def _clear_outputs(outputs: Outputs) -> None:

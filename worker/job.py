@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.settings import Color, Settings
-from worker.options import Backbone, JobVideo, ViewOptions
+from worker.options import Backbone, ViewOptions
 from worker.region_requests import RegionRequest
 from worker.styles import StyleFile
 
@@ -50,7 +50,6 @@ class JobSpec(BaseModel):
         regions: Regions with their own style or frozen colors, from `region_requests`.
         colors: Whether to also write a file of the stylized colors alone, if nothing else of the scene changes.
         style_background: sRGB color behind transparent parts of style images, in 0..1.
-        video: Options of a video of the result; None for no video.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -65,7 +64,6 @@ class JobSpec(BaseModel):
     regions: tuple[RegionRequest, ...] = ()
     colors: bool = False
     style_background: Color = (1.0, 1.0, 1.0)
-    video: JobVideo | None = None
 
 
 class Result(BaseModel):

@@ -136,11 +136,6 @@ class Outputs:
         return self._beside(".colors.f16")
 
     @property
-    def video(self) -> Path:
-        """Return the path of the video."""
-        return self._beside(".video.mp4")
-
-    @property
     def checkpoint(self) -> Path:
         """Return the path of the newest checkpoint."""
         return self._beside(".checkpoint.safetensors")
@@ -149,7 +144,7 @@ class Outputs:
     def all(self) -> list[Path]:
         """Return the paths of all output files except the older checkpoint, which is only created by renaming."""
         paths = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
-        paths += [self.colors, self.video]
+        paths.append(self.colors)
         return paths if self.compressed is None else [*paths, self.compressed]
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,17 +15,15 @@ from sgsst_core.files.scene_file import read_scene
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit.cameras import ELEVATION, turntable
 from sgsst_core.orbit.subject import find_subject, find_up
-from sgsst_core.quality.float32_reference import rasterizer_beside
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.video import Layer, write_frames
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.stylizer import Stylizer
 from worker.capture import about_notes, about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view
 from worker.job import SceneRequest, check_choice
-from worker.options import DEFAULT_SIDE, JobVideo, VideoOptions
+from worker.options import DEFAULT_SIDE, VideoOptions
 from worker.outputs import check_folder, check_is_not_input
 
 
@@ -138,28 +136,6 @@ def render_video(
             progress=progress,
         )
     return cameras
-
-
-def write_job_video(
-    out: Path,
-    stylizer: Stylizer,
-    source: SceneRequest,
-    options: JobVideo,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> None:
-    """Write the video of a finished job's result, on the job's device.
-
-    Raises:
-        InvalidInputError: If the video cannot be written.
-    """
-    job = stylizer.job
-    scene = replace(job.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
-    through = job.views.cameras if along_cameras(options, source) else None
-    cameras = video_cameras(scene, source, through, options, options.resolution, even=True)
-    layer = Layer(scene, rasterizer_beside(stylizer, scene))
-    unstylized = Layer(job.scene, layer.rasterizer) if options.compare else None
-    with video_writer(out, cameras[0].width, cameras[0].height, options.fps) as write:
-        write_frames(write, layer, cameras, unstylized=unstylized, transition=options.transition, progress=progress)
 
 
 def video_cameras(

@@ -10,7 +10,7 @@ export const titles = states.titles;
  * Return the fraction of its steps that a job has made; undefined unless it makes steps.
  * @param {any} job
  */
-export const stepFraction = ({ status, progress }) => (states.stepping.includes(status) && progress?.total && progress.stage !== "video" ? progress.fraction : undefined);
+export const stepFraction = ({ status, progress }) => (states.stepping.includes(status) && progress?.total ? progress.fraction : undefined);
 export const UNFINISHED = new Set(states.unfinished), WORKING = new Set(states.working);
 
 /**

@@ -183,7 +183,7 @@ export class SubmitView {
       return;
     }
     for (const [name, each] of Object.entries(schema)) {
-      if (["name", "style_weights", "regions", "preset", "video"].includes(name)) continue;
+      if (["name", "style_weights", "regions", "preset"].includes(name)) continue;
       this.controls.set(name, optionControl(name, each, name === "orbit" ? { title: say.howMany } : {}));
     }
     this.makePresets(schema.preset);

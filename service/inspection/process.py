@@ -121,8 +121,6 @@ def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, An
     settings = parameters.settings()
     check_steps(settings)
     _check_network_weights(parameters.backbone)
-    if parameters.video is not None:
-        _check_encoder()
     findings: dict[str, Any] = {}
     source = scene_request(staged, parameters)
     with _errors_of("scene"):

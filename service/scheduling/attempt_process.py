@@ -100,7 +100,6 @@ class AttemptProcess:
             warn=log,
             preview=preview,
             checkpoint_seconds=self._task.checkpoint_seconds,
-            show_video=_VideoReport(),
         )
 
     def _run_on_ranks(self) -> Result | None:
@@ -130,23 +129,6 @@ class AttemptProcess:
 def report_progress(now: Progress) -> None:
     """Report the progress of the job."""
     send(Report(progress=now))
-
-
-class _VideoReport:
-    """Reporter of the progress of the job's video; one step is one frame."""
-
-    def __init__(self) -> None:
-        self._started: float | None = None
-        self._sent = 0.0
-
-    def __call__(self, done: int, total: int) -> None:
-        """Report the number of completed frames, at most once per second."""
-        now = time.monotonic()
-        self._started = self._started or now
-        if now - self._sent >= 1:
-            self._sent = now
-            left = (now - self._started) / (done - 1) * (total - done) if done > 1 else None
-            report_progress(Progress(stage="video", step=done, total=total, eta_s=left))
 
 
 def report_prepared(prepared: Prepared) -> None:

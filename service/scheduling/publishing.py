@@ -35,7 +35,6 @@ _RESULTS = {
     "before_after.jpg": f"{_STEM}.before_after.jpg",
     "loss.png": f"{_STEM}.loss.png",
     "colors.f16": f"{_STEM}.colors.f16",
-    "video.mp4": f"{_STEM}.video.mp4",
 }
 #: Names of files that become visible only when the job ends.
 RESULTS = frozenset((RESULT, *_RESULTS))

@@ -8,7 +8,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 import torch
@@ -27,7 +26,6 @@ from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import execute
 from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume
-from worker.options import JobVideo
 from worker.prepare import Job, prepare
 from worker.previews import Previews
 
@@ -286,34 +284,6 @@ def test_colors_file_matches_the_result(request_: JobSpec, tmp_path: Path) -> No
             colors = np.fromfile(alone, "<f2").reshape(-1, 3)
             assert colors.shape == exact.shape
             assert np.array_equal(colors, exact.numpy().astype(np.float16))
-
-
-@pytest.mark.parametrize("stop_at", [None, 3])
-def test_video_is_made_at_the_end_unless_the_job_is_stopped(request_: JobSpec, stop_at: int | None) -> None:
-    """A stop during the video leaves the result, and no part of the video."""
-    job = prepare(request_.model_copy(update={"video": JobVideo(fps=4, seconds=2, resolution=64, compare=True)}))
-    warnings: list[str] = []
-    shown: list[tuple[int, int]] = []
-    result = execute(
-        job,
-        progress=lambda now: None,
-        stop=lambda: len(shown) == stop_at,
-        warn=warnings.append,
-        show_video=lambda done, total: shown.append((done, total)),
-    )
-    assert result.stopped == "finished"
-    assert request_.out.exists()
-    video = request_.out.with_name("s.video.mp4")
-    if stop_at is not None:
-        assert warnings == ["The video could not be rendered: the job was asked to stop"]
-        assert not [path for path in video.parent.iterdir() if path.suffix == ".mp4"]
-        return
-    assert warnings == []
-    assert shown == [(done, 8) for done in range(1, 9)]
-    with av.open(str(video), "r") as container:
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    assert len(frames) == 8
-    assert max(frames[0].shape) == 64
 
 
 @pytest.mark.parametrize("why", ["split", "dropped", "attenuated"])

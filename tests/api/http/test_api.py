@@ -478,7 +478,6 @@ def test_submit_sends_every_parameter(
         {"name": "rest", "weight": 3.0},
     ]
     parameters["scales"] = [1.0, 0.0, 0.5]
-    parameters["video"] = None  # not an option of the command
     texts = {"background": "white", "style_background": "black", "scales": "1,0,0.5"}
     ply, _, style = write_files(tmp_path, ball())
     command = ["submit", str(ply), "--style", str(style), "--style", f"{style}:2.5", "--url", service.url, "--json"]
