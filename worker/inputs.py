@@ -6,20 +6,24 @@ interpret the files in the same way.
 
 from __future__ import annotations
 
+import contextlib
+import json
 import math
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from torch import Tensor
 
 from sgsst_core.decision import Decision
-from sgsst_core.errors import SettingsError, SgsstError
+from sgsst_core.errors import CameraError, MaskError, SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.images import WHITE, Color, image_size, load_image
-from sgsst_core.files.photos import Photo, load_photo
+from sgsst_core.files.photos import Photo, check_names, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
@@ -31,12 +35,14 @@ from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
 from sgsst_core.stylizing.job_styles import check_style_size
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
-from worker.job import JobSpec, SceneRequest
+from worker.job import JobSpec, SceneRequest, check_choice
 from worker.ranks.shared_scene import read_shared_scene
+from worker.region_requests import RegionRequest
 from worker.selecting import select_regions
 from worker.styles import StyleFile
 
@@ -47,23 +53,34 @@ STYLE_PIXELS = 1 << 25
 _REDUCED = "{}: was reduced when it was read, because the style has more than 33 megapixels"
 
 
+class InputLimits(Protocol):
+    """Limits of the inputs that a service accepts; every method raises an error if its limit is exceeded."""
+
+    def check_count(self, count: int, growth: float) -> None:
+        """Check the number of Gaussians that a scene file declares, times the factor of its refinement."""
+
+    def check_cameras(self, cameras: Sequence[Camera]) -> None:
+        """Check the number of views and their pixels."""
+
+    def check_image(self, path: Path) -> None:
+        """Check the number of pixels of an image."""
+
+
 @dataclass(frozen=True)
 class Inputs:
     """All inputs of a job.
 
     Attributes:
-        weights: Weights of the feature network.
         style: Style images, [H, W, 3] in 0..1.
         scene_file: Scene, and which rows of its file were dropped.
         cameras: Cameras at the sizes at which the scene is stylized.
         orbit: Orbit that generated the cameras; None if they come from a file.
         photos: Photo of each camera for the content term; None if it uses unstylized renders.
-        decisions: Decisions about cameras and photos for the plan.
+        decisions: Decisions about scene, cameras and photos for the plan.
         regions: Regions of the scene; None if the job has none.
-        fingerprint: Hash of all inputs and settings; equal for equal jobs.
+        reader: Whether this rank read the scene's file itself, as one rank of each machine does.
     """
 
-    weights: BackboneWeights
     style: Style
     scene_file: SceneFile
     cameras: list[Camera]
@@ -71,7 +88,7 @@ class Inputs:
     photos: list[Photo] | None
     decisions: tuple[Decision, ...]
     regions: Regions | None
-    fingerprint: str
+    reader: bool
 
     def photo_loader(self, background: Color) -> Callable[[int], Tensor] | None:
         """Return a function that loads the photo of a camera by its index; None if the job has no photos.
@@ -83,43 +100,148 @@ class Inputs:
         return (lambda index: load_photo(photos[index], cameras[index], background=background)) if photos else None
 
 
-def read_inputs(request: JobSpec, collectives: Collectives = ALONE) -> Inputs:
-    """Read all inputs of a job. Every rank must call this function.
+def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: InputLimits | None = None) -> Inputs:
+    """Read and check all inputs of a job. Every rank must call this function.
+
+    Args:
+        request: Job with paths of the inputs.
+        collectives: Collectives of all ranks.
+        limits: Limits of a service. With them, every photo is read, a scene that no camera sees is found, and names of
+            photos and masks must be those of cameras. None reads only what the job needs first.
 
     Raises:
-        InvalidInputError: If an input cannot be used. Every rank raises the same error.
+        InvalidInputError: If an input cannot be used. Its attribute `role` is the input's role. Every rank raises the
+            same error.
     """
-    settings, images = request.settings, request.images
-    source = request.source
-    axes, about_axes, about_color = collectives.broadcast(
-        lambda: (*choose_axes(source, images), about_background(source.scene, settings.background))
-    )
-    weights = _same_weights(request.backbone, collectives)
-    style = together(collectives, lambda: load_styles(request.styles, request.style_background))
-    scene_file, reader = read_shared_scene(
-        source.scene,
-        collectives,
-        drop_invalid=source.drop_invalid,
-        growth=settings.growth,
-        spz_axes=axes,
-    )
-    scene_file = scene_file.rendered(source.render_mode, source.eps2d)
-    together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
-    capture = _capture_on_all_ranks(source, scene_file.scene, images, collectives).fitted(settings)
-    together(collectives, lambda: check_scales(settings.scales, capture.cameras, settings.coarsest_side))
-    together(collectives, lambda: check_stroke_depth(settings, capture.cameras, regions=bool(request.regions)))
-    together(collectives, lambda: check_style_size(style, capture.cameras, settings.style_scale))
-    with_photos = together(collectives, lambda: capture.with_photos(images))
-    capture = collectives.broadcast(lambda: with_photos.checked(scene_file.scene, source.near))
-    cameras, photos = capture.cameras, capture.photos
-    regions = read_regions(request, scene_file, cameras, collectives)
+    settings, images, source = request.settings, request.images, request.source
+    with errors_of("scene"):
+        if limits:
+            limits.check_count(read_scene_header(source.scene).count, settings.growth)
+    with errors_of("cameras"):
+        if limits and source.cameras is not None and images is None:
+            check_frames_have_sizes(source.cameras)
+    with errors_of("style"):
+        for file in (*request.styles, *(style for region in request.regions for style in region.styles)):
+            if limits:
+                limits.check_image(file.path)
+        style = together(collectives, lambda: load_styles(request.styles, request.style_background))
+    with errors_of("scene"):
+        axes, about_axes, about_color = collectives.broadcast(
+            lambda: (*choose_axes(source, images), about_background(source.scene, settings.background))
+        )
+        scene_file, reader = _read_scene(request, axes, collectives, limits)
+        together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
+    with errors_of("cameras"):
+        check_choice(source)
+        capture = _capture_on_all_ranks(source, scene_file.scene, images, collectives).fitted(settings)
+        cameras = capture.cameras
+        if limits:
+            limits.check_cameras(cameras)
+        together(collectives, lambda: check_scales(settings.scales, cameras, settings.coarsest_side))
+        together(collectives, lambda: check_stroke_depth(settings, cameras, regions=bool(request.regions)))
+        if limits:
+            check_something_in_view(scene_file.scene, cameras, source.near)
+    with errors_of("style"):
+        together(collectives, lambda: check_style_size(style, cameras, settings.style_scale))
+    with errors_of("photos"):
+        if limits and images is not None:
+            check_names(images, capture.names)
+        with_photos = together(collectives, lambda: capture.with_photos(images))
+        for photo in (with_photos.photos or []) if limits else []:
+            limits.check_image(photo.path)
+            load_image(photo.path)
+    with errors_of("cameras"):
+        capture = collectives.broadcast(lambda: with_photos.checked(scene_file.scene, source.near))
+    with errors_of("mask"):
+        if limits:
+            _check_masks(request.regions, capture.names, limits)
+    with errors_of("regions"):
+        regions = read_regions(request, scene_file, capture.cameras, collectives)
+    decisions = (*about_notes(scene_file), *about_axes, *about_rendering(scene_file), *about_color, *capture.decisions)
+    return Inputs(style, scene_file, capture.cameras, capture.orbit, capture.photos, decisions, regions, reader)
+
+
+def _read_scene(
+    request: JobSpec, axes: SpzAxes, collectives: Collectives, limits: InputLimits | None
+) -> tuple[SceneFile, bool]:
+    """Return the scene in the requested render mode, and whether this rank read its file."""
+    source, drop_invalid = request.source, request.source.drop_invalid
+    if limits:  # whether the memory of this machine suffices now does not matter
+        file, reader = read_scene(source.scene, drop_invalid=drop_invalid, spz_axes=axes), True
+    else:
+        growth = request.settings.growth
+        file, reader = read_shared_scene(
+            source.scene, collectives, drop_invalid=drop_invalid, growth=growth, spz_axes=axes
+        )
+    return file.rendered(source.render_mode, source.eps2d), reader
+
+
+def _check_masks(regions: Sequence[RegionRequest], names: Sequence[str], limits: InputLimits) -> None:
+    """Check the names and sizes of mask images, given the names of the cameras."""
+    for selection in (region.selection for region in regions):
+        if selection and selection.kind == "masks" and selection.path:
+            check_names(selection.path, names, masks=True)
+            for path in sorted(selection.path.rglob("*")):
+                if path.is_file():
+                    limits.check_image(path)
+
+
+@contextlib.contextmanager
+def errors_of(role: str) -> Iterator[None]:
+    """Mark errors with the role of the input that they concern."""
+    try:
+        yield
+    except BaseException as error:
+        if not hasattr(error, "role"):
+            error.role = "mask" if isinstance(error, MaskError) else role  # type: ignore[attr-defined]
+        raise
+
+
+def check_frames_have_sizes(path: Path) -> None:
+    """Check that the frames of a transforms.json, or of those in a folder, have image sizes.
+
+    Without photos, the size would otherwise be read from the image file. Its path may point anywhere on this machine,
+    and a message would reveal what exists there.
+
+    Raises:
+        CameraError: If a frame has no size.
+    """
+    for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
+        try:
+            content = json.loads(file.read_text(encoding="utf-8-sig"))
+        except (ValueError, RecursionError):
+            continue  # the reader reports the fault
+        frames = content.get("frames") if isinstance(content, dict) else None
+        for index, frame in enumerate(frames if isinstance(frames, list) else []):
+            if isinstance(frame, dict) and any(frame.get(side) is None and content.get(side) is None for side in "wh"):
+                raise CameraError(f"{file}: camera {index}: gives no size. Add the sizes of the images as 'w' and 'h'.")
+
+
+def fingerprint_of(inputs: Inputs, settings: Settings, weights: str, collectives: Collectives) -> str:
+    """Return the fingerprint of a job, after checking that all ranks that read the scene computed the same one.
+
+    Args:
+        weights: Digest of the feature network's weights.
+
+    Raises:
+        SettingsError: If ranks have read different files.
+    """
+    photos = inputs.photos
     stamps = collectives.broadcast(lambda: repr([_stamp(photo) for photo in photos]) if photos else "")
     own = None
-    if reader:
-        own = fingerprint(scene_file.scene, cameras, style, settings, weights.sha256, stamps, regions)
-    decisions = (*about_notes(scene_file), *about_axes, *about_rendering(scene_file), *about_color, *capture.decisions)
-    same = _same_fingerprint(own, collectives)
-    return Inputs(weights, style, scene_file, cameras, capture.orbit, photos, decisions, regions, same)
+    if inputs.reader:
+        own = fingerprint(
+            inputs.scene_file.scene, inputs.cameras, inputs.style, settings, weights, stamps, inputs.regions
+        )
+    fingerprints = collectives.all_gather((own, socket.gethostname()))
+    for other, host in fingerprints:
+        if other is not None and other != fingerprints[0][0]:
+            raise SettingsError(
+                f"The files of this job are not the same on {fingerprints[0][1]} and {host}: scene, cameras, style or "
+                "weights differ. Give paths on a file system that all machines share."
+            )
+    assert fingerprints[0][0] is not None  # rank 0 always reads the scene itself
+    return fingerprints[0][0]
 
 
 def read_regions(
@@ -242,27 +364,10 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
     return value  # type: ignore[return-value]
 
 
-def _same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
+def same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
     """Load the weights of the feature network on every rank. Rank 0 chooses the network."""
     name = collectives.broadcast(lambda: load_network_weights(backbone).name)
     return together(collectives, lambda: load_network_weights(name))
-
-
-def _same_fingerprint(own: str | None, collectives: Collectives) -> str:
-    """Return the job's fingerprint, after checking that all ranks that read the scene computed the same one.
-
-    Args:
-        own: Fingerprint of this rank; None if another rank of the same machine read the scene.
-    """
-    fingerprints = collectives.all_gather((own, socket.gethostname()))
-    for other, host in fingerprints:
-        if other is not None and other != fingerprints[0][0]:
-            raise SettingsError(
-                f"The files of this job are not the same on {fingerprints[0][1]} and {host}: scene, cameras, style or "
-                "weights differ. Give paths on a file system that all machines share."
-            )
-    assert fingerprints[0][0] is not None  # rank 0 always reads the scene itself
-    return fingerprints[0][0]
 
 
 def _stamp(photo: Photo) -> tuple[object, ...]:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from sgsst_core.errors import CheckpointError
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.context import common_device, rasterizer_problem
@@ -25,10 +26,10 @@ from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
 from sgsst_core.stylizing.job import prepare_job
-from sgsst_core.stylizing.refining import refine
+from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
-from worker.inputs import Inputs, read_inputs, together
+from worker.inputs import Inputs, fingerprint_of, read_inputs, same_weights, together
 from worker.job import JobSpec, Resume
 from worker.outputs import Outputs, check_request
 from worker.previews import Previews
@@ -85,11 +86,13 @@ def prepare(
     """
     timer = Timer()  # no CUDA synchronization needed: no GPU work is pending when a phase ends
     outputs = collectives.broadcast(lambda: check_request(request))
-    with timer("reading"):
-        inputs = read_inputs(request, collectives)
     settings = request.settings
+    with timer("reading"):
+        weights = same_weights(request.backbone, collectives)
+        inputs = read_inputs(request, collectives)
+        fingerprint = fingerprint_of(inputs, settings, weights.sha256, collectives)
     resume = resume or Resume(request.resume)
-    resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, inputs.fingerprint, settings, resume, warn))
+    resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, fingerprint, settings, resume, warn))
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
     if preview and not resumed and collectives.rank == 0:
@@ -97,7 +100,7 @@ def prepare(
     refinement, scene_file = resumed.plan.refinement if resumed else None, inputs.scene_file
     if settings.growth > 1:
         with timer("refining"):
-            refinement = refinement if resumed else _refine(inputs, settings, collectives, show_planning)
+            refinement = refinement if resumed else _refine(inputs, settings, weights, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     regions = inputs.regions and inputs.regions.refined(refinement)
     plan, planning_context, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
@@ -108,7 +111,7 @@ def prepare(
             scene_file.scene,
             inputs.cameras,
             settings,
-            weights=inputs.weights,
+            weights=weights,
             collectives=collectives,
             survey=resumed.plan.survey if resumed else None,
             measured=True,
@@ -127,7 +130,7 @@ def prepare(
             inputs.cameras,
             inputs.style,
             settings,
-            weights=inputs.weights,
+            weights=weights,
             photos=inputs.photo_loader(settings.background),
             collectives=collectives,
             planning_context=planning_context,
@@ -137,13 +140,42 @@ def prepare(
     stylizer.seconds_by_part.update(timer.seconds)
     source, images = request.source, request.images
     styles = tuple(file.path for file in request.styles)
-    sources = Sources(source.scene, scene_file.dropped, styles, source.cameras, images, inputs.weights)
+    sources = Sources(source.scene, scene_file.dropped, styles, source.cameras, images, weights)
     workers = {"requested": collectives.size, **_workers_used(stylizer), "attempts": []}
-    return Job(request, outputs, scene_file, sources, stylizer, inputs.fingerprint, resumed, planned_ranks, workers)
+    return Job(request, outputs, scene_file, sources, stylizer, fingerprint, resumed, planned_ranks, workers)
+
+
+def plan_job(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None) -> Plan:
+    """Plan a job as `prepare` would on one rank, without making a step.
+
+    Args:
+        request: Job to plan.
+        inputs: Inputs of the job, from `read_inputs`.
+        show: Callback for the progress of planning.
+
+    Raises:
+        InvalidInputError: If the job cannot be planned.
+    """
+    settings, weights = request.settings, load_network_weights(request.backbone)
+    refinement = _refine(inputs, settings, weights, ALONE, show)
+    plan, _ = make_plan(
+        refined(inputs.scene_file.scene, refinement),
+        inputs.cameras,
+        settings,
+        weights=weights,
+        measured=True,
+        show=show,
+        orbit=inputs.orbit,
+        about_inputs=inputs.decisions,
+        style=inputs.style,
+        regions=inputs.regions and inputs.regions.refined(refinement),
+        refinement=refinement,
+    )
+    return plan
 
 
 def _refine(
-    inputs: Inputs, settings: Settings, collectives: Collectives, show: ShowPlanning | None
+    inputs: Inputs, settings: Settings, weights: BackboneWeights, collectives: Collectives, show: ShowPlanning | None
 ) -> Refinement | None:
     """Return the refinement of the scene; None if `settings.refine` turns it off."""
     return refine(
@@ -151,7 +183,7 @@ def _refine(
         inputs.cameras,
         inputs.style,
         settings,
-        weights=inputs.weights,
+        weights=weights,
         collectives=collectives,
         regions=inputs.regions,
         show=show,

@@ -14,7 +14,6 @@ from pathlib import Path
 from api.cli.arguments import local_path
 from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import OutputError, SettingsError
-from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder, write_json
 from sgsst_core.files.blending import blend_scenes, normalized
 from sgsst_core.files.formats import read_scene_header
@@ -23,10 +22,8 @@ from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.files.library import load_scene, save
 from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
-from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
 from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
-from sgsst_core.planning import planner
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
@@ -34,16 +31,15 @@ from sgsst_core.quality.scene_difference import CompressionLoss, measure_compres
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
-from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from sgsst_core.stylizing.refining import refine, refined
 from worker.capture import about_notes, about_rendering, choose_axes, read_capture
-from worker.inputs import check_something_seen, load_styles, read_regions, read_scene_and_capture
+from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.outputs import check_is_not_input, result_format
-from worker.prepare import describe_scene
+from worker.prepare import describe_scene, plan_job
 from worker.styles import split_weight
 
 #: Number of views of an orbit that a converted scene is compared in.
@@ -74,31 +70,12 @@ def make_plan(request: JobSpec, show_planning: ShowPlanning | None = None, sheet
             raise OutputError(f"{sheet}: not the name of a JPEG file. Give one, such as views.jpg.")
         for path, description in _input_images(request):
             check_is_not_input(sheet, path, description)
-    file, capture = read_scene_and_capture(source, request.images)
-    cameras = capture.cameras
-    check_sh_attenuation(file, settings.sh_attenuation)
-    weights = load_network_weights(request.backbone)
-    style = load_styles(
-        request.styles, request.style_background
-    )  # also reports an unusable style before any work is done
-    regions = read_regions(request, file, fit_cameras(cameras, settings))
+    inputs = read_inputs(request)
     if sheet is not None:
         sheet.parent.mkdir(parents=True, exist_ok=True)
-        write_views(sheet, file.scene, cameras, background=settings.background, near=settings.near)
-    refinement = refine(file.scene, cameras, style, settings, weights=weights, regions=regions, show=show_planning)
-    plan, _ = planner.make_plan(
-        refined(file.scene, refinement),
-        cameras,
-        settings,
-        weights=weights,
-        measured=True,
-        show=show_planning,
-        orbit=capture.orbit,
-        about_inputs=capture.decisions,
-        style=style,
-        regions=regions and regions.refined(refinement),
-        refinement=refinement,
-    )
+        scene = inputs.scene_file.scene
+        write_views(sheet, scene, inputs.cameras, background=settings.background, near=settings.near)
+    plan = plan_job(request, inputs, show_planning)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))
     return plan

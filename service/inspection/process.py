@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -37,38 +37,30 @@ from service.request import job_spec, scene_request
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.decision import warnings_of
-from sgsst_core.errors import CameraError, InvalidInputError, MaskError, SettingsError, SgsstError, WeightsError
+from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, WeightsError
 from sgsst_core.features import pooling_kernels  # noqa: F401  # see `_confine`
-from sgsst_core.features.network_weights import list_network_weights, load_network_weights
+from sgsst_core.features.network_weights import list_network_weights
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.blending import blend_scenes, encode_blend
-from sgsst_core.files.formats import format_of_name, read_scene_header
-from sgsst_core.files.images import image_size, load_image
-from sgsst_core.files.photos import check_names
+from sgsst_core.files.formats import format_of_name
+from sgsst_core.files.images import image_size
 from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
-from sgsst_core.files.stylized_ply import check_sh_attenuation
-from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.plan import Prediction
-from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.progress import Progress
 from sgsst_core.quality.scene_difference import measure_compression
-from sgsst_core.regions.definition import Regions
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.style import Style
-from sgsst_core.stylizing.job_styles import check_style_size
-from sgsst_core.stylizing.refining import refine, refined
-from worker.capture import Capture, about_notes, about_rendering, choose_axes, read_capture
-from worker.inputs import check_something_in_view, load_styles, read_regions
-from worker.job import check_choice, check_steps
+from worker.capture import choose_axes, read_capture
+from worker.inputs import Inputs, errors_of, read_inputs
+from worker.job import check_steps
 from worker.options import JobVideo
+from worker.prepare import plan_job
 from worker.processes import die_with_parent
-from worker.region_requests import RegionRequest
 from worker.video import VideoRequest, render_video
 
 with contextlib.suppress(ImportError):
@@ -90,17 +82,38 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class _Inputs:
-    """Inputs of a job in memory.
+class _Limits:
+    """Limits of the service, as `worker.inputs.InputLimits`.
 
     Attributes:
-        capture: Cameras and photos.
+        gaussians, views, pixels: Maximum numbers of Gaussians, of views, and of pixels of all views.
+        image_pixels: Maximum number of pixels of an image.
     """
 
-    scene: Scene
-    capture: Capture
-    style: Style
-    regions: Regions | None
+    gaussians: int
+    views: int
+    pixels: int
+    image_pixels: int
+
+    def check_count(self, count: int, growth: float) -> None:
+        """Check the number of Gaussians of a scene and its refinement."""
+        count = int(count * growth)
+        if count > self.gaussians:
+            note = f" once it is refined to at most {growth:g} times as many" if growth > 1 else ""
+            raise problems.TOO_MANY_GAUSSIANS(count=count, note=note, limit=self.gaussians, input="scene")
+
+    def check_cameras(self, cameras: Sequence[Camera]) -> None:
+        """Check the number of views and their pixels."""
+        if len(cameras) > self.views:
+            raise problems.TOO_MANY_VIEWS(count=len(cameras), limit=self.views, input="cameras")
+        if (pixels := _pixels(cameras)) > self.pixels:
+            raise problems.TOO_MANY_PIXELS(count=pixels, limit=self.pixels, input="cameras")
+
+    def check_image(self, path: Path) -> None:
+        """Check the number of pixels of an image."""
+        width, height = image_size(path)
+        if width * height > self.image_pixels:
+            raise problems.IMAGE_TOO_LARGE(name=path.name, width=width, height=height, limit=self.image_pixels)
 
 
 def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
@@ -113,80 +126,28 @@ def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) 
         INVALID_INPUT, InvalidInputError: If an input cannot be used; the error's attribute `role` is the input's
             role.
     """
-    return _read_inputs(staged, parameters, limits)[0]
+    return _findings(_read(staged, parameters, limits))
 
 
-def _read_inputs(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> tuple[dict[str, Any], _Inputs]:
-    """Return the findings of `validate` and the inputs themselves."""
-    settings = parameters.settings()
-    check_steps(settings)
+def _read(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> Inputs:
+    check_steps(parameters.settings())
     _check_network_weights(parameters.backbone)
-    findings: dict[str, Any] = {}
-    source = scene_request(staged, parameters)
-    with _errors_of("scene"):
-        header = read_scene_header(staged.scene)
-        declared = int(header.count * settings.growth)
-        if declared > limits["gaussians"]:
-            raise problems.TOO_MANY_GAUSSIANS(
-                count=declared, note=_refinement_note(settings), limit=limits["gaussians"], input="scene"
-            )
-    with _errors_of("cameras"):
-        if source.cameras is not None and staged.photos is None:
-            _check_frames_have_sizes(source.cameras)
-    with _errors_of("scene"):
-        axes, about_axes = choose_axes(source, staged.photos)
-        file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
-        file = file.rendered(source.render_mode, source.eps2d)
-        check_sh_attenuation(file, settings.sh_attenuation)
-        findings |= {"gaussians": len(file.scene), "dropped": file.dropped, "sh_degree": file.scene.sh_degree}
-    with _errors_of("style"):
-        for path in staged.styles:
-            _check_pixel_count(path, limits)
-        job = job_spec(staged, parameters)
-        style = load_styles(job.styles, job.style_background)
-        findings["style"] = [style.images[0].shape[1], style.images[0].shape[0]]
-    with _errors_of("cameras"):
-        check_choice(source)
-        capture = read_capture(source, file.scene, staged.photos).fitted(settings)
-        cameras = capture.cameras
-        if len(cameras) > limits["views"]:
-            raise problems.TOO_MANY_VIEWS(count=len(cameras), limit=limits["views"], input="cameras")
-        pixels = _pixels(cameras)
-        if pixels > limits["pixels"]:
-            raise problems.TOO_MANY_PIXELS(count=pixels, limit=limits["pixels"], input="cameras")
-        check_scales(settings.scales, cameras, settings.coarsest_side)
-        check_stroke_depth(settings, cameras, regions=bool(job.regions))
-        check_something_in_view(file.scene, cameras, source.near)
-    with _errors_of("style"):
-        check_style_size(style, cameras, settings.style_scale)
-    with _errors_of("photos"):
-        if staged.photos is not None:
-            check_names(staged.photos, capture.names)
-        capture = capture.with_photos(staged.photos)
-        for photo in capture.photos or []:
-            _check_pixel_count(photo.path, limits)
-            load_image(photo.path)
-        findings["photos"] = len(capture.photos or [])
-    with _errors_of("cameras"):
-        capture = capture.checked(file.scene, source.near)
-        findings |= {"views": len(capture.cameras), "pixels": _pixels(capture.cameras)}
-    with _errors_of("mask"):
-        for folder in _mask_folders(job.regions):
-            check_names(folder, capture.names, masks=True)
-            for path in sorted(folder.rglob("*")):
-                if path.is_file():
-                    _check_pixel_count(path, limits)
-    with _errors_of("regions"):
-        regions = read_regions(job, file, capture.cameras)
-    decisions = (*about_notes(file), *about_axes, *about_rendering(file), *capture.decisions)
-    capture = replace(capture, decisions=decisions)
-    return findings, _Inputs(file.scene, capture, style, regions)
+    with errors_of("style"):
+        spec = job_spec(staged, parameters)
+    return read_inputs(spec, limits=_Limits(**limits))
 
 
-def _mask_folders(regions: Sequence[RegionRequest]) -> list[Path]:
-    """Return the folders of mask images of regions."""
-    selections = [region.selection for region in regions if region.selection and region.selection.kind == "masks"]
-    return [selection.path for selection in selections if selection.path]
+def _findings(inputs: Inputs) -> dict[str, Any]:
+    scene, image = inputs.scene_file.scene, inputs.style.images[0]
+    return {
+        "gaussians": len(scene),
+        "dropped": inputs.scene_file.dropped,
+        "sh_degree": scene.sh_degree,
+        "style": [image.shape[1], image.shape[0]],
+        "photos": len(inputs.photos or []),
+        "views": len(inputs.cameras),
+        "pixels": _pixels(inputs.cameras),
+    }
 
 
 def _pixels(cameras: Sequence[Camera]) -> int:
@@ -194,32 +155,11 @@ def _pixels(cameras: Sequence[Camera]) -> int:
     return sum(camera.width * camera.height for camera in cameras)
 
 
-def _refinement_note(settings: Settings) -> str:
-    """Return a note that a reported number of Gaussians includes refinement; empty without refinement."""
-    return f" once it is refined to at most {settings.growth:g} times as many" if settings.growth > 1 else ""
-
-
 def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """Return the findings of `validate` and the plan of `sgsst plan`; `show` receives the progress."""
     started = time.perf_counter()
-    findings, inputs = _read_inputs(staged, parameters, limits)
-    request = job_spec(staged, parameters)
-    weights = load_network_weights(request.backbone)
-    settings, regions, cameras = request.settings, inputs.regions, inputs.capture.cameras
-    refinement = refine(inputs.scene, cameras, inputs.style, settings, weights=weights, regions=regions, show=show)
-    job_plan, _ = make_plan(
-        refined(inputs.scene, refinement),
-        cameras,
-        settings,
-        weights=weights,
-        measured=True,
-        show=show,
-        orbit=inputs.capture.orbit,
-        about_inputs=inputs.capture.decisions,
-        style=inputs.style,
-        regions=regions and regions.refined(refinement),
-        refinement=refinement,
-    )
+    inputs = _read(staged, parameters, limits)
+    job_plan, settings = plan_job(job_spec(staged, parameters), inputs, show), parameters.settings()
     seconds = total = memory = on_device = None
     if job_plan.prediction:
         # The job starts a process with the same modules as this one, then reads and plans as was done here.
@@ -231,9 +171,9 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
         )
         memory, on_device = job_plan.prediction.peak_bytes, job_plan.prediction.device_bytes
         coarse = job_plan.prediction.seconds_coarse or job_plan.prediction.seconds
-        seconds = job_plan.prediction.seconds * request.settings.steps_sos + coarse * job_plan.steps_coarse
+        seconds = job_plan.prediction.seconds * settings.steps_sos + coarse * job_plan.steps_coarse
     return {
-        **findings,
+        **_findings(inputs),
         "plan": plan_json(job_plan),
         "estimated_seconds": seconds,
         "total_seconds": total,
@@ -327,17 +267,6 @@ WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], 
 }
 
 
-@contextlib.contextmanager
-def _errors_of(role: str) -> Iterator[None]:
-    """Mark errors with the role of the input that they concern."""
-    try:
-        yield
-    except BaseException as error:
-        if not hasattr(error, "role"):
-            error.role = "mask" if isinstance(error, MaskError) else role  # type: ignore[attr-defined]
-        raise
-
-
 def _check_network_weights(backbone: str) -> None:
     installed = [entry.name for entry in list_network_weights() if entry.path]
     wanted = [name for name in ("vgg19", "vgg16") if backbone in ("auto", name)]
@@ -352,29 +281,6 @@ def _check_encoder() -> None:
         raise SettingsError(
             f"The service cannot encode videos: its operator has to run `{install_command('video')}`."
         ) from error
-
-
-def _check_pixel_count(path: Path, limits: dict[str, Any]) -> None:
-    width, height = image_size(path)
-    if width * height > limits["image_pixels"]:
-        raise problems.IMAGE_TOO_LARGE(name=path.name, width=width, height=height, limit=limits["image_pixels"])
-
-
-def _check_frames_have_sizes(path: Path) -> None:
-    """Reject a transforms.json with frames that have no image size.
-
-    The size would otherwise be read from the image file, unless the job has photos. Its path may point anywhere on this
-    machine, and the response would reveal what exists there.
-    """
-    for file in sorted(path.glob("*.json")) if path.is_dir() else [path]:
-        try:
-            content = json.loads(file.read_text(encoding="utf-8-sig"))
-        except (ValueError, RecursionError):
-            continue  # the reader reports the fault
-        frames = content.get("frames") if isinstance(content, dict) else None
-        for index, frame in enumerate(frames if isinstance(frames, list) else []):
-            if isinstance(frame, dict) and any(frame.get(side) is None and content.get(side) is None for side in "wh"):
-                raise CameraError(f"{file}: camera {index}: gives no size. Add the sizes of the images as 'w' and 'h'.")
 
 
 # --- one request in a child ----------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from service.errors import ServiceError
 from service.files.blobs import BlobFolder
 from service.files.threads import FileThreads
 from service.inspection.inspector import InspectionProcess, Inspector, Show
-from service.inspection.process import WORK, _check_frames_have_sizes, _memory_besides_reading
+from service.inspection.process import WORK, _memory_besides_reading
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -25,6 +25,7 @@ from sgsst_core.errors import CameraError
 from sgsst_core.files.scene_file import write_scene
 from tests.api.service import PATIENCE
 from tests.small_scenes import wall, write_files
+from worker.inputs import check_frames_have_sizes
 
 
 class Inspect(Protocol):
@@ -144,8 +145,8 @@ def test_sizes_of_many_frames_are_checked_in_a_file_of_many_values(tmp_path: Pat
     path = tmp_path / "transforms.json"
     content = {"h": 1, **{str(number): 0 for number in range(100_000)}, "frames": [{"w": 1}] * 100_000}
     path.write_text(json.dumps(content))
-    _check_frames_have_sizes(path)  # many minutes if each frame copied the values
+    check_frames_have_sizes(path)  # many minutes if each frame copied the values
     for frame in ({"w": 1}, {"w": 1, "h": None}):
         path.write_text(json.dumps({"frames": [frame]}))
         with pytest.raises(CameraError, match="gives no size"):
-            _check_frames_have_sizes(path)
+            check_frames_have_sizes(path)
