@@ -50,6 +50,8 @@ T = TypeVar("T")
 #: Maximum number of pixels of all images of a style: as float32 they take 400 MB, and up to as much again while one of
 #: them is resized to the views.
 STYLE_PIXELS = 1 << 25
+#: Number of Gaussians that are projected at once to find one in a view.
+_BLOCK = 1 << 16
 _REDUCED = "{}: was reduced when it was read, because the style has more than 33 megapixels"
 
 
@@ -336,14 +338,15 @@ def check_something_in_view(scene: Scene, cameras: Sequence[Camera], near: float
     Raises:
         CameraError: If no camera sees a Gaussian.
     """
-    means = scene.means.double()
-    for camera in cameras:
-        x, y, z = (means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
-        across = camera.fx * x / z + camera.cx
-        down = camera.fy * y / z + camera.cy
-        inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
-        if bool(inside.any()):
-            return
+    for block in scene.means.split(_BLOCK):  # the first block usually decides
+        means = block.double()
+        for camera in cameras:
+            x, y, z = (means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
+            across = camera.fx * x / z + camera.cx
+            down = camera.fy * y / z + camera.cy
+            inside = (z > near) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
+            if bool(inside.any()):
+                return
     check_something_seen(scene, cameras, make_rasterizer("cpu", scene, near=near))
 
 

@@ -145,7 +145,7 @@ def prepare(
     return Job(request, outputs, scene_file, sources, stylizer, fingerprint, resumed, planned_ranks, workers)
 
 
-def plan_job(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None) -> Plan:
+def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None) -> Plan:
     """Plan a job as `prepare` would on one rank, without making a step.
 
     Args:

@@ -39,7 +39,7 @@ from worker.capture import about_notes, about_rendering, choose_axes, read_captu
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.outputs import check_is_not_input, result_format
-from worker.prepare import describe_scene, plan_job
+from worker.prepare import describe_scene, dry_run
 from worker.styles import split_weight
 
 #: Number of views of an orbit that a converted scene is compared in.
@@ -75,7 +75,7 @@ def make_plan(request: JobSpec, show_planning: ShowPlanning | None = None, sheet
         sheet.parent.mkdir(parents=True, exist_ok=True)
         scene = inputs.scene_file.scene
         write_views(sheet, scene, inputs.cameras, background=settings.background, near=settings.near)
-    plan = plan_job(request, inputs, show_planning)
+    plan = dry_run(request, inputs, show_planning)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))
     return plan

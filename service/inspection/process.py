@@ -59,7 +59,7 @@ from worker.capture import choose_axes, read_capture
 from worker.inputs import Inputs, errors_of, read_inputs
 from worker.job import check_steps
 from worker.options import JobVideo
-from worker.prepare import plan_job
+from worker.prepare import dry_run
 from worker.processes import die_with_parent
 from worker.video import VideoRequest, render_video
 
@@ -159,7 +159,7 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
     """Return the findings of `validate` and the plan of `sgsst plan`; `show` receives the progress."""
     started = time.perf_counter()
     inputs = _read(staged, parameters, limits)
-    job_plan, settings = plan_job(job_spec(staged, parameters), inputs, show), parameters.settings()
+    job_plan, settings = dry_run(job_spec(staged, parameters), inputs, show), parameters.settings()
     seconds = total = memory = on_device = None
     if job_plan.prediction:
         # The job starts a process with the same modules as this one, then reads and plans as was done here.
