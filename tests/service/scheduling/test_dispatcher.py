@@ -195,6 +195,9 @@ def test_attempt_is_abandoned_before_an_unrenewed_lease_expires(
         def start(self) -> None:
             self.started = time.monotonic()
 
+        def obey(self, status: str) -> None:
+            self.status = status
+
         def abandon(self) -> None:
             abandoned_at.append(store.database.clock())
             abandoned.set()
