@@ -18,7 +18,7 @@ import json
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -369,17 +369,17 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
 
 def _read_part(file: OpenScene, part: GlbPart, into: Arrays) -> None:
     """Fill the arrays of a set of Gaussians."""
-    accessors = part.accessors
+    converters: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+        "means": np.asarray,
+        "quats": lambda values: np.roll(values, 1, axis=1),
+        "scales": lambda values: logarithms(file.path, values),
+        "opacities": lambda values: logits(file.path, values)[:, 0],
+        "sh_dc": np.asarray,
+    }
     with np.errstate(over="ignore", invalid="ignore"):  # invalid values are reported later
-        for name in ("means", "sh_dc"):
-            for block, values in _values(file, accessors[name], part.count):
-                into[name][block] = values
-        for block, values in _values(file, accessors["quats"], part.count):
-            into["quats"][block] = np.roll(values, 1, axis=1)
-        for block, values in _values(file, accessors["scales"], part.count):
-            into["scales"][block] = logarithms(file.path, values)
-        for block, values in _values(file, accessors["opacities"], part.count):
-            into["opacities"][block] = logits(file.path, values)[:, 0]
+        for name, convert in converters.items():
+            for block, values in _values(file, part.accessors[name], part.count):
+                into[name][block] = convert(values)
         for index, accessor in enumerate(part.harmonics):
             for block, values in _values(file, accessor, part.count):
                 into["sh_rest"][block, index] = values

@@ -359,52 +359,47 @@ def _rotate(arrays: Arrays) -> None:
     arrays["sh_rest"] *= _FLIP_HARMONICS[: arrays["sh_rest"].shape[1], None]
 
 
-class _Stream:
-    """Content of a file of version 1 to 3: one stream, compressed by gzip or not.
-
-    Args:
-        file: Open file.
-        spz: Header of the file.
+class _Part:
+    """Byte range of a file, with the method `read` of binary files.
 
     Attributes:
-        position: Byte offset of what has not been read from the file.
-        inflate: Decompressor; None for a stream that is not compressed.
+        position: Byte offset of what is read next.
     """
 
-    def __init__(self, file: OpenScene, spz: SpzHeader) -> None:
-        self.position = 0
-        self.inflate = zlib.decompressobj(31) if spz.zipped else None
-        self._file, self._size = file, spz.size
+    def __init__(self, file: OpenScene, offset: int, size: int) -> None:
+        self.position = offset
+        self._file, self._end = file, offset + size
 
-    def read(self, count: int) -> bytes:
-        """Return the next `count` bytes, or those that are left."""
-        if self.inflate is None:
-            return self._next(count)
-        content = bytearray()
-        while len(content) < count and not self.inflate.eof:
-            data = self.inflate.unconsumed_tail or self._next(_READ_BYTES)
-            content += self.inflate.decompress(data, count - len(content))
-            if not data and len(content) < count:
-                break
-        return bytes(content)
-
-    def _next(self, count: int) -> bytes:
-        data = read_rows(self._file, np.dtype(np.uint8), self.position, min(count, self._size - self.position))
+    def read(self, size: int = -1) -> bytes:
+        left = self._end - self.position
+        data = read_rows(self._file, np.dtype(np.uint8), self.position, left if size < 0 else min(size, left))
         self.position += len(data)
         return data.tobytes()
 
 
-class _Part:
-    """File-like object for a byte range of a file."""
+class _Stream:
+    """Content of a file of version 1 to 3: one stream, compressed by gzip or not.
 
-    def __init__(self, file: OpenScene, offset: int, size: int) -> None:
-        self._file, self._position, self._end = file, offset, offset + size
+    Attributes:
+        source: File.
+        inflate: Decompressor; None for a stream that is not compressed.
+    """
 
-    def read(self, size: int = -1) -> bytes:
-        left = self._end - self._position
-        data = read_rows(self._file, np.dtype(np.uint8), self._position, left if size < 0 else min(size, left))
-        self._position += len(data)
-        return data.tobytes()
+    def __init__(self, file: OpenScene, spz: SpzHeader) -> None:
+        self.source = _Part(file, 0, spz.size)
+        self.inflate = zlib.decompressobj(31) if spz.zipped else None
+
+    def read(self, count: int) -> bytes:
+        """Return the next `count` bytes, or those that are left."""
+        if self.inflate is None:
+            return self.source.read(count)
+        content = bytearray()
+        while len(content) < count and not self.inflate.eof:
+            data = self.inflate.unconsumed_tail or self.source.read(_READ_BYTES)
+            content += self.inflate.decompress(data, count - len(content))
+            if not data and len(content) < count:
+                break
+        return bytes(content)
 
 
 def _sections_of_stream(path: Path, stream: _Stream, spz: SpzHeader) -> Iterator[Take]:
@@ -428,7 +423,7 @@ def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[bytes, int
     rest = content[sum(8 + len(each) for _, each in _extension_records(content)) * spz.extended :]
     if len(rest) >= sum(spz.sections) // spz.count and not is_padding(rest):
         raise _too_much(path, f" by {number_of(len(rest), 'byte')}")
-    return content, stream.position - len(stream.inflate.unused_data if stream.inflate else b"")
+    return content, stream.source.position - len(stream.inflate.unused_data if stream.inflate else b"")
 
 
 def _sections_of_streams(path: Path, file: OpenScene, spz: SpzHeader) -> Iterator[Take]:
