@@ -180,8 +180,8 @@ async def create_job(
             with suspended():  # fetching has its own deadline
                 fetched = await context.fetcher.fetch(urls, receipt)
         inputs, rows = await context.threads.run(caller.owner, find_inputs, fetched)
-        recall = context.inspector.recall
-        if await asyncio.to_thread(recall, "validate", caller.owner, inputs, parameters) is None:
+        recall = partial(context.inspector.recall, "validate", caller.owner, inputs, parameters)
+        if await context.threads.run(caller.owner, recall) is None:
             size = sum(row.size for row in rows.values())
             await context.threads.run(caller.owner, _check_files, context, inputs, rows, size=size)
             await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
