@@ -123,8 +123,8 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
         if limits and source.cameras is not None and images is None:
             check_frames_have_sizes(source.cameras)
     with errors_of("style"):
-        for file in (*request.styles, *(style for region in request.regions for style in region.styles)):
-            if limits:
+        if limits:
+            for file in (*request.styles, *(each for region in request.regions for each in region.styles)):
                 limits.check_image(file.path)
         style = together(collectives, lambda: load_styles(request.styles, request.style_background))
     with errors_of("scene"):
@@ -149,9 +149,10 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
         if limits and images is not None:
             check_names(images, capture.names)
         with_photos = together(collectives, lambda: capture.with_photos(images))
-        for photo in (with_photos.photos or []) if limits else []:
-            limits.check_image(photo.path)
-            load_image(photo.path)
+        if limits:
+            for photo in with_photos.photos or []:
+                limits.check_image(photo.path)
+                load_image(photo.path)
     with errors_of("cameras"):
         capture = collectives.broadcast(lambda: with_photos.checked(scene_file.scene, source.near))
     with errors_of("mask"):
