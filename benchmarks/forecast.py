@@ -11,7 +11,7 @@ from the number of pairs of a Gaussian and a raster tile, and from the instructi
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -32,8 +32,8 @@ from sgsst_core.features.statistics import TILE, span_positions
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.content import ContentDifference
 from sgsst_core.loss.sos import SosLoss
+from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.work import content_bytes
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings
@@ -184,6 +184,16 @@ class Part:
     works: Sequence[Work]
     visits: float = 1.0
     more_launches: int = 0
+
+
+def content_bytes(sizes: Iterable[Size], tiling: Tiling, cell: int) -> int:
+    """Return the size in bytes of the content features of views at all scales, given the bytes per cell."""
+    cells = sum(
+        (height >> scale + 3) * (width >> scale + 3)
+        for height, width in sizes
+        for scale in tiling.scales((height, width))
+    )
+    return cells * cell
 
 
 def shapes_of(name: str) -> BackboneWeights:

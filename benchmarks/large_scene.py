@@ -26,23 +26,22 @@ from scipy.spatial import cKDTree
 from benchmarks.machine import write_result
 from benchmarks.rasterizer import DATA, timed
 from sgsst_core.bench.synthetic import surface_scene
+from sgsst_core.budget import peak_memory
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
-from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import soft_image
+from sgsst_core.planning.context import soft_image
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections, intersections_of_subset
-from sgsst_core.report.machine import peak_memory
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.result_colors import NEIGHBORS, neighbors_change
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
@@ -149,14 +148,10 @@ def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """Time a job by part, from a loaded scene to the end of the first step, with network weights installed."""
     settings = make_settings(max_resolution=_RESOLUTION)
-    timer, weights, style = Timer(), load_network_weights("auto"), soft_image(512)
-    plan, planning_context = make_plan(scene, cameras, settings, weights=weights, timer=timer)
+    timer, weights, style = Timer(), load_network_weights("auto"), Style.of(soft_image(512))
+    job = plan_job(scene, cameras, style, settings, weights=weights, timer=timer)
     with timer("preparing"):
-        stylizer = Stylizer(
-            prepare_job(
-                plan, scene, cameras, Style.of(style), settings, weights=weights, planning_context=planning_context
-            )
-        )
+        stylizer = Stylizer(job)
     with timer("first_step"):
         stylizer.run_step()
     return {f"{name}_seconds_of_a_job": seconds for name, seconds in timer.seconds.items()}

@@ -20,7 +20,7 @@ import torch
 from benchmarks.inputs import input_parser, read_inputs, with_size
 from benchmarks.machine import RESULTS, write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.report.machine import peak_memory
+from sgsst_core.budget import peak_memory
 
 
 def main() -> None:

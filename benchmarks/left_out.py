@@ -26,20 +26,19 @@ from torch import Tensor
 from benchmarks.inputs import read_views
 from benchmarks.machine import write_result
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.budget import Cache
+from sgsst_core.budget import Cache, peak_memory
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.loss.tiling import Divider, Division, Tiling
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.planner import make_plan
-from sgsst_core.report.machine import peak_memory
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.planner import plan_job
 
 #: Components that can be left out without changing the result.
 EVERYTHING = ("unseen", "uncovered", "activations", "content", "blend-weights")
@@ -78,13 +77,14 @@ def with_components(
     """Return the stylizer of a job that computes some of `EVERYTHING` although it does not need to."""
     if "blend-weights" in added:
         settings = settings.model_copy(update={"cached_weights": "none"})
-    plan, context = make_plan(scene, cameras, settings, weights=weights, style=style)
+    job = plan_job(scene, cameras, style, settings, weights=weights)
+    plan = job.plan
     if "unseen" in added:
         plan = replace(plan, seen=torch.ones_like(plan.seen))
     if "uncovered" in added and plan.weighted:
-        whole = [Rectangle(0, 0, camera.height, camera.width) for camera in context.cameras]
+        whole = [Rectangle(0, 0, camera.height, camera.width) for camera in job.views.cameras]
         plan = replace(plan, survey=replace(plan.survey, regions=whole))
-    job = prepare_job(plan, scene, cameras, style, settings, weights=context.weights)
+    job = prepare_job(plan, scene, cameras, style, settings, weights=job.weights)
     if "uncovered" in added:
         job.loss.divider = _Whole(job.loss.tiling)
     if "activations" in added:

@@ -85,7 +85,7 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
     """Run one job from input files to output files, and return its measured values and predicted remaining times."""
     started = time.perf_counter()
     # Imported here, because the time of imports is part of the job's time.
-    from sgsst_core.report.machine import peak_memory
+    from sgsst_core.budget import peak_memory
     from worker.execute import execute
     from worker.job import JobSpec, SceneRequest
     from worker.options import StylizeOptions

@@ -3,8 +3,7 @@
 python -m benchmarks.ranks SCENE.ply CAMERAS|orbit:N STYLE [--ranks 2] [--sizes 1280x720,2048x2048] [--rounds 3]
 
 Ranks are gloo processes on this machine; iterations on one and on all ranks take turns. Also reported are the limit of
-the speedup due to halos, the fraction of an iteration in which ranks wait for each other or for data, and the speedup
-that the planner's model predicts from measurements on one rank.
+the speedup due to halos, and the fraction of an iteration in which ranks wait for each other or for data.
 """
 
 from __future__ import annotations
@@ -22,20 +21,12 @@ import torch
 from benchmarks.inputs import input_parser, read_inputs, with_size
 from benchmarks.machine import free_address, write_result
 from sgsst_core import Stylizer, make_settings
+from sgsst_core.budget import peak_memory
 from sgsst_core.features.partition import Rectangle, computed_twice
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, divide, loads
-from sgsst_core.planning.facts import Link
-from sgsst_core.planning.probe import probe_link
-from sgsst_core.planning.ranks import IterationWork
-from sgsst_core.planning.view_costs import proportional
-from sgsst_core.planning.work import pieces_of
-from sgsst_core.report.machine import peak_memory
 from sgsst_core.scene.camera import Camera
 from worker.ranks.process_group import process_group
-
-NETWORK = ("vgg_forward", "vgg_backward", "statistics")
-RASTER = ("render", "raster_backward")
 
 
 def main() -> None:
@@ -64,18 +55,16 @@ def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
     results = []
     # A long timeout, because the other ranks wait while one runs alone.
     with process_group(rank, arguments.ranks, address, timeout=timedelta(hours=1)) as collectives:
-        link = probe_link(collectives, torch.device("cpu"))
         for size in arguments.sizes.split(","):
             view = with_size(camera, *map(int, size.split("x")))
             figures = compare(
                 collectives, lambda c, view=view: make(c, scene, view, style, arguments), arguments.rounds
             )
             if rank == 0:
-                results.append({"view": size, **figures, **modeled(figures, len(scene), link, arguments.ranks)})
+                results.append({"view": size, **figures})
                 print(describe(results[-1]), flush=True)
     if rank == 0:
-        link_figures = {"bandwidth_gb_s": link.bandwidth / 1e9, "latency_us": link.latency * 1e6}
-        write_result(arguments.name, {"scene": arguments.scene.parent.name, "link": link_figures, "views": results})
+        write_result(arguments.name, {"scene": arguments.scene.parent.name, "views": results})
 
 
 def make(collectives: Collectives, scene: Any, view: Camera, style: Any, arguments: argparse.Namespace) -> Stylizer:
@@ -113,7 +102,8 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         return {}
     loss = alone.job.loss
     camera = alone.job.views.cameras[0]
-    pieces = pieces_of((camera.height, camera.width), loss.tiling, None)
+    sizes = {scale: (camera.height >> scale, camera.width >> scale) for scale in alone.job.scales(0)}
+    pieces = tuple(Piece(scale, size, Rectangle(0, 0, *size)) for scale, size in sizes.items())
     areas = [[tile.outer.pixels for tile in loss.divider.tiles(piece.size)] for piece in pieces]
     halo = loss.network.halo
     one, shared = (divide(pieces, halo, (1.0,) * count) for count in (1, collectives.size))
@@ -149,42 +139,6 @@ def processor_seconds(before: resource.struct_rusage) -> dict[str, float]:
     }
 
 
-def modeled(figures: dict[str, Any], gaussians: int, link: Link, ranks: int) -> dict[str, Any]:
-    """Return the figures that the planner's model predicts from one rank's seconds."""
-    steps = figures["steps"]["alone"]
-    network = sum(median(steps, part) for part in NETWORK)
-    raster = sum(median(steps, part) for part in RASTER)
-    pieces = tuple(whole_piece(*values) for values in figures["pieces"])
-    pixels, twice = figures["pixels_one_rank"], figures["pixels_twice_one_rank"]
-    forward = median(steps, "vgg_forward") / (pixels + twice)
-    fixed = max(median(steps, "total") - network - raster, 0.0)
-    work = IterationWork(
-        pieces,
-        figures["halo"],
-        (network - forward * twice) / pixels,
-        proportional(raster),
-        fixed,
-        gaussians,
-        forward=forward,
-        held=figures["held_pixels"],
-        working=figures["working"],
-        sharing=ranks,
-        shown=figures["shown"],
-    )
-    seconds = work.seconds(ranks, link)
-    return {
-        "model_seconds": seconds,
-        "model_communication_share": work.communication(ranks, link) / seconds,
-        "model_error": seconds / figures["seconds"] - 1,
-        "model_bytes_sent": work.sent(ranks),
-    }
-
-
-def whole_piece(scale: int, height: int, width: int) -> Piece:
-    """Return a work piece that covers the whole image at a scale."""
-    return Piece(scale, (height, width), Rectangle(0, 0, height, width))
-
-
 def median(steps: list[dict[str, float]], part: str) -> float:
     """Return the median over steps of a part's seconds."""
     return statistics.median(step.get(part, 0.0) for step in steps) if steps else math.nan
@@ -202,7 +156,7 @@ def describe(result: dict[str, Any]) -> str:
     return (
         f"{result['view']}: {result['seconds_one_rank']:.2f} s on one rank, {result['seconds']:.2f} s on "
         f"{result['ranks']}: {ratio} times faster, {best} in the fastest steps (halos bound it to {bound}); "
-        f"waiting {waiting}; the model says {result['model_seconds']:.2f} s ({result['model_error']:+.0%})"
+        f"waiting {waiting}"
     )
 
 

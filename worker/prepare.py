@@ -18,7 +18,6 @@ from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.context import common_device, rasterizer_problem
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.refine.split import Refinement
@@ -26,6 +25,7 @@ from sgsst_core.report.document import Sources
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
 from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
@@ -103,15 +103,30 @@ def prepare(
             refinement = refinement if resumed else _refine(inputs, settings, weights, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     regions = inputs.regions and inputs.regions.refined(refinement)
-    plan, planning_context, planned_ranks = _usable_plan(resumed, collectives), None, collectives.size
+    plan, planned_ranks = _usable_plan(resumed, collectives), collectives.size
+    photos = inputs.photo_loader(settings.background)
     if plan is not None and resumed is not None:
         planned_ranks = resumed.ranks
+        with timer("preparing"):
+            stylization = prepare_job(
+                plan,
+                scene_file.scene,
+                inputs.cameras,
+                inputs.style,
+                settings,
+                weights=weights,
+                photos=photos,
+                collectives=collectives,
+                regions=regions,
+            )
     else:
-        plan, planning_context = make_plan(
+        stylization = plan_job(
             scene_file.scene,
             inputs.cameras,
+            inputs.style,
             settings,
             weights=weights,
+            photos=photos,
             collectives=collectives,
             survey=resumed.plan.survey if resumed else None,
             measured=True,
@@ -119,23 +134,10 @@ def prepare(
             timer=timer,
             orbit=inputs.orbit,
             about_inputs=inputs.decisions,
-            style=inputs.style,
             regions=regions,
             refinement=refinement,
         )
     with timer("preparing"):
-        stylization = prepare_job(
-            plan,
-            scene_file.scene,
-            inputs.cameras,
-            inputs.style,
-            settings,
-            weights=weights,
-            photos=inputs.photo_loader(settings.background),
-            collectives=collectives,
-            planning_context=planning_context,
-            regions=regions,
-        )
         stylizer = Stylizer(stylization)
     stylizer.seconds_by_part.update(timer.seconds)
     source, images = request.source, request.images
@@ -158,20 +160,19 @@ def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None) 
     """
     settings, weights = request.settings, load_network_weights(request.backbone)
     refinement = _refine(inputs, settings, weights, ALONE, show)
-    plan, _ = make_plan(
+    return plan_job(
         refined(inputs.scene_file.scene, refinement),
         inputs.cameras,
+        inputs.style,
         settings,
         weights=weights,
         measured=True,
         show=show,
         orbit=inputs.orbit,
         about_inputs=inputs.decisions,
-        style=inputs.style,
         regions=inputs.regions and inputs.regions.refined(refinement),
         refinement=refinement,
-    )
-    return plan
+    ).plan
 
 
 def _refine(

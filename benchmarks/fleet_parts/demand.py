@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-from sgsst_core.planning.ranks import LEAST_GAIN
+from sgsst_core.planning.choices import LEAST_GAIN
 from sgsst_core.settings import make_settings
 
 #: Bytes of a Gaussian with SH of degree 3 in a PLY file.

@@ -8,8 +8,7 @@ from benchmarks.gpu.clock import forget_peak, kernel_times, peak_bytes, reserved
 from benchmarks.gpu.inputs import network_weights, small_weights
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device
 from sgsst_core.bench.synthetic import surface_scene, texture, views
-from sgsst_core.planning.probe import PROBE_SIDE, measure_rate
-from sgsst_core.report.machine import peak_memory
+from sgsst_core.budget import peak_memory
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Precision, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -68,6 +67,3 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     findings.add(f"{place}/planned_device_bytes", prediction.device_bytes if prediction else None)
     findings.add(f"{place}/process_peak_bytes", peak_memory())
     findings.add(f"{place}/planned_process_bytes", prediction.peak_bytes if prediction else None)
-    if device().type == "cuda":  # at the end, because it may take more memory than a step
-        planning = kernel_times(lambda: measure_rate(stylizer.job.loss, min(height, PROBE_SIDE["cuda"])))[1]
-        findings.add(f"{place}/kernels_of_planning", planning)

@@ -1,6 +1,6 @@
-"""Planning: measure a job before its first step, and decide what can be left out for its scene.
+"""Planning: survey the views of a job, and decide what can be left out for its scene.
 
-`planner.make_plan` surveys the views (`survey`), creates the objects to measure with (`context`), measures facts
-(`probe`, `facts`), and decides (`decide`): `choices` has each choice with its reasons, `cost` predicts seconds and
-bytes, `measuring` limits the time of measurements, and `plan` has the result.
+`survey` renders every view, `context` creates the objects that the job uses, `facts` has what is known then, `choices`
+each choice with its reasons, `measurement_choice` the measurements between the steps, and `plan` the result.
+`stylizing.planner` makes the plan, with a trial of the job that it predicts its cost from.
 """

@@ -1,13 +1,9 @@
-"""Choices of a plan, with the plan lines that state their reasons.
-
-Some choices depend only on the settings and a first measurement. Later measurements depend on these choices, so the
-probe makes them too.
-"""
+"""Choices of a plan, with the plan lines that state their reasons."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -20,12 +16,8 @@ from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.number_format import duration
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.cost import CostModel
-from sgsst_core.planning.facts import LEAST_VISITS, LaunchCost, Link, Probe, RasterCost
-from sgsst_core.planning.memory import OPTIMIZER_BYTES
-from sgsst_core.planning.ranks import RanksChoice
+from sgsst_core.planning.facts import Facts, LaunchCost, NetworkPixels, WeightCost
 from sgsst_core.planning.survey import Survey
-from sgsst_core.planning.view_costs import ViewData
 from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import CachedWeights, PlannedBackground, Precision, Settings
@@ -43,6 +35,15 @@ _SCAN_BACKGROUND: PlannedBackground = "palette"
 #: Speedup of convolutions from which on bfloat16 is recommended: at 1.9, less of the float32 loss is left than with
 #: float32 after the same seconds, on each of four pairs (docs/performance.md).
 _MUCH_FASTER = 1.5
+#: Minimum visits of a view for which caching its blend weights pays off on a CPU. Computing them takes as long as about
+#: three renders with gradient, and each use saves two thirds of a render. On GPUs, both times are measured.
+LEAST_VISITS = 5
+#: Minimum visits per view size for which a CUDA graph of the loss is considered at all.
+LEAST_GRAPH_VISITS = 20
+#: Minimum fraction of a step's time that additional ranks must save.
+LEAST_GAIN = 0.03
+#: Bytes per optimized Gaussian: color, gradient and two moments, float32.
+OPTIMIZER_BYTES = 4 * 3 * 4
 ANOTHER_LOSS = "differs from the paper's loss"
 
 
@@ -54,35 +55,35 @@ def rendered_gaussians(survey: Survey) -> Tensor:
     return survey.total_blend_weights > 0
 
 
-def about_gaussians(probe: Probe, rendered: Tensor, settings: Settings) -> list[Decision]:
+def about_gaussians(facts: Facts, rendered: Tensor, settings: Settings) -> list[Decision]:
     """Return the decisions about Gaussians that are not rendered, and about spherical harmonics."""
     unseen = int((~rendered).sum())
-    harmonics = _about_harmonics(probe, settings)
+    harmonics = _about_harmonics(facts, settings)
     if not unseen:
         return harmonics
     change = "keep their colors" if settings.unseen == "freeze" else "follow their neighbors' color change at the end"
     line = Decision(
         "unseen Gaussians",
-        f"{unseen:,} of {probe.scene.gaussians:,} are neither rendered nor optimized; they {change}",
+        f"{unseen:,} of {facts.gaussians:,} are neither rendered nor optimized; they {change}",
         "no pixel of any view shows them",
         bytes=unseen * OPTIMIZER_BYTES,
     )
     return [line, *harmonics]
 
 
-def _about_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
-    scene, item, attenuation = probe.scene, "spherical harmonics", settings.sh_attenuation
-    if not scene.sh_degree:
+def _about_harmonics(facts: Facts, settings: Settings) -> list[Decision]:
+    item, attenuation = "spherical harmonics", settings.sh_attenuation
+    if not facts.sh_degree:
         nothing = ": there is nothing to attenuate" if attenuation else ""
         return [Decision(item, "no view directions are computed", f"the scene has degree 0{nothing}")]
     if attenuation == 1:
         return [
             Decision(
                 item,
-                f"degrees 1 to {scene.sh_degree} are attenuated to 0, in the result too; no view directions are "
+                f"degrees 1 to {facts.sh_degree} are attenuated to 0, in the result too; no view directions are "
                 "computed",
                 "requested",
-                bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - 1) * 4,
+                bytes=facts.gaussians * 3 * ((facts.sh_degree + 1) ** 2 - 1) * 4,
                 error="colors no longer depend on the view direction",
             )
         ]
@@ -90,35 +91,35 @@ def _about_harmonics(probe: Probe, settings: Settings) -> list[Decision]:
         return [
             Decision(
                 item,
-                f"coefficients of degrees 1 to {scene.sh_degree} are multiplied by {1 - attenuation:.3g}, in the "
-                f"result too; evaluated up to degree {scene.used_degree}",
+                f"coefficients of degrees 1 to {facts.sh_degree} are multiplied by {1 - attenuation:.3g}, in the "
+                f"result too; evaluated up to degree {facts.used_degree}",
                 "requested",
                 error="colors depend less on the view direction",
             )
         ]
     lines = []
-    if scene.harmonics_energy >= _VIEW_DEPENDENT:
+    if facts.harmonics_energy >= _VIEW_DEPENDENT:
         advice = "unchanged, so highlights keep their tint; --sh-attenuation 1 removes it"
-        reason = f"{scene.harmonics_energy:.0%} of the color variance depends on the view direction"
+        reason = f"{facts.harmonics_energy:.0%} of the color variance depends on the view direction"
         lines = [Decision("view-dependent color", advice, reason)]
-    degree = scene.used_degree
-    if degree == scene.sh_degree:
+    degree = facts.used_degree
+    if degree == facts.sh_degree:
         return lines
     return [
         *lines,
         Decision(
             item,
             f"evaluated up to degree {degree}",
-            f"all coefficients of degrees {degree + 1} to {scene.sh_degree} are 0",
-            bytes=scene.gaussians * 3 * ((scene.sh_degree + 1) ** 2 - (degree + 1) ** 2) * 4,
+            f"all coefficients of degrees {degree + 1} to {facts.sh_degree} are 0",
+            bytes=facts.gaussians * 3 * ((facts.sh_degree + 1) ** 2 - (degree + 1) ** 2) * 4,
         ),
     ]
 
 
-def about_views(probe: Probe) -> list[Decision]:
+def about_views(facts: Facts) -> list[Decision]:
     """Return the decision about views that show nothing."""
-    total = len(probe.sizes)
-    blind = total - len(probe.survey.covered)
+    total = len(facts.sizes)
+    blind = total - len(facts.survey.covered)
     return [Decision(VIEWS, f"{blind} of {total} are skipped", "they see no Gaussian")] if blind else []
 
 
@@ -131,17 +132,16 @@ def position_weights(survey: Survey, settings: Settings) -> tuple[bool, list[Dec
     return True, [line]
 
 
-def about_uncovered_pixels(model: CostModel, probe: Probe) -> list[Decision]:
-    """Return the decision about uncovered pixels that skip the network."""
-    work = model.work
-    if work.pixels >= work.without_region:
+def about_uncovered_pixels(pixels: NetworkPixels, survey: Survey, seconds: float) -> list[Decision]:
+    """Return the decision about uncovered pixels that skip the network, given the seconds of those that do not."""
+    if pixels.all >= pixels.without_region:
         return []
     return [
         Decision(
             "uncovered pixels",
-            f"{1 - work.pixels / work.without_region:.0%} of the pixels skip the network",
-            _uncovered(probe.survey),
-            seconds=(work.without_region - work.pixels) * probe.network.rate.both,
+            f"{1 - pixels.all / pixels.without_region:.0%} of the pixels skip the network",
+            _uncovered(survey),
+            seconds=(pixels.without_region / pixels.all - 1) * seconds,
         )
     ]
 
@@ -163,18 +163,24 @@ def training_background(settings: Settings, *, scan: bool) -> PlannedBackground:
 
 
 def about_training_background(
-    background: PlannedBackground, survey: Survey, settings: Settings, model: CostModel
+    background: PlannedBackground, survey: Survey, settings: Settings, seconds: float
 ) -> list[Decision]:
-    """Return the decision about the training background, unless it is the job's own background."""
+    """Return the decision about the training background, unless it is the job's own background.
+
+    Args:
+        background: Training background.
+        survey: Survey of the views.
+        settings: Settings of the job.
+        seconds: Seconds per step for recomputing content features.
+    """
     if background == "background":
         return []
     color = {"random": "a random color", "palette": "the color of a random pixel of the style"}[background]
     reason = "requested"
     if settings.training_background == "auto":
         reason = f"{_uncovered(survey)}: colors would be fitted to a fixed background"
-    cost = model.views.content.always + model.views.images.always
-    if cost:
-        reason += f"; content features are recomputed with it, {duration(cost, ' ')} per step"
+    if settings.content_weight:
+        reason += f"; content features are recomputed with it, {duration(seconds, ' ')} per step"
     return [Decision("training background", f"{color} each time", reason, error=ANOTHER_LOSS)]
 
 
@@ -303,34 +309,42 @@ class Visits:
 # --- network -------------------------------------------------------------------------------------------------------
 
 
-def about_network(model: CostModel, probe: Probe, settings: Settings) -> list[Decision]:
-    """Return the decisions about layers, style loss, content, partition and forward passes."""
-    network, work = probe.network, model.work
-    layers = f"up to {network.deepest}, the deepest one used"
+def about_network(
+    pixels: NetworkPixels, facts: Facts, settings: Settings, matching: float, forward: float
+) -> list[Decision]:
+    """Return the decisions about layers, style loss, content, partition and forward passes.
+
+    Args:
+        pixels: Pixels through the network.
+        facts: Facts about the job.
+        settings: Settings of the job.
+        matching: Seconds per view for the nearest-neighbor search.
+        forward: Seconds per view for the network's forward pass.
+    """
+    layers = f"up to {facts.deepest}, the deepest one used"
     lines = [Decision("network layers", layers, "the loss reads no deeper layer")]
     if settings.style_loss != "sos":
         weight = NEAREST_WEIGHTS[settings.style_loss]
         what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
         distance = (
             f"the distance of relu3 features to the nearest of at most {MAX_VECTORS:,} style features {what}, with "
-            f"weight {weight:.3g}; the search takes {duration(work.pairs * network.rate.search, ' ')} per view"
+            f"weight {weight:.3g}; the search takes {duration(matching, ' ')} per view"
         )
         lines.append(Decision("style loss", distance, f"{settings.style_loss} was requested", error=ANOTHER_LOSS))
     if not settings.content_weight:
         lines.append(Decision("content", "no content features are computed or cached", "its weight is 0"))
-    memory = f"the {memory_for('activations', probe.machine.memory) / 1e9:.1f} GB for activations"
-    if work.tiles <= 1:
+    memory = f"the {memory_for('activations', facts.machine.memory) / 1e9:.1f} GB for activations"
+    if pixels.tiles <= 1:
         lines.append(Decision("partition", "none: the network takes each view as a whole", f"it fits in {memory}"))
     else:
-        tiles = f"up to {work.tiles} tiles per view"
+        tiles = f"up to {pixels.tiles} tiles per view"
         lines.append(Decision("partition", tiles, f"larger tiles would not fit in {memory}"))
-    if work.again:
-        again = work.again / work.pixels
+    if pixels.again:
+        again = pixels.again / pixels.all
         reason = f"activations of {1 - again:.0%} of the pixels fit in {memory}"
         return [*lines, Decision("second forward", f"for {again:.0%} of the pixels", reason)]
     none = "none: activations are cached between statistics and gradient"
-    saved = work.pixels * network.rate.features
-    return [*lines, Decision("second forward", none, f"they fit in {memory}", seconds=saved)]
+    return [*lines, Decision("second forward", none, f"they fit in {memory}", seconds=forward)]
 
 
 def precision_of(requested: Precision, ratio: float | None) -> Precision:
@@ -340,14 +354,14 @@ def precision_of(requested: Precision, ratio: float | None) -> Precision:
 
     Args:
         requested: Requested precision.
-        ratio: See `NetworkFacts.precision_ratio`.
+        ratio: See `Facts.precision_ratio`.
     """
     return requested if ratio is not None and ratio > 1 else "float32"
 
 
-def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decision]]:
+def precision(facts: Facts, settings: Settings) -> tuple[Precision, list[Decision]]:
     """Choose the network's precision. If float32 was requested, at most recommend bfloat16."""
-    requested, ratio, error = settings.precision, probe.network.precision_ratio, probe.network.gradient_error
+    requested, ratio, error = settings.precision, facts.precision_ratio, facts.gradient_error
     chosen = precision_of(requested, ratio)
     if requested == "float32":
         if ratio is None or ratio < _MUCH_FASTER:
@@ -371,13 +385,22 @@ def precision(probe: Probe, settings: Settings) -> tuple[Precision, list[Decisio
     return chosen, [Decision("precision", what, f"requested, {ratio:.1f} times faster here", error=known)]
 
 
-def launches(probe: Probe, settings: Settings, visits: Visits, phases: int) -> tuple[bool, list[Decision]]:
-    """Choose whether the loss of a view is captured as a CUDA graph on a GPU, one per image size and phase."""
-    cost = probe.launches
-    if probe.machine.device != "cuda":
+def launches(
+    facts: Facts, settings: Settings, visits: Visits, phases: int, cost: LaunchCost | None
+) -> tuple[bool, list[Decision]]:
+    """Choose whether the loss of a view is captured as a CUDA graph on a GPU, one per image size and phase.
+
+    Args:
+        facts: Facts about the job.
+        settings: Settings of the job.
+        visits: Visits of the schedule.
+        phases: Number of phases.
+        cost: Cost of launching a view's loss; None if the views are visited too rarely to measure it.
+    """
+    if facts.machine.device != "cuda":
         return False, []
     visited = f"views of one size are visited about {visits.of_a_size:,} times"
-    if probe.machine.ranks > math.gcd(settings.views_per_step, probe.machine.ranks):  # several ranks share a view
+    if divides_views(facts.machine.ranks, settings):
         reason = "a graph cannot contain communication between workers"
     elif cost is None:
         reason = visited
@@ -395,6 +418,11 @@ def launches(probe: Probe, settings: Settings, visits: Visits, phases: int) -> t
     return False, [Decision("launches", "kernel by kernel", reason)]
 
 
+def divides_views(ranks: int, settings: Settings) -> bool:
+    """Return whether several of these ranks work on the same view."""
+    return ranks > math.gcd(settings.views_per_step, ranks)
+
+
 def _launch_times(cost: LaunchCost) -> str:
     return (
         f"measured per view: {1e3 * cost.replayed:.3g} ms as a graph, {1e3 * cost.seconds:.3g} ms kernel by kernel, "
@@ -405,89 +433,101 @@ def _launch_times(cost: LaunchCost) -> str:
 # --- rasterizer ----------------------------------------------------------------------------------------------------
 
 
-def blend_weights(probe: Probe, settings: Settings, visits: Visits) -> tuple[CachedWeights, Decision]:
+def blend_weights(facts: Facts, settings: Settings, visits: Visits) -> tuple[CachedWeights, Decision]:
     """Choose the format of cached blend weights: float32 or half precision, as fits; none if it saves no time."""
-    raster, item = probe.raster, "blend weights"
-    why_not = _why_not_cached(probe, settings, visits)
+    cost, item = facts.weights, "blend weights"
+    why_not = _why_not_cached(facts, settings, visits)
     if why_not is not None:
-        return "none", Decision(item, "recomputed in every step", why_not, bytes=raster.bytes)
-    budget, cached = memory_for("rasterizer", probe.machine.memory), settings.cached_weights
+        return "none", Decision(item, "recomputed in every step", why_not, bytes=cost.bytes)
+    budget, cached = memory_for("rasterizer", facts.machine.memory), settings.cached_weights
     if cached == "auto":
-        cached = "float32" if (raster.bytes or 0) <= budget or settings.preset == "paper" else "half"
-    name, size, error = "float32", raster.bytes or 0, "none"
+        cached = "float32" if (cost.bytes or 0) <= budget or settings.preset == "paper" else "half"
+    name, size, error = "float32", cost.bytes or 0, "none"
     if cached == "half":
-        name, size = "half precision", raster.half_bytes or 0
+        name, size = "half precision", cost.half_bytes or 0
         error = "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
-    fraction = ViewData(0.0, size, budget, len(probe.survey.covered)).cached
-    portion = "all" if fraction == 1 else f"{fraction:.0%} of the views'"
+    of_a_view = size / len(facts.survey.covered)
+    portion = "all" if size <= budget else f"{budget // of_a_view * of_a_view / size:.0%} of the views'"
     reason = f"they take {size / 1e9:.2f} GB for all views; {budget / 1e9:.1f} GB are available for blend weights"
-    if RASTERIZERS[probe.rasterizer].on_gpu and raster.cached_seconds is not None:
-        reason += f"; {_weight_times(raster)}"
-    saved = (raster.seconds - raster.cached_seconds) * fraction if raster.cached_seconds else None
-    return cached, Decision(item, f"{portion} cached in {name}", reason, seconds=saved, error=error)
+    if RASTERIZERS[facts.rasterizer].on_gpu and cost.cached_seconds is not None:
+        reason += f"; {_weight_times(cost)}"
+    return cached, Decision(item, f"{portion} cached in {name}", reason, error=error)
 
 
-def _why_not_cached(probe: Probe, settings: Settings, visits: Visits) -> str | None:
+def _why_not_cached(facts: Facts, settings: Settings, visits: Visits) -> str | None:
     """Return the reason why blend weights are not cached; None if they are."""
-    raster, visited = probe.raster, f"a view is visited {visits.of_a_view:.1f} times"
+    cost, visited = facts.weights, f"a view is visited {visits.of_a_view:.1f} times"
     if settings.cached_weights == "none":
         return "requested"
-    if raster.bytes is None or raster.half_bytes is None:
-        return f"{RASTERIZERS[probe.rasterizer].title} cannot cache them"
+    if cost.bytes is None or cost.half_bytes is None:
+        return f"{RASTERIZERS[facts.rasterizer].title} cannot cache them"
     if settings.cached_weights != "auto":
         return None
-    if not RASTERIZERS[probe.rasterizer].on_gpu:
+    if not RASTERIZERS[facts.rasterizer].on_gpu:
         return visited if visits.of_a_view < LEAST_VISITS else None
-    if raster.cached_seconds is None:
+    if cost.cached_seconds is None:
         return "the weights of one view do not fit"
-    if raster.least_visits is None:
-        return f"cached weights are not faster here: {_weight_times(raster)}"
-    if visits.of_a_view < raster.least_visits:
-        return f"{visited}, but caching pays off from {raster.least_visits:.1f} visits; {_weight_times(raster)}"
+    if cost.least_visits is None:
+        return f"cached weights are not faster here: {_weight_times(cost)}"
+    if visits.of_a_view < cost.least_visits:
+        return f"{visited}, but caching pays off from {cost.least_visits:.1f} visits; {_weight_times(cost)}"
     return None
 
 
-def _weight_times(raster: RasterCost) -> str:
-    cached, recomputed = 1e3 * (raster.cached_seconds or 0), 1e3 * raster.seconds
+def _weight_times(cost: WeightCost) -> str:
+    cached, recomputed = 1e3 * (cost.cached_seconds or 0), 1e3 * cost.seconds
     return f"measured per view: {cached:.3g} ms cached, {recomputed:.3g} ms recomputed"
 
 
-def about_rasterizer(probe: Probe, *, cached: bool) -> list[Decision]:
+def about_rasterizer(facts: Facts, *, cached: bool) -> list[Decision]:
     """Return the decision about the rasterizer on a GPU; on the CPU there is no choice.
 
     Args:
-        probe: Measured facts.
+        facts: Facts about the job.
         cached: Whether blend weights are cached.
     """
-    if probe.machine.device != "cuda":
+    if facts.machine.device != "cuda":
         return []
-    used = RASTERIZERS[probe.rasterizer]
+    used = RASTERIZERS[facts.rasterizer]
     how = f"{used.title} on the GPU" if used.on_gpu else "on the CPU"
     if cached:
         how += ", with cached blend weights"
-    problems = probe.machine.problems.items()
+    problems = facts.machine.problems.items()
     reasons = [f"{RASTERIZERS[name].title} cannot be used: {problem}" for name, problem in problems]
     if used.on_gpu:
         reasons.append(f"{used.title} works here")
     return [Decision("rasterizer", how, "; ".join(reasons) or "requested")]
 
 
-def about_shared_gpus(probe: Probe) -> list[Decision]:
+def about_shared_gpus(facts: Facts) -> list[Decision]:
     """Return the decision about ranks that share a GPU, if there are any."""
-    if probe.machine.device == "cpu" or probe.machine.sharing == 1:
+    if facts.machine.device == "cpu" or facts.machine.sharing == 1:
         return []
-    reason = f"{probe.machine.sharing} of them share a GPU, which NCCL does not support; give each a GPU of its own"
+    reason = f"{facts.machine.sharing} of them share a GPU, which NCCL does not support; give each a GPU of its own"
     return [Decision("communication", "ranks exchange data over the CPU (gloo)", reason)]
 
 
-def about_ranks(choice: RanksChoice, available: int, link: Link) -> Decision:
-    """Return the decision about the number of ranks."""
-    speed = f"{choice.speed_up:.2f} times as fast as one"
-    measured = f"{link.bandwidth / 1e9:.2g} GB/s and {link.latency * 1e6:.0f} microseconds between ranks were measured"
-    if choice.ranks == available:
-        return Decision("ranks", f"all {available} take part, {speed}", measured)
-    other = choice.seconds[1] / choice.seconds[available]
-    reason = (
-        f"all of them would be {other:.2f} times as fast, because the others would only add communication; {measured}"
-    )
-    return Decision("ranks", f"{choice.ranks} of {available} take part, {speed}", reason)
+def choose_ranks(seconds: Mapping[int, float]) -> int:
+    """Return the smallest number of ranks whose seconds per step are within `LEAST_GAIN` of the best."""
+    return min(ranks for ranks, own in seconds.items() if own <= min(seconds.values()) * (1 + LEAST_GAIN))
+
+
+def about_ranks(chosen: int, seconds: Mapping[int, float], available: int) -> list[Decision]:
+    """Return the decision about the number of ranks, unless there is only one.
+
+    Args:
+        chosen: Chosen number of ranks.
+        seconds: Measured mean seconds of a step by number of ranks.
+        available: Number of available ranks.
+    """
+    if available == 1:
+        return []
+    measured = ", ".join(f"{duration(own, ' ')} on {ranks}" for ranks, own in seconds.items())
+    if 1 not in seconds:
+        return [Decision("ranks", f"all {available} take part", f"requested; a step takes {measured}")]
+    speed, measured = f"{seconds[1] / seconds[chosen]:.2f} times as fast as one", f"a step takes {measured}"
+    if chosen == available:
+        return [Decision("ranks", f"all {available} take part, {speed}", measured)]
+    other = seconds[1] / seconds[available]
+    reason = f"all of them would be {other:.2f} times as fast, because the others would only add communication"
+    return [Decision("ranks", f"{chosen} of {available} take part, {speed}", f"{reason}; {measured}")]

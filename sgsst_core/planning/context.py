@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from sgsst_core.budget import default_memory_limit, memory_for
 from sgsst_core.features.network_weights import BackboneWeights
@@ -17,6 +19,8 @@ from sgsst_core.features.vgg import (
     has_tf32,
     use_whole_float32,
 )
+from sgsst_core.loss.gradient_error import Difference
+from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.choices import precision_of
@@ -26,7 +30,10 @@ from sgsst_core.rasterizer import Rasterizer, gpu_rasterizers, make_rasterizer, 
 from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.pyramid import downscale
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Precision, Settings
+from sgsst_core.style import Style
 from sgsst_core.timing import Timer
 
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16}
@@ -35,6 +42,8 @@ _CHANNELS: dict[Device, int] = {"cpu": 128, "cuda": 256}
 _SIDE: dict[Device, int] = {"cpu": 24, "cuda": 256}
 #: Minimum total seconds of the repetitions, so that the launch time is negligible.
 _LEAST_SECONDS: dict[Device, float] = {"cpu": 0.0, "cuda": 5e-3}
+#: Maximum longer side of the view on which another precision is compared with float32.
+_COMPARED_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 2048}
 #: Number of measurements, of which the fastest counts: another process can interrupt one.
 _MEASUREMENTS = 5
 
@@ -50,7 +59,7 @@ class PlanningContext:
         machine: Facts about the machine.
         weights: Weights of the network.
         network: Network in the precision in which it will run.
-        precision_ratio: See `NetworkFacts`.
+        precision_ratio: See `Facts`.
         rasterizer: Rasterizer of the whole scene that computes blend weights.
         sh_degree: SH degree of the original scene.
     """
@@ -64,6 +73,11 @@ class PlanningContext:
     precision_ratio: float | None
     rasterizer: Rasterizer
     sh_degree: int
+
+    @property
+    def precision(self) -> Precision:
+        """Precision of the network."""
+        return precision_of(self.settings.precision, self.precision_ratio)
 
 
 def equip(
@@ -204,3 +218,41 @@ def seconds_of(run: Callable[[int], float], least: float) -> float:
     while (seconds := run(times)) < least:
         times *= 2
     return seconds / times
+
+
+def gradient_error(context: PlanningContext, camera: Camera) -> Difference | None:
+    """Compare the pixel gradient of a view with that of the same network in full float32, for a synthetic style.
+
+    Args:
+        context: Objects to measure with.
+        camera: View, which is rendered unstylized and then downscaled.
+
+    Returns:
+        Difference of the gradients; None if the network runs in float32.
+    """
+    network, rasterizer = context.network, context.rasterizer
+    if network.precision == "float32":
+        return None
+    colors = scene_colors(context.scene, camera)
+    image = rasterizer.render(colors.to(rasterizer.device), camera).to(network.device)
+    longer, shorter = max(image.shape[:2]) / _COMPARED_SIDE[context.machine.device], min(image.shape[:2])
+    image = downscale(
+        image,
+        min(max(0, math.ceil(math.log2(longer))), shorter.bit_length() - 1),
+    )
+    reference = FeatureNetwork(context.weights, network.layers, torch.float32, network.device)
+    memory, gradients = memory_for("activations", context.machine.memory), []
+    for each in (network, reference):
+        loss = SosLoss(each, content_weight=0, style_loss=context.settings.style_loss, memory=memory)
+        style = loss.targets.of_style(Style.of(soft_image(max(image.shape[:2]))), (image.shape[0], image.shape[1]))
+        result = loss.evaluate(image, style, loss.targets.of_view(image), [0])
+        assert result.image_gradient is not None
+        gradients.append(result.image_gradient)
+    return Difference.of(*gradients)
+
+
+def soft_image(side: int) -> Tensor:
+    """Return a smooth synthetic image [side, side, 3] in 0..1: fixed random colors 16 pixels apart, interpolated."""
+    cells = torch.rand((1, 3, side // 16 + 1, side // 16 + 1), generator=torch.Generator().manual_seed(0))
+    image = torch.nn.functional.interpolate(cells, size=(side, side), mode="bilinear")[0]
+    return image.permute(1, 2, 0).contiguous()

@@ -2,135 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from torch import Tensor
 
+from sgsst_core.features.partition import Rectangle, computed_twice, scaled_region
 from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.graphs import FIRST_VISITS
+from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.plan import Device
 from sgsst_core.planning.survey import Survey
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.rasterizer.base import Precision as WeightPrecision
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.scene.camera import Camera, spread
+from sgsst_core.settings import Settings
+from sgsst_core.timing import wait_for
 
-#: Minimum visits of a view for which caching its blend weights pays off on a CPU. Computing them takes as long as about
-#: three renders with gradient, and each use saves two thirds of a render. On GPUs, both times are measured
-#: (`RasterCost.least_visits`).
-LEAST_VISITS = 5
+#: Precisions of cached blend weights, the exact one first, and number of views whose weights are counted.
+_FORMATS: tuple[WeightPrecision, ...] = ("float32", "half")
+_SAMPLED_VIEWS = 3
 #: Minimum fraction of the time of a view's loss that a CUDA graph must save to be worth its memory.
 LEAST_SAVING = 0.03
 
 
 @dataclass(frozen=True)
-class SceneFacts:
-    """Facts about the scene.
+class WeightCost:
+    """Cost of caching the views' blend weights. Times are measured on a GPU only.
 
     Attributes:
-        gaussians: Number N of Gaussians.
-        sh_degree: SH degree of its file.
-        used_degree: Highest SH degree with a non-zero coefficient after SH attenuation, among the rendered Gaussians.
-        held_degree: SH degree in memory; 0 if coefficients stay in the file.
-        harmonics_energy: See `spherical_harmonics.harmonics_energy`, with the views' blend weights.
-    """
-
-    gaussians: int
-    sh_degree: int
-    used_degree: int
-    held_degree: int
-    harmonics_energy: float = 0.0
-
-
-@dataclass(frozen=True)
-class Rate:
-    """Seconds per pixel of the loss of an image, or per partition tile.
-
-    Attributes:
-        features: Seconds of the feature network's forward pass alone.
-        forward: Seconds of the loss, which includes statistics.
-        both: Seconds of the loss and its gradient.
-        search: Seconds per pair of position and style vector in the nearest-neighbor search; 0 if features are not
-            matched.
-    """
-
-    features: float
-    forward: float
-    both: float
-    search: float = 0.0
-
-    def times(self, pixels: int) -> Rate:
-        """Return the time of a number of pixels."""
-        return Rate(pixels * self.features, pixels * self.forward, pixels * self.both, self.search)
-
-
-@dataclass(frozen=True)
-class NetworkFacts:
-    """Facts about the feature network, in the precision in which it will run.
-
-    Attributes:
-        halo: Pixels around a partition tile.
-        held_bytes: Bytes per pixel stored by a forward pass for the backward pass.
-        working_bytes: Additional bytes per pixel needed by a pass.
-        content_bytes: Bytes per cell of the content layer.
-        rate: Time per pixel.
-        fixed: Constant time of a partition tile, measured on one with almost no pixels. On a GPU, it is the time to
-            launch its kernels. Not measured, and 0, for a single rank on a CPU.
-        precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision, or in bfloat16 if
-            float32 was requested; None if it is unavailable.
-        gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
-        vector_channels: Length of a vector that is matched with the style's; 0 if nothing is matched.
-        deepest: Name of the deepest layer in use.
-        largest_tile: Maximum pixels of a partition tile; None for no limit.
-    """
-
-    halo: int
-    held_bytes: float
-    working_bytes: float
-    content_bytes: int
-    rate: Rate
-    fixed: Rate = Rate(0.0, 0.0, 0.0)
-    precision_ratio: float | None = None
-    gradient_error: Difference | None = None
-    vector_channels: int = 0
-    deepest: str = "relu5_1"
-    largest_tile: int | None = None
-
-
-@dataclass(frozen=True)
-class RasterCost:
-    """Cost of the views' blend weights.
-
-    Attributes:
-        seconds: Time in seconds of a render and its gradient with recomputed weights, mean over some views.
-        cached_seconds: Time in seconds of a render and its gradient with cached weights; None if not measured, for
-            example because not even one view's weights fit in memory.
         bytes: Size in bytes of the cached weights of all views, float32; None if the rasterizer cannot cache them.
         half_bytes: Size in bytes of the cached weights of all views in half precision; None as for `bytes`.
-        caching_seconds: Time in seconds to compute a view's cached weights; None on the CPU, where it is not measured.
-        first_seconds: Additional time in seconds of a view's first render, which computes its tile intersections.
-        intersection_bytes: Mean size in bytes of a view's tile intersections; 0 if unknown.
-        max_pairs: Largest number of pairs of Gaussian and raster tile that a GPU sorts for a view; 0 if unknown.
-        colors_seconds: Time in seconds for the contribution of spherical harmonics to the colors of a view.
-        fixed: Portion of `seconds` that does not depend on the number of pixels. It is measured on a single raster tile
-            if there are several ranks, each of which renders a part of a view; 0 otherwise.
-        first_fixed: Such a portion of `first_seconds`.
+        seconds: Time in seconds of a view's render and gradient with recomputed weights.
+        cached_seconds: Time in seconds of a view's render and gradient with cached weights; None if the weights of a
+            view do not fit in memory.
+        caching_seconds: Time in seconds to compute a view's cached weights.
     """
 
-    seconds: float
-    cached_seconds: float | None = None
     bytes: int | None = None
     half_bytes: int | None = None
-    caching_seconds: float | None = None
-    first_seconds: float = 0.0
-    intersection_bytes: int = 0
-    max_pairs: int = 0
-    colors_seconds: float = 0.0
-    fixed: float = 0.0
-    first_fixed: float = 0.0
+    seconds: float = 0.0
+    cached_seconds: float | None = None
+    caching_seconds: float = 0.0
 
     @property
     def least_visits(self) -> float | None:
         """Minimum visits of a view for which cached weights save time; None if they never do, or if not measured."""
-        if self.cached_seconds is None or self.caching_seconds is None or self.cached_seconds >= self.seconds:
+        if self.cached_seconds is None or self.cached_seconds >= self.seconds:
             return None
         return self.caching_seconds / (self.seconds - self.cached_seconds)
 
@@ -188,60 +109,113 @@ class Machine:
 
 
 @dataclass(frozen=True)
-class Link:
-    """Connection between ranks.
+class Facts:
+    """All facts from which the decisions before the trial follow, apart from the settings.
 
     Attributes:
-        bandwidth: Bytes per second that a rank sends while receiving as many.
-        latency: Time in seconds of the shortest message from one rank to the next.
+        gaussians: Number N of Gaussians.
+        sh_degree: SH degree of the scene's file.
+        used_degree: Highest SH degree with a non-zero coefficient after SH attenuation, among the rendered Gaussians.
+        harmonics_energy: See `spherical_harmonics.harmonics_energy`, with the views' blend weights.
+        sizes: (height, width) of each view.
+        survey: Survey of the views.
+        machine: Facts about the machine.
+        rasterizer: Rasterizer that computes blend weights.
+        weights: Cost of cached blend weights.
+        frozen: [N] bool, frozen Gaussians; None if there are none.
+        deepest: Name of the deepest layer in use.
+        precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision, or in bfloat16 if
+            float32 was requested; None if it is unavailable.
+        gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
     """
 
-    bandwidth: float
-    latency: float
-
-    def all_gather(self, size: int, ranks: int) -> float:
-        """Return the time in seconds of an all-gather of `size` bytes in total; a reduce-scatter takes as long."""
-        return (ranks - 1) * (self.latency + size / ranks / self.bandwidth)
-
-    def all_reduce(self, size: int, ranks: int) -> float:
-        """Return the time in seconds of an all-reduce of `size` bytes per rank."""
-        return 2 * self.all_gather(size, ranks)
+    gaussians: int
+    sh_degree: int
+    used_degree: int
+    harmonics_energy: float
+    sizes: tuple[Size, ...]
+    survey: Survey
+    machine: Machine
+    rasterizer: str
+    weights: WeightCost
+    frozen: Tensor | None = None
+    deepest: str = "relu5_1"
+    precision_ratio: float | None = None
+    gradient_error: Difference | None = None
 
 
 @dataclass(frozen=True)
-class Probe:
-    """All facts from which decisions follow, apart from the settings.
+class NetworkPixels:
+    """Pixels through the network in one iteration on a single rank, mean over views.
 
     Attributes:
-        scene: Facts about the scene.
-        sizes: (height, width) of each view.
-        survey: Survey of the views.
-        network: Facts about the feature network.
-        rasterizer: Timed rasterizer, which computes blend weights.
-        raster: Cost of rendering with recomputed and with cached weights.
-        machine: Facts about the machine.
-        link: Connection between ranks.
-        process_bytes: Physical memory of the process in bytes, with scene and network loaded.
-        device_bytes: GPU memory in bytes, with scene and network loaded; 0 on a CPU.
-        launches: Cost of launching a view's loss on a GPU; None on a CPU, or if no decision depends on it.
-        styles: Number of images in the style mixture.
-        style_bytes: Size of the largest style image in bytes, which is copied while it is resized.
-        frozen: [N] bool, frozen Gaussians; None if there are none.
-        maps: Number of maps of regions, and of content weights, that are rendered in each view.
+        all: Pixels through the forward and the backward pass, including halos.
+        again: Pixels through a second forward pass, because their activations do not fit in memory.
+        without_region: Value of `all` if uncovered pixels were processed too.
+        tiles: Maximum number of tiles of a view at one scale.
+        held: Maximum number of pixels in memory at a time, including the temporary memory of a pass in units of pixels.
     """
 
-    scene: SceneFacts
-    sizes: tuple[Size, ...]
-    survey: Survey
-    network: NetworkFacts
-    rasterizer: str
-    raster: RasterCost
-    machine: Machine
-    link: Link
-    process_bytes: int
-    device_bytes: int = 0
-    launches: LaunchCost | None = None
-    styles: int = 1
-    style_bytes: int = 0
-    frozen: Tensor | None = None
-    maps: int = 0
+    all: float = 0.0
+    again: float = 0.0
+    without_region: float = 0.0
+    tiles: int = 0
+    held: float = 0.0
+
+    @staticmethod
+    def of(views: Sequence[tuple[Size, Rectangle | None]], tiling: Tiling) -> NetworkPixels:
+        """Count the pixels of views of some sizes (height, width), of which only a rectangle may be covered."""
+        pixels = again = without = held = 0.0
+        tiles = 0
+        for size, region in views:
+            for scale in tiling.scales(size):
+                scaled = (size[0] >> scale, size[1] >> scale)
+                areas = _areas(tiling, scaled, region and scaled_region(region, scale, scaled))
+                flags = tiling.cached(areas)
+                twice = computed_twice(areas, flags)
+                pixels, again, tiles = pixels + sum(areas), again + twice, max(tiles, len(areas))
+                without += sum(_areas(tiling, scaled))
+                once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
+                passing = sum(areas) - twice + tiling.working * max(areas, default=0)
+                held = max(held, passing, (1 + tiling.working) * once)
+        return NetworkPixels(pixels / len(views), again / len(views), without / len(views), tiles, held)
+
+
+def _areas(tiling: Tiling, size: Size, region: Rectangle | None = None) -> list[int]:
+    """Return the pixels of each partition tile, with its halo, of a scaled view."""
+    return [tile.outer.pixels for tile in tiling.tiles(size, region)]
+
+
+def weight_cost(
+    rasterizer: Rasterizer, cameras: Sequence[Camera], settings: Settings, budget: int, least_visits: float
+) -> WeightCost:
+    """Count the blend weights of a few evenly spread views; on a GPU, also time a view with and without cached weights.
+
+    Args:
+        rasterizer: Rasterizer that computes the weights.
+        cameras: Cameras of the views that see anything.
+        settings: Settings of the job.
+        budget: Memory budget for blend weights in bytes.
+        least_visits: Visits of a view below which weights are not cached on a CPU, so that one view is enough.
+    """
+    if not rasterizer.can_cache:
+        return WeightCost()
+    sample = spread(cameras, _SAMPLED_VIEWS)
+    middle = sample[len(sample) // 2]
+    visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(cameras)
+    if not rasterizer.on_gpu and settings.cached_weights == "auto" and visits < least_visits:
+        sample = [middle]
+    sizes = [[counted.nbytes(format_) for format_ in _FORMATS] for counted in map(rasterizer.count_weights, sample)]
+    total, half = (sum(column) * len(cameras) // len(sample) for column in zip(*sizes, strict=True))
+    fitting = [format_ for format_, size in zip(_FORMATS, sizes[len(sample) // 2], strict=True) if size <= budget]
+    if not rasterizer.on_gpu or not fitting:
+        return WeightCost(total, half)
+    caching = 0.0
+    for _ in range(2):  # the first run compiles
+        started = time.perf_counter()
+        rasterizer.count_weights(middle).store(fitting[0])
+        wait_for(rasterizer.device)
+        caching = time.perf_counter() - started
+    cached = CachedRasterizer(rasterizer.scene, precision=fitting[0], uncached=rasterizer)
+    recomputed, applied = (each.step_seconds(middle, visits=2)[1] for each in (rasterizer, cached))
+    return WeightCost(total, half, recomputed, applied, caching)

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
 
+from sgsst_core.budget import Cache
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
 from sgsst_core.scene.camera import Camera
@@ -72,23 +71,6 @@ class CountedWeights(Protocol):
     def store(self, precision: Precision) -> CachedWeights:
         """Compute the weights again and store them."""
         ...
-
-
-@dataclass(frozen=True)
-class RenderCost:
-    """Measured cost of rendering views with gradient.
-
-    Attributes:
-        seconds: Time in seconds of one render with gradient of each prepared view.
-        preparation_seconds: Mean time in seconds to prepare a view, for example to build its tile intersections.
-        preparation_bytes: Mean size in bytes of the prepared data; 0 if unknown.
-        max_pairs: Largest number of pairs of Gaussian and raster tile that a GPU sorts for a view; 0 if unknown.
-    """
-
-    seconds: list[float]
-    preparation_seconds: float
-    preparation_bytes: int
-    max_pairs: int = 0
 
 
 class Rasterizer(ABC):
@@ -254,17 +236,13 @@ class Rasterizer(ABC):
         Only rasterizers whose data share a memory budget with cached weights need this.
         """
 
+    @property
+    def caches(self) -> dict[str, Cache[CameraKey, Any]]:
+        """Caches of data of views: "weights" and "intersections", if there are any."""
+        return {}
+
     def forget_views(self) -> None:
         """Drop all cached data of views, because other views or other rectangles of them are rendered from now on."""
-
-    # --- cost ---
-
-    def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
-        """Measure the cost of rendering some views with gradient."""
-        timed = [self.step_seconds(camera, visits=2) for camera in cameras]
-        # Minimum, because one of them may include compilation or waiting for memory.
-        preparation = max(min(first - later for first, later in timed), 0.0)
-        return RenderCost([later for _, later in timed], preparation, 0)
 
     def step_seconds(self, camera: Camera, visits: int = 1) -> list[float]:
         """Return the time in seconds of each of several renders with gradient.

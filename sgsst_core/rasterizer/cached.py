@@ -8,7 +8,7 @@ applies them, in a layout for this device.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -22,7 +22,6 @@ from sgsst_core.rasterizer.base import (
     CountedWeights,
     Precision,
     Rasterizer,
-    RenderCost,
     camera_key,
 )
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -124,6 +123,15 @@ class CachedRasterizer(Rasterizer):
                 self._cached.add(key, lambda: self._counted(camera))
             return self._serving(key) is not None
 
+    @property
+    def caches(self) -> dict[str, Cache[CameraKey, Any]]:
+        """Caches of blend weights, "weights", and those of the uncached rasterizer."""
+        return {"weights": self._cached, **self.uncached.caches}
+
+    def intersection_budget(self, weights: int) -> int | None:
+        """Return the budget for tile intersections beside `weights` bytes of cached weights; None for no limit."""
+        return None if self.max_bytes is None else max(self.max_bytes - weights, self.min_intersection_bytes)
+
     def forget_views(self) -> None:
         """Drop the weights and the tile intersections of all views."""
         self._cached.clear()
@@ -156,10 +164,6 @@ class CachedRasterizer(Rasterizer):
         """
         return self.uncached.survey(camera)
 
-    def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
-        """Measure the cost of rendering some views with gradient without cached weights."""
-        return self.uncached.probe_cost(cameras)
-
     def _render(self, colors: Tensor, camera: Camera) -> Tensor:
         cached = self._cached_for(camera)
         return self.uncached.render(colors, camera) if cached is None else cached.render(colors)
@@ -190,9 +194,9 @@ class CachedRasterizer(Rasterizer):
 
         def make() -> CachedWeights:
             weights = counted.store(self.precision)
-            if self.max_bytes is not None:
-                left = self.max_bytes - self.cached_bytes - weights.nbytes
-                self.uncached.release_view(camera, max(left, self.min_intersection_bytes))
+            budget = self.intersection_budget(self.cached_bytes + weights.nbytes)
+            if budget is not None:
+                self.uncached.release_view(camera, budget)
             return weights
 
         return counted.nbytes(self.precision), make

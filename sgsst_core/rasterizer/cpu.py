@@ -7,8 +7,6 @@ images are therefore bit-identical. See `kernels` for the layout.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import RASTER_TILE
 from sgsst_core.rasterizer import kernels
-from sgsst_core.rasterizer.base import CountedWeights, Precision, RenderCost
+from sgsst_core.rasterizer.base import CountedWeights, Precision
 from sgsst_core.rasterizer.projection import Shapes
 from sgsst_core.rasterizer.tile_intersections import (
     TileIntersections,
@@ -27,7 +25,7 @@ from sgsst_core.rasterizer.tile_intersections import (
     intersections_of_subset,
     run_starts,
 )
-from sgsst_core.rasterizer.tiled import TiledRasterizer, ViewCache
+from sgsst_core.rasterizer.tiled import TiledRasterizer, cache_of_intersections
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -60,11 +58,8 @@ class CpuRasterizer(TiledRasterizer[TileIntersections]):
             raise ValueError(f"{len(scene)} Gaussians are not the {int(rows.sum())} chosen ones of {len(self.scene)}")
         subset = self.for_scene(scene, **self.options(memory))
         indices = torch.where(rows, rows.cumsum(0, dtype=torch.int32) - 1, -1).to(torch.int32).numpy()
-        subset._intersections = ViewCache(
-            subset._build,
-            memory,
-            self._intersections,
-            lambda isects: intersections_of_subset(isects, indices),
+        subset._intersections = cache_of_intersections(
+            memory, previous=self._intersections, adapt=lambda isects: intersections_of_subset(isects, indices)
         )
         self._shapes = None
         return subset
@@ -77,20 +72,6 @@ class CpuRasterizer(TiledRasterizer[TileIntersections]):
     def count_weights(self, camera: Camera) -> CountedWeights:
         """Count a view's weights without storing them; takes about as long as one render."""
         return CountedStrips(self, camera)
-
-    def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
-        """Measure the cost of rendering some views with gradient; reuses their tile intersections if cached."""
-        self.for_scene(self.scene.subset(torch.arange(1))).step_seconds(cameras[0])  # compiles the kernels
-        seconds = []
-        for camera in cameras:
-            self.intersections(camera)
-            seconds += self.step_seconds(camera)
-        preparation, size, shapes = 0.0, 0, Shapes.of(self.scene)
-        for camera in cameras:
-            started = time.perf_counter()
-            size += build_tile_intersections(self.scene, camera, near=self.near, shapes=shapes).nbytes
-            preparation += time.perf_counter() - started
-        return RenderCost(seconds, preparation / len(cameras), size // len(cameras))
 
     def _render(self, colors: Tensor, camera: Camera) -> Tensor:
         return self._blend(colors.numpy(), camera)[0]

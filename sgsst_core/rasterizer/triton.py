@@ -15,8 +15,7 @@ Gaussians cover few pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -30,7 +29,7 @@ from sgsst_core.constants import (
 )
 from sgsst_core.devices import on_device
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.base import CountedWeights, Precision, RenderCost
+from sgsst_core.rasterizer.base import CountedWeights, Precision
 from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
 from sgsst_core.rasterizer.tiled import TiledRasterizer
 from sgsst_core.scene.camera import Camera
@@ -117,12 +116,6 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
                 "program starts, or choose 'cpu' or 'cached'."
             )
         return chosen
-
-    def probe_cost(self, cameras: Sequence[Camera]) -> RenderCost:
-        """Measure the cost of rendering some views with gradient, and the size of their tile intersections."""
-        cost, built = super().probe_cost(cameras), [self.intersections(camera) for camera in cameras]
-        pairs = max(len(isects.ranks) for isects in built)
-        return replace(cost, preparation_bytes=sum(isects.nbytes for isects in built) // len(built), max_pairs=pairs)
 
     def count_weights(self, camera: Camera) -> CountedWeights:
         """Count a view's weights without storing them; takes about as long as one render."""

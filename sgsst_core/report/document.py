@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-from sgsst_core.budget import device_peak
+from sgsst_core.budget import device_peak, peak_memory
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import ratio, smoothed
 from sgsst_core.loss.scale_weights import ScaleWeights
@@ -18,7 +18,7 @@ from sgsst_core.parallel.collectives import TRAFFIC
 from sgsst_core.planning.measurement_choice import allowed_seconds
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
-from sgsst_core.report.machine import machine, peak_memory, program_version
+from sgsst_core.report.machine import machine, program_version
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, relative_loss
 from sgsst_core.stylizing.loop import Stopped
 from sgsst_core.stylizing.schedule import StepRecord

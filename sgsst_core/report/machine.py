@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,6 @@ from sgsst_core.stylizing.checkpoint import versions
 def program_version() -> str:
     """Return the version of the installed distribution; "unknown" for a source tree that is not installed."""
     return versions()["program"]
-
-
-def peak_memory() -> int:
-    """Return the peak physical memory of this process so far, in bytes."""
-    if sys.platform == "win32":
-        return int(psutil.Process().memory_info().peak_wset)
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere except on macOS
 
 
 def machine(device: torch.device) -> dict[str, Any]:

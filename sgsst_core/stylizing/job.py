@@ -4,45 +4,45 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
-from numpy.typing import NDArray
+import torch
 from torch import Tensor
 
-from sgsst_core.budget import forget_device_peak, least_intersection_memory, memory_for
-from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.budget import Cache, forget_device_peak, least_intersection_memory, measuring_memory, memory_for
+from sgsst_core.errors import DeviceMemoryError
+from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.scale_weights import band_count
-from sgsst_core.loss.sos import SosLoss, make_loss
-from sgsst_core.loss.targets import StyleTargets
+from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
+from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import ends_with_transfer
 from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.survey import ShowPlanning
-from sgsst_core.planning.view_costs import view_memory
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.regions.maps import mean_level
-from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras, spread
-from sgsst_core.scene.gaussians import Scene, checked_scene
+from sgsst_core.scene.camera import Camera, fit_cameras, spread
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.style import Style, image_of
+from sgsst_core.style import Style
 from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.schedule import Phase, planned_phases
 from sgsst_core.stylizing.team import Team
+from sgsst_core.stylizing.training_background import Color
 from sgsst_core.stylizing.view_targets import ViewTargets
 from sgsst_core.stylizing.views import Views
 from sgsst_core.timing import Timer
+
+T = TypeVar("T")
 
 
 class StyleTargetCache:
@@ -174,6 +174,48 @@ class StylizationJob:
         """Whether only luminance changes."""
         return self.settings.preserve_colors == "luminance"
 
+    @property
+    def caches(self) -> dict[str, Cache[Any, Any]]:
+        """Caches of data of the views by name, "weights" before "intersections"."""
+        return {**self.views.caches, **self.view_targets.caches}
+
+    def intersection_budget(self, weights: int) -> int:
+        """Return the budget for tile intersections in bytes if cached blend weights take `weights` bytes."""
+        rasterizer, memory = self.views.rasterizer, memory_for("rasterizer", self.memory)
+        budget = rasterizer.intersection_budget(weights) if isinstance(rasterizer, CachedRasterizer) else memory
+        return memory if budget is None else budget
+
+    def gradient(
+        self,
+        index: int,
+        sh_dc: Tensor,
+        style: StyleTargets,
+        target: ViewTarget,
+        scales: Sequence[int],
+        background: Color | None = None,
+    ) -> tuple[Tensor, SosResult]:
+        """Return dE/dsh_dc [n, 3] of one view for colors [n, 3], and the loss.
+
+        Args:
+            index: Index of the view.
+            sh_dc: Colors of the rendered Gaussians.
+            style: Targets of the style.
+            target: Targets of the view.
+            scales: Scales to evaluate.
+            background: Background color; None for that of the settings.
+        """
+        with self.timer("render"), torch.no_grad():
+            colors = self.views.colors(index, sh_dc)
+            image = self.views.render(index, colors)
+            if background is not None:
+                image = self.view_targets.replace_background(index, image, background)
+        with self.timer("loss"):
+            evaluate = self.graphs.evaluate if self.graphs is not None else self.loss.evaluate
+            result = evaluate(image, style, target, scales)
+        with self.timer("raster_backward"):
+            assert result.image_gradient is not None
+            return self.views.gradient(index, result.image_gradient.to(colors.device), colors), result
+
     def scale_count(self, index: int) -> int:
         """Return n_s of a view."""
         camera = self.views.cameras[index]
@@ -183,65 +225,6 @@ class StylizationJob:
         """Return the scales of a view with a positive weight, finest first."""
         camera = self.views.cameras[index]
         return self.loss.tiling.scales((camera.height, camera.width))
-
-
-def plan_job(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    style: Tensor | NDArray[Any] | Style,
-    settings: Settings,
-    *,
-    weights: BackboneWeights | None = None,
-    photos: PhotoLoader | None = None,
-    rasterizer: str | None = None,
-    collectives: Collectives = ALONE,
-    regions: Regions | None = None,
-    show: ShowPlanning | None = None,
-) -> StylizationJob:
-    """Plan and prepare a job; see `make_plan` for `weights`, `rasterizer`, `show` and exceptions.
-
-    Inputs are checked, and converted if necessary. If the settings request refinement, the job contains the refined
-    scene.
-    """
-    style, regions = Style.given(style), regions and regions.with_checked_styles()
-    scene, cameras = checked_scene(scene), checked_cameras(cameras)
-    weights = weights or load_network_weights("auto")
-    refinement = refine(
-        scene,
-        cameras,
-        style,
-        settings,
-        weights=weights,
-        rasterizer=rasterizer,
-        collectives=collectives,
-        regions=regions,
-        show=show,
-    )
-    scene, regions = refined(scene, refinement), regions and regions.refined(refinement)
-    plan, planning_context = make_plan(
-        scene,
-        cameras,
-        settings,
-        weights=weights,
-        rasterizer=rasterizer,
-        collectives=collectives,
-        style=style,
-        regions=regions,
-        refinement=refinement,
-        show=show,
-    )
-    return prepare_job(
-        plan,
-        scene,
-        cameras,
-        style,
-        settings,
-        weights=weights,
-        photos=photos and (lambda index: image_of(photos(index), f"photo of view {index}")),
-        collectives=collectives,
-        planning_context=planning_context,
-        regions=regions,
-    )
 
 
 def prepare_job(
@@ -260,7 +243,7 @@ def prepare_job(
     """Prepare a planned job. Every rank calls this with the same arguments.
 
     Args:
-        plan: Plan for this scene, these cameras and settings: from `make_plan`, or from an earlier run of the same job.
+        plan: Plan for this scene, these cameras and settings, such as that of an earlier run of the same job.
         scene: Scene to stylize, refined if the plan says so.
         cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
         style: Style of the job.
@@ -284,6 +267,7 @@ def prepare_job(
         planning_context.network if planning_context else make_network(weights, settings, plan.precision, plan.device)
     )
     team = Team(plan, settings, collectives)
+    team.expect(plan)
     memory_limit = settings.memory_limit or plan.memory_limit
     memory = memory_limit // sharing_memory(team.everybody, plan.device)
     loss = make_loss(
@@ -408,4 +392,59 @@ def _make_rasterizer(
         precision="half" if plan.cached_weights == "half" else "float32",
         at_first_use=False,
         uncached=uncached,
+    )
+
+
+def view_memory(plan: Plan, memory: int) -> int:
+    """Return the budget in bytes for data of the views: what other caches leave of it, and `Plan.spare`.
+
+    Args:
+        plan: Plan of the job.
+        memory: Memory limit of a rank in bytes.
+    """
+    left = memory_for("views", memory) + plan.spare
+    if plan.cached_weights != "none":
+        left -= least_intersection_memory(memory)
+    if plan.measured:
+        left -= (2 if plan.is_approximated else 1) * measuring_memory(memory)
+    return left
+
+
+def with_second_attempt(job: StylizationJob, work: Callable[[], T]) -> T:
+    """Return the result of a function, which is called again if the GPU runs out of memory.
+
+    Before that, caches are cleared, and the memory budget for activations is halved for the rest of the job. Results
+    then differ by rounding. Several ranks make no second attempt, because the others wait for messages of the first.
+
+    Raises:
+        DeviceMemoryError: If the memory is still not enough.
+    """
+    try:
+        return work()
+    except torch.OutOfMemoryError:
+        if job.collectives.size > 1:
+            raise _not_enough(job, "") from None
+    # Outside of the handler, because the exception refers to the tensors of the first attempt.
+    _halve_activations(job)
+    try:
+        return work()
+    except torch.OutOfMemoryError:
+        raise _not_enough(job, ", not even with half of the activations in memory") from None
+
+
+def _halve_activations(job: StylizationJob) -> None:
+    """Clear what depends on the partition, and halve the memory budget for activations."""
+    job.loss.halve_memory(max(camera.height * camera.width for camera in job.views.cameras))
+    job.view_targets.forget_division()
+    if job.graphs is not None:
+        job.graphs.clear()
+    torch.cuda.empty_cache()
+
+
+def _not_enough(job: StylizationJob, attempt: str) -> DeviceMemoryError:
+    free, total = torch.cuda.mem_get_info(job.network.device)
+    return DeviceMemoryError(
+        f"The GPU's memory ({total / 1e9:.1f} GB, {free / 1e9:.1f} GB free) is not enough for a step{attempt}. Stop "
+        f"other programs on this GPU, or give a smaller --memory-limit than {job.memory_limit / 1e9:.1f} GB or a "
+        "smaller --resolution (`max_resolution` in Python)."
     )

@@ -15,7 +15,7 @@ from sgsst_core.loss.convergence import has_converged, has_reached, window_lengt
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.progress import Progress
 from sgsst_core.stylizing.evaluation import RunningRound, mean_loss
-from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
+from sgsst_core.stylizing.seconds_left import Pace, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
 
 Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "on-request", "interrupted"]
@@ -170,13 +170,13 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
         "coarse": (expected.seconds_coarse, expected.first_visit_coarse),
         "sos": (expected.seconds, expected.first_visit),
     }
-    phases = [ExpectedPhase(phase.stage, phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.job.schedule]
+    phases = {phase.stage: Pace(phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.job.schedule}
     views_per_step = stylizer.job.settings.views_per_step
     pace = SecondsLeft(phases, stylizer.job.views.covered, views_per_step)
     if views_per_step == 1:  # a record names only one view of its step
         before = 0.0
         for record in stylizer.history:
-            pace.add_step(record.stage, [record.view], record.seconds - before, record.parts.get("prepare", 0.0))
+            pace.add_step(record.stage, [record.view], record.seconds - before)
             before = record.seconds
         pace.resume()
     return pace
@@ -187,20 +187,14 @@ def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
     before, style_before = stylizer.seconds, stylizer.job.style_targets.seconds
     record = stylizer.run_step()
     style = stylizer.job.style_targets.seconds - style_before
-    seconds = stylizer.seconds - before - style
-    prepared = max(record.parts.get("prepare", 0.0) - style, 0.0)
-    pace.add_step(record.stage, stylizer.latest, seconds, prepared)
+    pace.add_step(record.stage, stylizer.latest, stylizer.seconds - before - style)
 
 
 def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft, running: RunningRound) -> Progress:
     record, most, measure = stylizer.history[-1], stylizer.job.settings.max_seconds, callbacks.measure
     expected = stylizer.job.plan.prediction
-    left = pace.left(
-        stylizer.step,
-        stylizer.coming,
-        measuring=measure.seconds_left(stylizer.step) if measure else 0.0,
-        limit=most - stylizer.seconds if most else None,
-    )
+    left = pace.left(stylizer.step, stylizer.coming, limit=most - stylizer.seconds if most else None)
+    left += measure.seconds_left(stylizer.step) if measure else 0.0
     stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
     if expected:
         left += expected.ending

@@ -72,7 +72,7 @@ def refine(
         style: Style of the job.
         settings: Settings of the job.
         weights: Weights of the feature network.
-        rasterizer: Name of the rasterizer, as in `make_plan`.
+        rasterizer: Name of the rasterizer, as in `plan_job`.
         collectives: Ranks of the job.
         regions: Regions of the scene; frozen Gaussians are not split.
         show: Callback, called before each view that is surveyed, before each view whose gradient is computed, and

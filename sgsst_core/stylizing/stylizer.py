@@ -6,7 +6,7 @@ Each call of `Stylizer.run_step` makes one step; `loop.run` makes all steps.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Self, TypeVar
@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.budget import device_peak
-from sgsst_core.errors import DeviceMemoryError, DivergedError
+from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
-from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.regions.definition import Regions
@@ -37,9 +36,10 @@ from sgsst_core.stylizing.evaluation import (
     mean_loss,
     show_nothing,
 )
-from sgsst_core.stylizing.job import StylizationJob, plan_job
+from sgsst_core.stylizing.job import StylizationJob, with_second_attempt
 from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
+from sgsst_core.stylizing.planner import refine_and_plan
 from sgsst_core.stylizing.result_colors import result_colors, transferred_colors
 from sgsst_core.stylizing.schedule import (
     BEFORE_STEPS,
@@ -121,7 +121,7 @@ class Stylizer:
         regions: Regions | None = None,
         show: ShowPlanning | None = None,
     ) -> Self:
-        """Plan a job and create its stylizer; see `plan_job`.
+        """Plan a job and create its stylizer; see `refine_and_plan`.
 
         If the settings request refinement, the job contains the refined scene.
 
@@ -132,7 +132,7 @@ class Stylizer:
             >>> stylizer.job.total_steps
             2
         """
-        job = plan_job(
+        job = refine_and_plan(
             scene,
             cameras,
             style,
@@ -236,7 +236,7 @@ class Stylizer:
                 style = self.job.style_targets(self.job.views.cameras[index])
             assert target.division is not None
             cost += target.division.cost(self.job.group.rank, self.job.network.halo)
-            own, result = self._gradient(index, style, target, scales, background)
+            own, result = self.job.gradient(index, self.sh_dc.detach(), style, target, scales, background)
             gradient = own if gradient is None else gradient.add_(own)
             results.append(result)
         assert gradient is not None
@@ -335,29 +335,8 @@ class Stylizer:
         )
         with self.job.views.temporary_weights(index):
             started = time.perf_counter()
-            gradient = self._gradient(index, style, target, scales)[0]
+            gradient = self.job.gradient(index, self.sh_dc.detach(), style, target, scales)[0]
             return gradient.cpu(), time.perf_counter() - started
-
-    def _gradient(
-        self,
-        index: int,
-        style: StyleTargets,
-        target: ViewTarget,
-        scales: Sequence[int],
-        background: Color | None = None,
-    ) -> tuple[Tensor, SosResult]:
-        """Return dE/dsh_dc [n, 3] of one view over a background color (None: that of the settings), and the loss."""
-        with self.job.timer("render"), torch.no_grad():
-            colors = self.job.views.colors(index, self.sh_dc.detach())
-            image = self.job.views.render(index, colors)
-            if background is not None:
-                image = self.job.view_targets.replace_background(index, image, background)
-        with self.job.timer("loss"):
-            evaluate = self.job.graphs.evaluate if self.job.graphs is not None else self.job.loss.evaluate
-            result = evaluate(image, style, target, scales)
-        with self.job.timer("raster_backward"):
-            assert result.image_gradient is not None
-            return self.job.views.gradient(index, result.image_gradient.to(colors.device), colors), result
 
     def cache_weights(self, index: int) -> None:
         """Cache a view's blend weights, if they fit, as its first step does.
@@ -457,43 +436,3 @@ class Stylizer:
         self.seconds_by_part = {**earlier, **{name: earlier.get(name, 0.0) + own[name] for name in own}}
         self.measured = list(state.measured)
         self._visited_before = state.step
-
-
-def with_second_attempt(job: StylizationJob, work: Callable[[], T]) -> T:
-    """Return the result of a function, which is called again if the GPU runs out of memory.
-
-    Before that, caches are cleared, and the memory budget for activations is halved for the rest of the job. Results
-    then differ by rounding. Several ranks make no second attempt, because the others wait for messages of the first.
-
-    Raises:
-        DeviceMemoryError: If the memory is still not enough.
-    """
-    try:
-        return work()
-    except torch.OutOfMemoryError:
-        if job.collectives.size > 1:
-            raise _not_enough(job, "") from None
-    # Outside of the handler, because the exception refers to the tensors of the first attempt.
-    _halve_activations(job)
-    try:
-        return work()
-    except torch.OutOfMemoryError:
-        raise _not_enough(job, ", not even with half of the activations in memory") from None
-
-
-def _halve_activations(job: StylizationJob) -> None:
-    """Clear what depends on the partition, and halve the memory budget for activations."""
-    job.loss.halve_memory(max(camera.height * camera.width for camera in job.views.cameras))
-    job.view_targets.forget_division()
-    if job.graphs is not None:
-        job.graphs.clear()
-    torch.cuda.empty_cache()
-
-
-def _not_enough(job: StylizationJob, attempt: str) -> DeviceMemoryError:
-    free, total = torch.cuda.mem_get_info(job.network.device)
-    return DeviceMemoryError(
-        f"The GPU's memory ({total / 1e9:.1f} GB, {free / 1e9:.1f} GB free) is not enough for a step{attempt}. Stop "
-        f"other programs on this GPU, or give a smaller --memory-limit than {job.memory_limit / 1e9:.1f} GB or a "
-        "smaller --resolution (`max_resolution` in Python)."
-    )

@@ -48,10 +48,14 @@ class Team:
         self.everybody = taking_part
         self.groups = math.gcd(settings.views_per_step, taking_part.size)
         self.group = taking_part.split_group(self.groups)
-        for ranks in (self.everybody, self.group):
-            ranks.set_timeout_for(plan.prediction.seconds if plan.prediction else 0.0)
         #: Pixels and seconds of this rank's network passes in each step, until speeds have been compared.
         self._pace: list[tuple[int, float]] | None = [] if settings.rebalance and self.group.size > 1 else None
+
+    def expect(self, plan: Plan) -> None:
+        """Set the timeouts of the ranks for steps as long as the plan predicts, if it does."""
+        if plan.prediction is not None:
+            for ranks in (self.everybody, self.group):
+                ranks.set_timeout_for(plan.prediction.seconds)
 
     @property
     def own_group(self) -> int:

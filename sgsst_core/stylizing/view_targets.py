@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 from torch import Tensor
 
@@ -81,6 +82,16 @@ class ViewTargets:
         self._images: Cache[_ContentKey, ScaledView] = Cache(images, _image_bytes)
         self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
         self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
+
+    @property
+    def caches(self) -> dict[str, Cache[Any, Any]]:
+        """Caches of data of the views by name."""
+        return {
+            "coverage": self._coverage,
+            "maps": self._region_weights,
+            "images": self._images,
+            "content": self._content,
+        }
 
     def target(self, index: int, scales: Sequence[int], background: Color | None = None) -> ViewTarget:
         """Return the target of a view at some scales; cached if it fits.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -36,13 +37,13 @@ class ViewColors:
         self._degree = scene.sh_degree
         self._sh_rest = scene.sh_rest.to(device)
         self._means = scene.means.to(device)
-        self._rest: Cache[int, Tensor] = Cache(memory, tensor_bytes)
+        self.cache: Cache[int, Tensor] = Cache(memory, tensor_bytes)
 
     def __call__(self, index: int, sh_dc: Tensor) -> Tensor:
         """Return the colors [N, 3] of a view for `sh_dc` [N, 3]."""
         if self._degree == 0:
             return view_colors(sh_dc, torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device))
-        rest = self._rest.get(index, lambda: rest_colors(self._sh_rest, self._means, self._cameras[index]))
+        rest = self.cache.get(index, lambda: rest_colors(self._sh_rest, self._means, self._cameras[index]))
         return view_colors(sh_dc, rest)
 
 
@@ -92,6 +93,11 @@ class Views:
         self._shown: Cache[int, ShownGaussians] = Cache(shown)
         self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4 - shown)
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
+
+    @property
+    def caches(self) -> dict[str, Cache[Any, Any]]:
+        """Caches of data of the views by name, "weights" before "intersections"."""
+        return {"colors": self.colors.cache, "shown": self._shown, **self.rasterizer.caches}
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -198,7 +204,7 @@ class Views:
             The Gaussians; None if there is only one rank, or if they do not fit in the cache.
         """
         size = ShownGaussians.nbytes(len(self.scene))
-        if self.collectives.size == 1 or not self._shown.holds(index, size):
+        if self.collectives.size == 1 or (index not in self._shown and not self._shown.has_space(size)):
             return None
 
         def find() -> ShownGaussians:

@@ -14,13 +14,15 @@ from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import middle_of
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit, orbit_decisions
 from sgsst_core.orbit.subject import find_subject
-from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.planner import plan_job
 from tests.sgsst_core.orbit.objects import ball, box, figure, ground, joined, scene_of
+from tests.small_scenes import style
 
 
 def elevations(scene: Scene, orbit: Orbit) -> list[float]:
@@ -139,9 +141,9 @@ def test_plan_starts_with_the_lines_about_the_orbit(tiny_weights) -> None:  # ty
     scene = figure()
     orbit = make_orbit(scene, OrbitRequest(count=3))
     cameras = [resized(camera, 64) for camera in orbit.cameras]
-    plan, _ = make_plan(scene, cameras, make_settings(), weights=tiny_weights, orbit=orbit)
+    plan = plan_job(scene, cameras, Style.of(style()), make_settings(), weights=tiny_weights, orbit=orbit).plan
     assert [decision.item for decision in plan.decisions[:3]] == ["up", "cameras", "frames"]
-    without, _ = make_plan(scene, cameras, make_settings(), weights=tiny_weights)
+    without = plan_job(scene, cameras, Style.of(style()), make_settings(), weights=tiny_weights).plan
     assert "up" not in {decision.item for decision in without.decisions}
 
 

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 from torch.torch_version import TorchVersion
 
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import ALIGNMENT, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.context import equip
-from sgsst_core.planning.facts import Link
-from sgsst_core.planning.probe import LAUNCH_RUNS, LEAST_GRAPH_VISITS, launch_cost, measure, soft_image
-from sgsst_core.planning.survey import survey_views
+from sgsst_core.planning.choices import LEAST_GRAPH_VISITS
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import StylizationJob
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.trial import launch_cost
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.pretend_cuda.runtime import pretend_cuda
@@ -32,8 +29,6 @@ from tests.small_scenes import cameras, style, wall
 
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-SIZE = 32, 48
 
 
 @pytest.fixture
@@ -45,75 +40,38 @@ def counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counts]:
         yield counts
 
 
+def job(weights: BackboneWeights, **values: Any) -> StylizationJob:
+    settings = make_settings(steps_coarse=0, steps_sos=2, coarsest_side=16, **values)
+    return plan_job(wall(10, 8), cameras(1, 48, 32), Style.of(style()), settings, weights=weights, rasterizer="cpu")
+
+
 def test_launches_are_timed_with_and_without_a_graph(counts: Counts, tiny_weights: BackboneWeights) -> None:
-    loss = SosLoss(FeatureNetwork(tiny_weights, device="cuda"), coarsest=16)
+    planned = job(tiny_weights)
     counts.clear()
-    cost = launch_cost(loss, SIZE)
+    cost = launch_cost(planned)
     assert cost.problem is None
     assert cost.seconds > 0
     assert cost.replayed > 0
     assert cost.capture >= 0
     replays = [count for line, count in counts.launches.items() if "loss/graphs.py" in line]
-    assert LAUNCH_RUNS + 1 in replays  # including the run after the capture
-
-
-def test_launches_of_a_tile_are_timed_and_do_not_depend_on_its_size(
-    counts: Counts, tiny_weights: BackboneWeights
-) -> None:
-    scene, views = wall(10, 8), cameras(1, 48, 32)
-    loss = SosLoss(FeatureNetwork(tiny_weights, device="cuda"))
-    launches = []
-    for side in (ALIGNMENT, 4 * ALIGNMENT):
-        image = soft_image(side).to("cuda")
-        style, view = loss.targets.of_style(Style.of(image.flip(0)), (side, side)), loss.targets.of_view(image)
-        counts.clear()
-        loss.evaluate(image, style, view, [0])
-        launches.append(counts.launches.total())
-    assert launches[0] == pytest.approx(launches[1], rel=0.02)
-    context = equip(scene, views, make_settings(), tiny_weights, ALONE, rasterizer="cpu")
-    fixed = measure(context, survey_views(scene, views, context.rasterizer), Link(math.inf, 0.0)).network.fixed
-    assert min(fixed.features, fixed.forward, fixed.both) > 0
+    assert max(replays) > 1  # including the run after the capture
 
 
 def test_launch_cost_without_graph_states_the_problem(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    network = FeatureNetwork(tiny_weights, device="cuda")
-    little = int(1.5 * SIZE[0] * SIZE[1] * (network.held_bytes_per_pixel() + network.working_bytes_per_pixel()))
-    assert launch_cost(SosLoss(network, memory=little), SIZE).problem == (
-        "a view's activations do not fit the memory twice"
-    )
-    on_cpu = SosLoss(FeatureNetwork(tiny_weights, device="cpu"))
-    assert launch_cost(on_cpu, SIZE).problem == "only NVIDIA GPUs are known to replay them"
+    planned = job(tiny_weights)
+    little = SosLoss(planned.network, memory=int(1.5 * 48 * 32 * planned.network.held_bytes_per_pixel()), coarsest=16)
+    assert launch_cost(replace(planned, loss=little)).problem == "a view's activations do not fit the memory twice"
 
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("not here")
 
     with monkeypatch.context() as patch:
         patch.setattr(torch.cuda, "graph", broken)
-        assert launch_cost(SosLoss(network), SIZE).problem == "RuntimeError: not here"
-
-
-@pytest.mark.parametrize(
-    ("version", "problem"), [("2.12.1", "PyTorch 2.13 or later is needed"), ("2.13.0", "not here")]
-)
-def test_failed_capture_does_not_break_the_process(
-    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, version: str, problem: str
-) -> None:
-    network = FeatureNetwork(tiny_weights, device="cuda")
-    convolve = FeatureNetwork._convolve
-
-    def cannot_be_captured(network: FeatureNetwork, x: Tensor, step: Any) -> Tensor:
-        if torch.cuda.is_current_stream_capturing():
-            raise RuntimeError("not here")
-        return convolve(network, x, step)
-
-    monkeypatch.setattr(torch, "__version__", TorchVersion(version))
-    monkeypatch.setattr(FeatureNetwork, "_convolve", cannot_be_captured)
-    cost = launch_cost(SosLoss(network, coarsest=16), SIZE).problem
-    assert cost is not None
-    assert problem in cost
-    torch.cuda.synchronize()
+        assert launch_cost(planned).problem == "RuntimeError: not here"
+    monkeypatch.setattr(torch, "__version__", TorchVersion("2.12.1"))
+    assert "PyTorch 2.13 or later is needed" in str(launch_cost(planned).problem)
 
 
 @pytest.mark.parametrize(("capability", "chosen"), [((7, 5), "float32"), ((8, 0), "bfloat16")])

@@ -13,8 +13,7 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning import context as module
-from sgsst_core.planning.context import convolution_ratio, equip, precision_ratio, seconds_of
-from sgsst_core.planning.probe import gradient_error
+from sgsst_core.planning.context import convolution_ratio, equip, gradient_error, precision_ratio, seconds_of
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToTf32, to_tf32
@@ -23,10 +22,10 @@ from tests.small_scenes import ball, cameras, style, wall
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def error_of(network: FeatureNetwork, weights: BackboneWeights, side: int = 384) -> Difference | None:
+def error_of(network: FeatureNetwork, weights: BackboneWeights) -> Difference | None:
     settings = make_settings(memory_limit=2 << 30)
     context = equip(wall(sh_degree=1), cameras(1), settings, weights, ALONE, "cpu")
-    return gradient_error(replace(context, network=network), cameras(1)[0], side)
+    return gradient_error(replace(context, network=network), cameras(1)[0])
 
 
 def test_tf32_gradient_error_is_a_thousandth_without_flipped_decisions(vgg16_weights: BackboneWeights) -> None:

@@ -9,13 +9,15 @@ import pytest
 import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.planning.planner import make_plan
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.context import equip
 from sgsst_core.quality.float32_reference import Float32Reference, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToTf32
 from tests.small_scenes import ball, cameras, style, wall
@@ -79,11 +81,13 @@ def test_initial_error_can_be_measured_later(tiny_weights: BackboneWeights) -> N
 def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) -> None:
     """The plan is constructed by hand, and TF32 is emulated, because a CPU would use float32."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12, warm_start=False)
-    plan, planning_context = make_plan(scene, cameras(2), settings, weights=tiny_weights)
-    plan = replace(plan, precision="tf32")
-    rounded = RoundedToTf32(tiny_weights, planning_context.network.layers)
+    context = equip(scene, cameras(2), settings, tiny_weights, ALONE)
+    plan = replace(
+        plan_job(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights).plan, precision="tf32"
+    )
+    rounded = RoundedToTf32(tiny_weights, context.network.layers)
     errors = []
-    for shop in (None, replace(planning_context, network=rounded)):
+    for shop in (None, replace(context, network=rounded)):
         stylizer = Stylizer(
             prepare_job(
                 plan, scene, cameras(2), Style.of(style()), settings, weights=tiny_weights, planning_context=shop
@@ -99,7 +103,7 @@ def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) ->
 def test_bfloat16_error_is_plausible(tiny_weights: BackboneWeights) -> None:
     """The plan is constructed by hand, so that the precision does not depend on the processor."""
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12)
-    plan, _ = make_plan(scene, cameras(2), settings, weights=tiny_weights)
+    plan = plan_job(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights).plan
     plan = replace(plan, precision="bfloat16")
     stylizer = Stylizer(prepare_job(plan, scene, cameras(2), Style.of(style()), settings, weights=tiny_weights))
     assert approximations(stylizer) == ["bfloat16 features"]

@@ -395,7 +395,7 @@ def test_weights_and_tile_intersections_share_a_budget() -> None:
         cached.render(colors, view)
     assert [cached.is_cached(view) for view in views] == [True, True, False, False]
     assert [cpu.has_intersections(view) for view in views] == [False, False, True, False]
-    assert cached.cached_bytes + cpu._intersections.cached_bytes <= sum(weights[:2]) + isects[2]
+    assert cached.cached_bytes + cpu._intersections.used <= sum(weights[:2]) + isects[2]
 
 
 def test_arguments_are_checked_before_any_work() -> None:

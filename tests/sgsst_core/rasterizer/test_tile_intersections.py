@@ -127,7 +127,7 @@ def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
     assert [part.has_intersections(view) for view in views] == [True, True, True, False]
     for done, view in enumerate(views):
         check_same(part.intersections(view), build_tile_intersections(scene.subset(chosen), view))
-        assert part._intersections.cached_bytes <= budget
+        assert part._intersections.used <= budget
         assert not whole.has_intersections(view)
         assert [whole.has_intersections(other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
     assert part.intersections(views[1]) is part.intersections(views[1])

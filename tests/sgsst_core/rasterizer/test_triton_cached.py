@@ -14,10 +14,7 @@ from torch import Tensor
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.context import equip
-from sgsst_core.planning.facts import Link
-from sgsst_core.planning.planner import make_plan
-from sgsst_core.planning.probe import measure
-from sgsst_core.planning.survey import survey_views
+from sgsst_core.planning.facts import weight_cost
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Precision
 from sgsst_core.rasterizer.cached import CachedRasterizer
@@ -28,6 +25,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, rotated_pose
@@ -224,9 +222,7 @@ VIEWS = cameras(2, 32, 24)
 def test_plan_predicts_the_bytes_of_cached_weights(tiny_weights: BackboneWeights) -> None:
     scene = ball(60)
     planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
-    cost = measure(
-        planning_context, survey_views(scene, VIEWS, planning_context.rasterizer), Link(float("inf"), 0.0)
-    ).raster
+    cost = weight_cost(planning_context.rasterizer, VIEWS, make_settings(), 1 << 30, 5)
     planned: dict[Precision, int | None] = {"float32": cost.bytes, "half": cost.half_bytes}
     for precision, size in planned.items():
         cached = CachedRasterizer(scene, precision=precision, uncached=planning_context.rasterizer)  # type: ignore[arg-type]
@@ -234,23 +230,18 @@ def test_plan_predicts_the_bytes_of_cached_weights(tiny_weights: BackboneWeights
             cached.coverage(view)
         assert cached.cached_bytes == size
     assert cost.cached_seconds is not None
-    assert cost.caching_seconds is not None
     assert min(cost.seconds, cost.cached_seconds, cost.caching_seconds) > 0
 
 
 @pytest.mark.slow
-def test_job_reuses_tile_intersections_of_its_plan(tiny_weights: BackboneWeights) -> None:
+def test_job_uses_the_requested_rasterizer(tiny_weights: BackboneWeights) -> None:
     scene, losses = ball(60), {}
     settings = make_settings("preview", steps_coarse=0, steps_sos=1, cached_weights="half")
     for name in ("cpu", "triton"):
-        plan, planning_context = make_plan(scene, VIEWS[:1], settings, weights=tiny_weights, rasterizer=name)
-        inputs = (plan, scene, VIEWS[:1], Style.of(style()), settings)
-        used, resumed = (
-            Stylizer(prepare_job(*inputs, weights=tiny_weights, planning_context=shop))
-            for shop in (planning_context, None)
-        )
+        inputs = (scene, VIEWS[:1], Style.of(style()), settings)
+        job = plan_job(*inputs, weights=tiny_weights, rasterizer=name)
+        used, resumed = Stylizer(job), Stylizer(prepare_job(job.plan, *inputs, weights=tiny_weights))
         rasterizers: list[Any] = [stylizer.job.views.rasterizer for stylizer in (used, resumed)]
-        assert rasterizers[0].uncached is planning_context.rasterizer
         for each in rasterizers:
             assert (each.name, each.precision, each.uncached.name) == ("cached", "half", name)
         losses[name] = used.run_step().loss

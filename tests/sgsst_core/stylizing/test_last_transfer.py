@@ -13,7 +13,6 @@ from sgsst_core import Settings, Stylizer, make_settings
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.plan import Plan
-from sgsst_core.planning.planner import make_plan
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.regions.definition import Region, Regions
@@ -23,6 +22,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.warm_start import warm_start
 from tests.small_scenes import cameras, style, wall
 
@@ -43,7 +43,7 @@ def settings_of(**values: Any) -> Settings:
 def in_bfloat16(weights: BackboneWeights) -> Stylizer:
     """Make a job in bfloat16 with a fixed plan, so that the precision does not depend on the processor."""
     scene, settings = wall(60, 40), settings_of()
-    plan, _ = make_plan(scene, cameras(), settings, weights=weights)
+    plan = plan_job(scene, cameras(), Style.of(style()), settings, weights=weights).plan
     return Stylizer(
         prepare_job(replace(plan, precision="bfloat16"), scene, cameras(), Style.of(style()), settings, weights=weights)
     )

@@ -20,8 +20,11 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.images import save_png
 from sgsst_core.files.photos import Photo, load_photo
 from sgsst_core.settings import make_settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.photo_prefetch import PhotosAhead
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.device import DEVICE, PretendTensor
@@ -94,10 +97,12 @@ def make(weights: BackboneWeights, photos: Photos, *, cached: bool = False, **va
     options = {"steps_coarse": 0, "steps_sos": STEPS, "coarsest_side": 16, "position_weights": "off", "seed": SEED}
     settings = make_settings("paper", **{**options, **values})
     views = cameras(VIEWS, SIDE, SIDE)
-    stylizer = Stylizer.planned(wall(6, 5), views, style(), settings, weights=weights, photos=photos)
+    inputs = wall(6, 5), views, Style.of(style()), settings
+    plan = plan_job(*inputs, weights=weights).plan  # without photos, so that the trial reads none
+    job = prepare_job(plan, *inputs, weights=weights, photos=photos)
     if not cached:
-        stylizer.job.view_targets._content = Cache(0)
-    return stylizer
+        job.view_targets._content = Cache(0)
+    return Stylizer(job)
 
 
 def drawn() -> list[int]:

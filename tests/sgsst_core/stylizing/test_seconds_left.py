@@ -7,9 +7,26 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from sgsst_core.stylizing.seconds_left import ExpectedPhase, SecondsLeft
+from sgsst_core.stylizing.seconds_left import Pace, SecondsLeft
 
 VIEWS = 12
+
+
+@dataclass(frozen=True)
+class ExpectedPhase:
+    """Actual or predicted times of a phase."""
+
+    stage: str
+    steps: int
+    seconds: float = 0.0
+    first_visit: float = 0.0
+
+
+def estimator_of(phases: list[ExpectedPhase], views: range, views_per_step: int = 1) -> SecondsLeft:
+    paces = {phase.stage: Pace(phase.steps, phase.seconds, phase.first_visit) for phase in phases}
+    return SecondsLeft(paces, views, views_per_step)
+
+
 #: Actual times of the steps; their sums are exact in binary.
 COARSE = ExpectedPhase("coarse", 30, 1.0, 8.0)
 SOS = ExpectedPhase("sos", 60, 4.5, 2.25)
@@ -33,7 +50,7 @@ def session(
     Each view's cached data are computed at its first visit after `start`, as after resuming.
     """
     chance = random.Random(seed)
-    estimator = SecondsLeft(expected, range(VIEWS), views_per_step)
+    estimator = estimator_of(expected, range(VIEWS), views_per_step)
     queue: list[int] = []
     order = [phase for phase in phases for _ in range(phase.steps)]
     visited: dict[str, set[int]] = {phase.stage: set() for phase in phases}
@@ -50,7 +67,7 @@ def session(
         fresh = len(set(views) - visited[phase.stage])
         visited[phase.stage].update(views)
         prices.append(phase.seconds + fresh * phase.first_visit)
-        estimator.add_step(phase.stage, views, prices[-1], fresh * phase.first_visit / 2)
+        estimator.add_step(phase.stage, views, prices[-1])
         number = sum(entry.stage == phase.stage for entry in estimates[start:]) + 1
         estimates.append(Estimate(phase.stage, number, estimator.left(step, queue), 0.0))
     return [replace(entry, truth=sum(prices[index + 1 :])) for index, entry in enumerate(estimates)][start:]
@@ -99,21 +116,20 @@ def test_first_visits_after_this_round_count_with_their_probability() -> None:
     Three views are new, one of them in this round.
     """
     phase = ExpectedPhase("sos", 20, 1.0, 6.0)
-    estimator = SecondsLeft([phase], range(VIEWS))
+    estimator = estimator_of([phase], range(VIEWS))
     for view in range(9):
         estimator.add_step("sos", [view], 7.0)
     estimator.add_step("sos", [1], 1.0)
     assert estimator.left(16, [9, 0]) == 4 * 1.0 + (1 + 2 * 2 / 12) * 6.0
 
 
-def test_estimate_includes_measuring_checkpoints_and_time_limit() -> None:
+def test_estimate_includes_checkpoints_and_time_limit() -> None:
     """Checkpoints keep taking a quarter of the steps' time; the time limit applies to steps alone."""
-    estimator = SecondsLeft([ExpectedPhase("sos", 10)], [0])
+    estimator = estimator_of([ExpectedPhase("sos", 10)], range(1))
     estimator.add_step("sos", [0], 3.0)
     estimator.add_step("sos", [0], 1.0)
     estimator.add_beside(1.0)
     assert estimator.left(2, []) == 8 * 1.0 * 1.25
-    assert estimator.left(2, [], measuring=5.0) == 8 * 1.0 * 1.25 + 5.0
     assert estimator.left(2, [], limit=4.0) == 4.0 * 1.25
-    assert estimator.left(2, [], measuring=5.0, limit=-1.0) == 5.0
-    assert estimator.left(10, [], measuring=5.0) == 5.0
+    assert estimator.left(2, [], limit=-1.0) == 0.0
+    assert estimator.left(10, []) == 0.0

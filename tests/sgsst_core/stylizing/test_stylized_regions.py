@@ -13,7 +13,6 @@ from torch import Tensor
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.targets import ViewTarget
-from sgsst_core.planning.planner import make_plan
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
@@ -24,6 +23,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, fingerprint, load_checkpoint, versions
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.result_colors import neighbors_change_by_region, transferred_colors
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.synthetic_images import relative_error
@@ -251,7 +251,7 @@ def test_float32_reference_has_the_same_regions(tiny_weights: BackboneWeights) -
 
 def test_plan_includes_region_maps(tiny_weights: BackboneWeights) -> None:
     scene, settings = wall(), make_settings(steps_sos=20, coarsest_side=24)
-    plan, _ = make_plan(scene, cameras(), settings, weights=tiny_weights, regions=halves(scene))
+    plan = plan_job(scene, cameras(), Style.of(style()), settings, weights=tiny_weights, regions=halves(scene)).plan
     lines = {line.item: line for line in plan.decisions}
     assert "2 renders at a view's first visit, 0.1 MB for all views" in lines["regions"].decision
     assert "% of what the views show, use the style" in lines["region rest"].decision

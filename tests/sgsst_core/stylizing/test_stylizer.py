@@ -15,7 +15,6 @@ from torch import Tensor
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import smoothed
-from sgsst_core.planning.planner import make_plan
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer.tile_intersections import TileIntersections, build_tile_intersections
 from sgsst_core.scene.camera import Camera, fit_cameras
@@ -26,6 +25,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkp
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
 from tests.sgsst_core.synthetic_images import synthetic_image
@@ -64,26 +64,25 @@ def test_tile_intersections_of_the_survey_are_reused(
     built: list[int] = []
 
     def build(scene: Scene, camera: Camera, **options: Any) -> TileIntersections:
-        if len(scene) > 1:  # the plan makes those of one Gaussian to compile the kernels
-            built.append(len(scene))
+        built.append(len(scene))
         return build_tile_intersections(scene, camera, **options)
 
     monkeypatch.setattr("sgsst_core.rasterizer.cpu.build_tile_intersections", build)
     scene, views = ball(), cameras(3)
     scene.means[-10:, 2] *= -1  # behind the cameras
     settings = make_settings(steps_sos=6, cached_weights=cached_weights)
-    plan, planning_context = make_plan(scene, views, settings, weights=tiny_weights)
+    job = plan_job(scene, views, Style.of(style()), settings, weights=tiny_weights)
+    plan, results = job.plan, []
     assert not plan.seen.all()
     assert plan.cached_weights == cached_weights
-    results = []
-    for given in (planning_context, None):
-        stylizer = Stylizer(
-            prepare_job(plan, scene, views, Style.of(style()), settings, weights=tiny_weights, planning_context=given)
-        )
+    trial = 0 if cached_weights == "none" else 1  # a view is also timed without its cached weights
+    assert built == [len(scene)] * 3 + [int(plan.seen.sum())] * trial
+    built.clear()
+    for each in (job, prepare_job(plan, scene, views, Style.of(style()), settings, weights=tiny_weights)):
+        stylizer = Stylizer(each)
         run(stylizer)
         results.append(stylizer.stylized())
-    surveyed, timed = [len(scene)] * 3, [len(scene)] * 3
-    assert built == [*surveyed, *timed, *[int(plan.seen.sum())] * 3]
+    assert built == [int(plan.seen.sum())] * 3
     assert torch.equal(*results)
 
 
@@ -221,6 +220,7 @@ def test_style_time_is_not_counted_as_time_of_a_view(
 
     monkeypatch.setattr(time, "perf_counter", lambda: clock() + late[0])
     monkeypatch.setattr(stylizer.job.loss.targets, "of_style", slowly)
+    stylizer.job.style_targets._targets.clear()  # as for views of another size than those of the trial
     run(stylizer, Callbacks(progress=seen.append))
     assert (seen[0].seconds or 0) > 1000
     assert all((now.eta_s or 0) < 1000 for now in seen)

@@ -86,7 +86,7 @@ def drawn_gradient(stylizer: Stylizer, index: int, scales: list[int], behind: Co
         stylizer.job.view_targets.target(index, scales, behind),
         stylizer.job.style_targets(stylizer.job.views.cameras[0]),
     )
-    return stylizer._gradient(index, targets, target, scales, behind)
+    return stylizer.job.gradient(index, stylizer.sh_dc.detach(), targets, target, scales, behind)
 
 
 @pytest.mark.parametrize("scales", [[0, 1], [1]])

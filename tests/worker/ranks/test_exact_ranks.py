@@ -15,7 +15,6 @@ from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.planner import make_plan
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
@@ -26,6 +25,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.view_targets import ViewTargets
 from sgsst_core.stylizing.views import Views
@@ -297,7 +297,7 @@ def test_gradients_of_views_in_a_step_are_averaged() -> None:
 def run_with_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
     inputs: Any = wall(), cameras(2, 192, 144)
     settings, weights = make_settings("standard", steps_coarse=0, steps_sos=20, rebalance=False), tiny_weights()
-    plan, _ = make_plan(*inputs, settings, weights=weights, collectives=collectives)
+    plan = plan_job(*inputs, Style.of(style()), settings, weights=weights, collectives=collectives).plan
     settings = settings.model_copy(update={"rebalance": rebalance})
     job = prepare_job(plan, *inputs, Style.of(style()), settings, weights=weights, collectives=collectives)
     stylizer = Stylizer(job)

@@ -14,7 +14,6 @@ from torch import Tensor
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.probe import probe_link
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.ports import free_port
@@ -73,9 +72,6 @@ def merge_three(rank: int, size: int, address: str, folder: str) -> None:
         merged, added = collectives.all_reduce_statistics(own, numbers)
         sums = [(part.count, part.mean, part.centered, number) for part, number in zip(merged, added, strict=True)]
         torch.save([[value.cpu() for value in values] for values in sums], Path(folder) / f"{rank}.pt")
-        link = probe_link(collectives, torch.device("cuda"))
-        assert 1e8 < link.bandwidth < 1e13
-        assert 0 < link.latency < 1
 
 
 def features(seed: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Time of an iteration on several ranks: each rank's portion of the work, and the messages between ranks."""
+"""Forecast of an iteration on several ranks: each rank's portion of the work, and the messages between ranks."""
 
 from __future__ import annotations
 
@@ -10,16 +10,53 @@ from sgsst_core.features.partition import cached_tiles, choose_tile_size, comput
 from sgsst_core.parallel.collectives import TRAFFIC, Traffic
 from sgsst_core.parallel.division import Piece, Shares, divide, rounds
 from sgsst_core.parallel.visible_gaussians import gaussians_sent
-from sgsst_core.planning.facts import Link
-from sgsst_core.planning.view_costs import RankPart
 
 #: Channels of the style layers. Ranks exchange their statistics in float64: first the pixel count and the mean, then
 #: one half of the symmetric covariance.
 _STYLE_CHANNELS = (64, 128, 256, 512, 512)
 _FIRST_BYTES = 8 * sum(c + 1 for c in _STYLE_CHANNELS)
 _SECOND_BYTES = 8 * sum(c * (c + 1) // 2 for c in _STYLE_CHANNELS)
-#: Minimum fraction of an iteration that additional ranks must save.
-LEAST_GAIN = 0.03
+
+
+@dataclass(frozen=True)
+class Link:
+    """Connection between ranks.
+
+    Attributes:
+        bandwidth: Bytes per second that a rank sends while receiving as many.
+        latency: Time in seconds of the shortest message from one rank to the next.
+    """
+
+    bandwidth: float
+    latency: float
+
+    def all_gather(self, size: int, ranks: int) -> float:
+        """Return the time in seconds of an all-gather of `size` bytes in total; a reduce-scatter takes as long."""
+        return (ranks - 1) * (self.latency + size / ranks / self.bandwidth)
+
+    def all_reduce(self, size: int, ranks: int) -> float:
+        """Return the time in seconds of an all-reduce of `size` bytes per rank."""
+        return 2 * self.all_gather(size, ranks)
+
+
+@dataclass(frozen=True)
+class RankPart:
+    """Part of the work on each view that a rank does.
+
+    Attributes:
+        ranks: Number of ranks that divide a view.
+        window: Fraction of a view's covered pixels that the rank renders: its part of the view and the halo.
+        memory: Memory budget of the rank, relative to `Machine.memory`; more than 1 if some ranks do not take part.
+    """
+
+    ranks: int = 1
+    window: float = 1.0
+    memory: float = 1.0
+
+    def seconds(self, whole: float, fixed: float = 0.0) -> float:
+        """Return the rank's time in seconds; `whole` is that of a whole view, `fixed` its size-independent portion."""
+        fixed = min(fixed, whole)
+        return fixed + (whole - fixed) * self.window
 
 
 @dataclass(frozen=True)
@@ -165,58 +202,6 @@ class IterationWork:
         return self.computing(ranks, groups) + self.communication(ranks, link)
 
 
-@dataclass(frozen=True)
-class RanksChoice:
-    """Chosen number of ranks.
-
-    Attributes:
-        ranks: Number of ranks that take part.
-        seconds: Time in seconds of the whole schedule for each number of ranks considered.
-    """
-
-    ranks: int
-    seconds: dict[int, float]
-
-    @property
-    def speed_up(self) -> float:
-        """Speed-up over one rank."""
-        return self.seconds[1] / self.seconds[self.ranks]
-
-
-def choose_ranks(
-    phases: Sequence[tuple[int, Sequence[IterationWork]]], views_per_step: int, available: int, link: Link
-) -> RanksChoice:
-    """Choose the smallest number of ranks whose time is within `LEAST_GAIN` of the best.
-
-    Args:
-        phases: Number of steps of each phase, and the work of iterations on a sample of views.
-        views_per_step: Views per step, which groups of ranks process in parallel.
-        available: Number of available ranks.
-        link: Connection between the ranks.
-    """
-    seconds = {ranks: _schedule_seconds(phases, views_per_step, ranks, link) for ranks in _candidates(available)}
-    best = min(seconds.values())
-    enough = min(ranks for ranks, time_ in seconds.items() if time_ <= best * (1 + LEAST_GAIN))
-    return RanksChoice(enough, seconds)
-
-
-def _candidates(available: int) -> list[int]:
-    """Return the numbers of ranks to consider: all up to eight, then increasing by a quarter."""
-    candidates, ranks = [], 1
-    while ranks < available:
-        candidates.append(ranks)
-        ranks += max(ranks // 4, 1) if ranks >= 8 else 1
-    return [*candidates, available]
-
-
-def _schedule_seconds(
-    phases: Sequence[tuple[int, Sequence[IterationWork]]], views_per_step: int, ranks: int, link: Link
-) -> float:
-    groups = math.gcd(views_per_step, ranks)
-    each = ranks // groups
-    total = 0.0
-    for steps, works in phases:
-        mean = sum(work.seconds(each, link, groups) for work in works) / len(works)
-        across = link.all_reduce(works[0].gaussians * 12, ranks) if groups > 1 else 0.0
-        total += steps * (mean * views_per_step / groups + across)
-    return total
+def proportional(seconds: float) -> Callable[[RankPart], float]:
+    """Return a function that scales `seconds` of a whole view to the pixels that a rank renders."""
+    return lambda part: part.seconds(seconds)

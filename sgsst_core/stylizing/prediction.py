@@ -1,0 +1,284 @@
+"""Plan of a job from the facts about it, completed and predicted from its trial; without rendering or measuring."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from sgsst_core.budget import measuring_memory, memory_for, peak_memory
+from sgsst_core.decision import Decision
+from sgsst_core.loss.tiling import Tiling
+from sgsst_core.number_format import duration
+from sgsst_core.planning import choices
+from sgsst_core.planning.facts import Facts, LaunchCost, NetworkPixels
+from sgsst_core.planning.measurement_choice import (
+    LEAST_ALLOWED,
+    LEVELS,
+    LOSS_VIEWS,
+    RENDERED,
+    Prices,
+    allowed_seconds,
+    choose_level,
+    choose_loss_views,
+    novel_view_seconds,
+)
+from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.scene.pyramid import scale_count
+from sgsst_core.settings import Precision, Settings
+from sgsst_core.stylizing.trial import NETWORK, Trial
+
+#: Time from the last step to the last file written: constant seconds for images and report, and seconds per Gaussian
+#: for the neighbor search and for writing (measured with 4 million Gaussians on two cores; an estimate elsewhere).
+_ENDING_SECONDS, _ENDING_SECONDS_PER_GAUSSIAN = 1.5, 4e-6
+#: Portion of `_ENDING_SECONDS_PER_GAUSSIAN` for the neighbor search. If some Gaussians are unseen, the search is
+#: repeated at every measurement.
+_NEIGHBORS_SECONDS_PER_GAUSSIAN = 1.5e-6
+#: Bytes per Gaussian of the neighbor search for unseen Gaussians: result, color change, positions, and search tree.
+_SEARCH_BYTES = 120
+#: Memory of measurements and report apart from the data of novel views: libraries, LPIPS, images.
+_MEASURING_BYTES = 100 << 20
+#: Bytes of a novel view per Gaussian (colors), and per pixel (coverage, and two warps).
+_NOVEL_GAUSSIAN_BYTES, _NOVEL_PIXEL_BYTES = 12, 84
+#: Time of a render without gradient, relative to one with gradient, and renders for the depth of a novel view.
+_RENDER, _DEPTH_RENDERS = 0.5, 2
+
+
+def draft_plan(facts: Facts, settings: Settings, *, precision: Precision, measured: bool) -> Plan:
+    """Choose everything that needs no trial. The plan lacks ranks, graphs, measurements, decisions and prediction.
+
+    Args:
+        facts: Facts about the job.
+        settings: Settings of the job.
+        precision: Precision of the network.
+        measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
+    """
+    survey = facts.survey
+    weighted, _ = choices.position_weights(survey, settings)
+    scan = choices.is_scan(survey, weighted=weighted)
+    rendered = choices.rendered_gaussians(survey)
+    cached_weights, _ = choices.blend_weights(facts, settings, choices.Visits.of(survey, facts.sizes, settings))
+    return Plan(
+        survey=survey,
+        optimized=rendered if facts.frozen is None else rendered & ~facts.frozen,
+        seen=rendered,
+        covered=tuple(survey.covered),
+        weighted=weighted,
+        steps_coarse=choices.steps_coarse(choices.computed_scales(facts.sizes, settings), settings)[0],
+        training_background=choices.training_background(settings, scan=scan),
+        warm_start=choices.warm_start(survey, settings, scan=scan)[0],
+        memory_limit=facts.machine.memory_limit,
+        device=facts.machine.device,
+        rasterizer=facts.rasterizer if cached_weights == "none" else "cached",
+        uncached=facts.rasterizer,
+        precision=precision,
+        cached_weights=cached_weights,
+        measured=measured,
+        loss_views=min(LOSS_VIEWS[0], len(survey.covered)),
+    )
+
+
+def network_pixels(plan: Plan, facts: Facts, tiling: Tiling) -> NetworkPixels:
+    """Count the pixels through the network on a single rank."""
+    regions = [plan.survey.regions[index] if plan.weighted else None for index in plan.covered]
+    return NetworkPixels.of([(facts.sizes[i], region) for i, region in zip(plan.covered, regions, strict=True)], tiling)
+
+
+def with_spare_memory(plan: Plan, facts: Facts, activations: int) -> Plan:
+    """Add to a plan the memory for activations that the steps of a single rank on a GPU do not need.
+
+    Args:
+        plan: Plan of the job.
+        facts: Facts about the job.
+        activations: Bytes of the activations of a view.
+    """
+    machine = facts.machine
+    if machine.device == "cpu" or machine.ranks > 1:
+        return plan
+    budget = memory_for("activations", machine.memory)
+    needed = activations
+    if plan.measured and plan.is_approximated:  # the float32 reference needs more
+        needed = max(min(int(activations * _reference_size(plan)), budget), activations)
+    # A CUDA graph does not share its memory: evaluating the loss without the graph needs the same amount again.
+    return replace(plan, spare=max(budget - needed - (activations if plan.graphs else 0), 0))
+
+
+def measures_launches(plan: Plan, facts: Facts, settings: Settings) -> bool:
+    """Return whether views of one size are visited often enough on a GPU to consider a CUDA graph of their loss."""
+    sizes = {facts.sizes[index] for index in plan.covered}
+    visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
+    rare = visits < choices.LEAST_GRAPH_VISITS
+    return plan.device == "cuda" and not rare and not choices.divides_views(facts.machine.ranks, settings)
+
+
+def completed_plan(
+    plan: Plan,
+    facts: Facts,
+    settings: Settings,
+    pixels: NetworkPixels,
+    trials: Mapping[int, Trial],
+    cost: LaunchCost | None,
+) -> Plan:
+    """Choose ranks, graphs and measurements from the trials of a plan, predict its cost, and list its decisions.
+
+    Args:
+        plan: Plan from `draft_plan`.
+        facts: Facts about the job.
+        settings: Settings of the job.
+        pixels: Pixels through the network.
+        trials: Trials by number of ranks.
+        cost: Cost of launching a view's loss; None if it was not measured.
+    """
+    steps = plan.steps_coarse + settings.steps_sos
+    seconds = {
+        ranks: (plan.steps_coarse * trial.coarse.seconds + settings.steps_sos * trial.sos.seconds) / max(steps, 1)
+        for ranks, trial in trials.items()
+    }
+    ranks = choices.choose_ranks(seconds)
+    trial, survey = trials[ranks], facts.survey
+    visits = choices.Visits.of(survey, facts.sizes, settings)
+    phases = bool(plan.steps_coarse) + bool(settings.steps_sos)
+    graphs, launch_lines = choices.launches(facts, settings, visits, phases, cost)
+    plan = replace(plan, ranks=ranks, graphs=graphs)
+    prediction = _predicted_steps(plan, facts, settings, trials, cost)
+    if plan.measured:
+        plan, prediction = _with_measurements(plan, prediction, facts, settings, trial)
+    process, device = _peak_bytes(plan, facts, settings, trial)
+    plan = replace(plan, prediction=replace(prediction, peak_bytes=process, device_bytes=device))
+    scan = choices.is_scan(survey, weighted=plan.weighted)
+    weights_line = choices.blend_weights(facts, settings, visits)[1]
+    if plan.cached_weights != "none":
+        weights_line = replace(weights_line, seconds=max(trial.render - trial.sos.of("render", "raster_backward"), 0.0))
+    counts = [scale_count(*facts.sizes[index], settings.coarsest_side) for index in plan.covered]
+    lines = (
+        *choices.about_gaussians(facts, plan.seen, settings),
+        *choices.about_views(facts),
+        *choices.about_uncovered_pixels(pixels, survey, trial.sos.of(*NETWORK)),
+        *choices.position_weights(survey, settings)[1],
+        *choices.about_training_background(plan.training_background, survey, settings, trial.sos.of("prepare")),
+        *choices.warm_start(survey, settings, scan=scan)[1],
+        *choices.about_colors(settings),
+        *choices.about_network(pixels, facts, settings, trial.sos.of("matching"), trial.sos.of("vgg_forward")),
+        *choices.about_rasterizer(facts, cached=plan.cached_weights != "none"),
+        *launch_lines,
+        weights_line,
+        *choices.about_scales(counts, settings),
+        *choices.steps_coarse(choices.computed_scales(facts.sizes, settings), settings)[1],
+        *choices.about_early_stop(plan.training_background, len(plan.covered), settings),
+        *choices.about_shared_gpus(facts),
+        *choices.about_ranks(ranks, seconds, facts.machine.ranks),
+        *choices.precision(facts, settings)[1],
+        *([_about_measuring(plan, settings)] if plan.measured else []),
+    )
+    return replace(plan, decisions=lines)
+
+
+def _predicted_steps(
+    plan: Plan, facts: Facts, settings: Settings, trials: Mapping[int, Trial], cost: LaunchCost | None
+) -> Prediction:
+    """Return the prediction for the steps, with first visits and style; those of the trial have been made already."""
+    trial, views = trials[plan.ranks], len(plan.covered)
+    saved = settings.views_per_step * cost.saved if cost and plan.graphs else 0.0
+    seconds = max(trial.sos.seconds - saved, 0.0), max(trial.coarse.seconds - saved, 0.0)
+    unvisited = max(1 - trial.views / views, 0.0)
+    first = trial.sos.first * unvisited, trial.coarse.first * unvisited
+    style = trial.style * max(len({facts.sizes[index] for index in plan.covered}) - 1, 0)
+    job = style + sum(
+        steps * own + min(steps * settings.views_per_step, views) * more
+        for steps, own, more in zip((settings.steps_sos, plan.steps_coarse), seconds, first, strict=True)
+    )
+    return Prediction(
+        *seconds,
+        0,
+        communication=trial.sos.of("communication"),
+        seconds_one_rank=trials[1].sos.seconds if facts.machine.ranks > 1 and 1 in trials else None,
+        first_visit=first[0],
+        first_visit_coarse=first[1],
+        style=style,
+        job=min(job, settings.max_seconds or job),
+    )
+
+
+def _with_measurements(
+    plan: Plan, expected: Prediction, facts: Facts, settings: Settings, trial: Trial
+) -> tuple[Plan, Prediction]:
+    """Choose the measurements of a job, and add their time to its prediction.
+
+    Novel views are assumed to cost as much as the job's own.
+    """
+    count, sos, total = len(plan.covered), trial.sos, plan.steps_coarse + settings.steps_sos
+    evaluation = sum(sos.parts.values()) - sos.of("vgg_backward", "raster_backward", "optimizer")
+    unvisited = max(1 - settings.steps_sos * settings.views_per_step / count, 0.0)
+    before_and_after = evaluation + unvisited * expected.first_visit
+    # `target_loss` is relative to the initial loss on these views. Their number must not depend on timings, or timings
+    # would determine the step at which the job ends.
+    loss_views = plan.loss_views
+    if not settings.target_loss:
+        loss_views = choose_loss_views(settings.measure, expected.job, before_and_after, count)
+    ending = _ENDING_SECONDS + _ENDING_SECONDS_PER_GAUSSIAN * facts.gaussians
+    losses = loss_views * before_and_after
+    expected = replace(expected, evaluation=loss_views * evaluation, losses=losses, ending=ending)
+    neighbors = _NEIGHBORS_SECONDS_PER_GAUSSIAN * facts.gaussians if _searches_neighbors(plan, settings) else 0.0
+    prices = Prices(
+        setup=RENDERED * (trial.prepare + _DEPTH_RENDERS * _RENDER * trial.render),
+        view=RENDERED * _RENDER * trial.render + sos.of("vgg_forward", "statistics"),
+        moment=neighbors + (2 * expected.seconds if plan.is_approximated else 0.0),
+    )
+    level = choose_level(prices, novel_view_seconds(settings.measure, expected), total)
+    measuring = losses + prices.of(LEVELS[level], len(LEVELS[level].moments(total)))
+    expected = replace(expected, measuring=measuring, job=expected.job + measuring)
+    return replace(plan, measuring=level, loss_views=loss_views), expected
+
+
+def _peak_bytes(plan: Plan, facts: Facts, settings: Settings, trial: Trial) -> tuple[int, int | None]:
+    """Return the peak memory in bytes of a rank's process, and of its GPU (None on a CPU)."""
+    memory, novel, measuring = facts.machine.memory * facts.machine.ranks // max(plan.ranks, 1), 0, 0
+    if plan.measured:
+        level, measuring = LEVELS[plan.measuring].views, _MEASURING_BYTES
+        pixels = max(height * width for height, width in facts.sizes)
+        colors = RENDERED * facts.gaussians * _NOVEL_GAUSSIAN_BYTES if facts.used_degree else 0
+        novel = min(level * (colors + _NOVEL_PIXEL_BYTES * pixels), measuring_memory(memory))
+        novel += min(RENDERED * level * trial.novel, trial.free)
+        # The float32 reference evaluates the loss with larger activations.
+        novel += int((_reference_size(plan) - 1) * trial.passing)
+    if trial.device is not None:
+        graphs = trial.passing if plan.graphs else 0
+        return trial.process + measuring, trial.device + trial.growth + novel + graphs
+    searching = _SEARCH_BYTES * facts.gaussians if _searches_neighbors(plan, settings) else 0
+    held = trial.process - trial.passing + trial.growth + measuring + novel
+    return max(peak_memory(), held + max(trial.passing, searching)), None
+
+
+def _reference_size(plan: Plan) -> float:
+    """Return the size of a feature value in the float32 reference, relative to the job's network."""
+    return 2.0 if plan.precision == "bfloat16" else 1.0
+
+
+def _searches_neighbors(plan: Plan, settings: Settings) -> bool:
+    """Return whether unseen Gaussians follow their neighbors' color change."""
+    return settings.unseen == "neighbors" and not bool(plan.seen.all())
+
+
+def _about_measuring(plan: Plan, settings: Settings) -> Decision:
+    """Return the decision about measurements outside the steps and their cost."""
+    expected = plan.prediction
+    assert expected is not None
+    steps = expected.job - expected.measuring
+    cost = f"about {duration(expected.measuring, ' ')} in addition to {duration(steps, ' ')} of steps"
+    losses = f"the initial loss on {_count(plan.loss_views, 'view')}"
+    if not settings.measure:
+        return Decision("measuring", f"{losses} only", f"requested; {cost}")
+    level = LEVELS[plan.measuring]
+    moments = level.moments(plan.steps_coarse + settings.steps_sos)
+    when = f"at {len(moments)} moments" if len(moments) > 1 else "at the end"
+    novel = f", and {when} up to {_count(level.views, 'novel view')}" if moments else " only"
+    allowed = duration(allowed_seconds(settings.measure, steps), " ")
+    return Decision(
+        "measuring",
+        f"{losses}{novel}",
+        f"{cost}; {allowed} is allowed, {settings.measure:.0%} of the steps' time or {LEAST_ALLOWED:.0f} s, and less "
+        "is measured if the first novel view takes longer",
+    )
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
