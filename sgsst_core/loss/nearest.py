@@ -42,8 +42,6 @@ MAX_VECTORS = 1 << 13
 #: Number of positions and number of style vectors per block of the search, by device. The similarities of a block fit
 #: in the CPU cache; on a GPU, they take a quarter of a gigabyte.
 _BLOCK = {"cpu": (1 << 10, 1 << 10), "cuda": (1 << 13, 1 << 13)}
-#: Bytes stored per matched position.
-MATCH_BYTES = 8 + 4 + 4
 #: w_n for `nnfm`. With content_weight 1, the nearest-neighbor and content terms are balanced as in ARF for 360-degree
 #: scenes (content weight 5e-3 in units of ImageNet-normalized features: github.com/Kai-46/ARF-svox2, opt/try_tnt.sh).
 NNFM_WEIGHT = KAPPA**2 / 5e-3
@@ -192,16 +190,6 @@ def search(units: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
             best[part] = torch.where(nearer, values, best[part])
             nearest[part] = torch.where(nearer, positions + first, nearest[part])
     return best, nearest
-
-
-def working_bytes(channels: int, value: int, device: str) -> int:
-    """Return the peak memory of the search in bytes, excluding features and style vectors.
-
-    Args:
-        channels: Length of a style vector.
-    """
-    rows, columns = _BLOCK[device]
-    return rows * (2 * columns + 3 * channels) * value
 
 
 @dataclass(frozen=True)
