@@ -14,7 +14,7 @@ from functools import cache
 from typing import Any
 
 from sgsst_core.planning.choices import LEAST_GAIN
-from sgsst_core.settings import make_settings
+from sgsst_core.settings import PresetName, make_settings
 
 #: Bytes of a Gaussian with SH of degree 3 in a PLY file.
 GAUSSIAN_BYTES = 248
@@ -157,7 +157,7 @@ class SimulatedJob:
 
 
 @cache
-def _size(preset: str, side: int, scene_bytes: int) -> JobSize:
+def _size(preset: PresetName, side: int, scene_bytes: int) -> JobSize:
     settings = make_settings(preset)
     side = min(side, settings.max_resolution or side)
     steps = settings.views_per_step
