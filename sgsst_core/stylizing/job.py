@@ -26,6 +26,7 @@ from sgsst_core.planning.choices import ends_with_transfer
 from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer.base import Color
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.regions.maps import mean_level
@@ -37,7 +38,6 @@ from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.schedule import Phase, planned_phases
 from sgsst_core.stylizing.team import Team
-from sgsst_core.stylizing.training_background import Color
 from sgsst_core.stylizing.view_targets import ViewTargets
 from sgsst_core.stylizing.views import Views
 from sgsst_core.timing import Timer

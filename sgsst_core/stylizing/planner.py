@@ -143,7 +143,9 @@ def plan_job(
                 own = run_trial(job)
             except RankLeftOut:
                 pass
-            trials[ranks] = collectives.broadcast(lambda own=own: own)
+            of_first = collectives.all_gather(own)[0]
+            assert of_first is not None  # the first rank takes part in every trial
+            trials[ranks] = of_first
         if job is not None and measures_launches(draft, facts, settings):
             cost = launch_cost(job)
         plan = collectives.broadcast(lambda: completed_plan(draft, facts, settings, pixels, trials, cost))

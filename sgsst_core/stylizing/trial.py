@@ -153,7 +153,7 @@ class _Visitor:
         for repetition in range(_REPETITIONS):
             slow = later["total"] - (0.0 if repetition else prepared) > _SLOW
             wanted = (repeated < _ENOUGH_SECONDS and not slow) or (phase.scale is not None and not repetition)
-            if not job.collectives.broadcast(lambda wanted=wanted: wanted):
+            if not job.collectives.all_gather(wanted)[0]:
                 break
             again = self._visit(index, phase)
             later = min(later, again, key=lambda visit: visit["total"]) if repetition else again
@@ -202,7 +202,10 @@ class _Visitor:
         job = self._job
         regions, tiling = job.plan.survey.regions if job.plan.weighted else None, job.loss.tiling
         every = {
-            index: ((job.views.cameras[index].height, job.views.cameras[index].width), regions and regions[index])
+            index: (
+                (job.views.cameras[index].height, job.views.cameras[index].width),
+                regions[index] if regions else None,
+            )
             for index in job.views.covered
         }
         pixels = NetworkPixels.of([every[index] for index in self._visited], tiling).all
