@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 
 from sgsst_core.files.scene_file import read_scene
 
@@ -37,7 +37,7 @@ class Attacked:
     accepted: dict[str, dict[str, Any]] = field(default_factory=dict)
     resent: int = 0
 
-    def call(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def call(self, method: str, path: str, **options: Any) -> httpx2.Response:
         """Send a request to any API process that responds; retry while none does.
 
         Raises:
@@ -46,8 +46,8 @@ class Attacked:
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             for url in self.urls:
-                with contextlib.suppress(httpx.TransportError):
-                    answer = httpx.request(method, f"{url}{path}", timeout=15, trust_env=False, **options)
+                with contextlib.suppress(httpx2.TransportError):
+                    answer = httpx2.request(method, f"{url}{path}", timeout=15, trust_env=False, **options)
                     if answer.status_code < 500:
                         return answer
                 self.resent += 1

@@ -36,7 +36,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 
 from benchmarks.attacked import FINISHED, Attacked
 from benchmarks.cluster_hosts import Host, Network, missing
@@ -167,7 +167,7 @@ class Cluster:
         host.run([*user, f"{programs}/postgres", "-D", str(data), "-h", host.address, "-p", str(PG_PORT), "-k", ""], {})
 
     def _make_bucket(self) -> bool:
-        return httpx.put(f"{self.store['AWS_ENDPOINT_URL']}/files", trust_env=False, timeout=5).status_code == 200
+        return httpx2.put(f"{self.store['AWS_ENDPOINT_URL']}/files", trust_env=False, timeout=5).status_code == 200
 
     def database_answers(self) -> bool:
         """Return whether PostgreSQL accepts connections."""
@@ -184,14 +184,14 @@ def _postgres_programs() -> Path:
 
 
 def _ready(url: str) -> bool:
-    answer = httpx.get(f"{url}/readyz", timeout=5, trust_env=False)
+    answer = httpx2.get(f"{url}/readyz", timeout=5, trust_env=False)
     return answer.status_code == 200 and answer.json()["status"] == "ok"
 
 
 def _wait(what: str, condition: Callable[[], bool], seconds: float = 180.0) -> None:
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        with contextlib.suppress(httpx.HTTPError, OSError):
+        with contextlib.suppress(httpx2.HTTPError, OSError):
             if condition():
                 return
         time.sleep(0.3)
@@ -237,8 +237,8 @@ class Run(Attacked):
 
     @staticmethod
     def _reads(url: str) -> bool:
-        with contextlib.suppress(httpx.TransportError):
-            return httpx.get(f"{url}/v1/jobs", params={"limit": 1}, timeout=3, trust_env=False).status_code == 200
+        with contextlib.suppress(httpx2.TransportError):
+            return httpx2.get(f"{url}/v1/jobs", params={"limit": 1}, timeout=3, trust_env=False).status_code == 200
         return False
 
     # --- faults ----------------------------------------------------------------------------------------------------

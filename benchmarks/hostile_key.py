@@ -23,7 +23,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import psutil
 
 from benchmarks.machine import write_result
@@ -47,7 +47,7 @@ _LARGE = 60_000_000
 _PATIENCE, _SHORT_PATIENCE = 600.0, 60.0
 
 Files = dict[str, bytes]
-Costly = Callable[[httpx.AsyncClient, Files, int], Awaitable[httpx.Response]]
+Costly = Callable[[httpx2.AsyncClient, Files, int], Awaitable[httpx2.Response]]
 
 
 def costly_files(folder: Path) -> Files:
@@ -82,22 +82,22 @@ def form(files: Files, number: int) -> dict[str, Any]:
     return {"files": parts, "data": {"parameters": json.dumps(_QUICK)}}
 
 
-async def _inspection(client: httpx.AsyncClient, files: Files, number: int) -> httpx.Response:
+async def _inspection(client: httpx2.AsyncClient, files: Files, number: int) -> httpx2.Response:
     costly = {**files, "scene": files["costly scene"], "cameras": files["costly cameras"]}
     return await client.post("/v1/jobs", **form({role: costly[role] for role in ("scene", "cameras", "style")}, number))
 
 
-async def _dry_run(client: httpx.AsyncClient, files: Files, number: int) -> httpx.Response:
+async def _dry_run(client: httpx2.AsyncClient, files: Files, number: int) -> httpx2.Response:
     request = form({role: files[role] for role in ("scene", "cameras", "style")}, number)
     return await client.post("/v1/jobs", params={"dry_run": True}, **request | {"data": {}})
 
 
-async def _large_body(client: httpx.AsyncClient, files: Files, number: int) -> httpx.Response:
+async def _large_body(client: httpx2.AsyncClient, files: Files, number: int) -> httpx2.Response:
     large = {"scene": files["scene"], "cameras": files["cameras"], "style": number.to_bytes(16, "big") + bytes(_LARGE)}
     return await client.post("/v1/jobs", **form(large, number))
 
 
-async def _uploads(client: httpx.AsyncClient, files: Files, number: int) -> httpx.Response:
+async def _uploads(client: httpx2.AsyncClient, files: Files, number: int) -> httpx2.Response:
     answer = await client.post("/v1/uploads", headers=_TUS | {"Upload-Length": "1000"})
     if answer.status_code == 201:
         await client.delete(answer.headers["location"])
@@ -115,19 +115,19 @@ ATTACKS: dict[str, Costly] = {
 def attack(url: str, key: str, name: str, files: Files, parallel: int, statuses: Any) -> None:
     """Send requests of one kind until the process is killed, and count response statuses."""
 
-    async def one(client: httpx.AsyncClient, numbers: itertools.count[int]) -> None:
+    async def one(client: httpx2.AsyncClient, numbers: itertools.count[int]) -> None:
         while True:
             try:
                 status = str((await ATTACKS[name](client, files, next(numbers))).status_code)
-            except httpx.TransportError as error:
+            except httpx2.TransportError as error:
                 status = type(error).__name__
             statuses[status] = statuses.get(status, 0) + 1
 
     async def all_of_them() -> None:
         numbers = itertools.count(int(time.time() * 1000) << 20)
-        limits = httpx.Limits(max_connections=parallel)
+        limits = httpx2.Limits(max_connections=parallel)
         headers = {"Authorization": f"Bearer {key}"}
-        async with httpx.AsyncClient(base_url=url, headers=headers, timeout=_PATIENCE, limits=limits) as client:
+        async with httpx2.AsyncClient(base_url=url, headers=headers, timeout=_PATIENCE, limits=limits) as client:
             await asyncio.gather(*(one(client, numbers) for _ in range(parallel)))
 
     asyncio.run(all_of_them())
@@ -140,12 +140,12 @@ def submissions(url: str, key: str, files: Files, seconds: float) -> dict[str, A
     small = {role: files[role] for role in ("scene", "cameras", "style")}
     first = int(time.time() * 1000) << 20
     end = time.perf_counter() + seconds
-    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=_SHORT_PATIENCE) as client:
+    with httpx2.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=_SHORT_PATIENCE) as client:
         while time.perf_counter() < end:
             started = time.perf_counter()
             try:
                 status = str(client.post("/v1/jobs", **form(small, first + len(took))).status_code)
-            except httpx.TransportError as error:
+            except httpx2.TransportError as error:
                 status = type(error).__name__
             took.append(time.perf_counter() - started)
             statuses[status] += 1

@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import psutil
 
 from benchmarks.large_scene import multiplied, small_scene
@@ -109,7 +109,7 @@ class Trial:
 
     def __init__(self, service: Service, folder: Path, files: dict[str, Path], parameters: dict[str, Any]) -> None:
         self._service, self._folder, self._files, self._parameters = service, folder, files, parameters
-        self._client = httpx.Client(base_url=service.url, timeout=3600)
+        self._client = httpx2.Client(base_url=service.url, timeout=3600)
         self._upload = self._job = ""
 
     def tus(self) -> dict[str, Any]:
@@ -122,7 +122,7 @@ class Trial:
         )
         where = begun.raise_for_status().headers["location"]
         self._upload = begun.json()["id"]
-        with contextlib.suppress(httpx.TransportError):
+        with contextlib.suppress(httpx2.TransportError):
             self._patch(where, 0, size // 2)
         offset = int(wait_for(lambda: self._offset(where), "the first part's end"))
         self._patch(where, offset, None)
@@ -140,7 +140,7 @@ class Trial:
                 file.seek(offset)
                 while piece := file.read(_PIECE):
                     if cut_at is not None and file.tell() > cut_at:
-                        raise httpx.WriteError("cut off")
+                        raise httpx2.WriteError("cut off")
                     yield piece
 
         answer = self._client.patch(where, content=pieces(), headers=self._patch_headers(offset))

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 from PIL import Image
 
 from tests.api.page.browser import Watched, open_browser
@@ -82,7 +82,7 @@ def move(watched: Watched, frame: int) -> None:
 def submit(service: Service, files: dict[str, Path], parameters: dict[str, Any]) -> str:
     """Submit a job and return its id."""
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-    answer = httpx.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(parameters)}, timeout=120)
+    answer = httpx2.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(parameters)}, timeout=120)
     answer.raise_for_status()
     return str(answer.json()["id"])
 
@@ -93,7 +93,7 @@ def finished(service: Service, job_id: str) -> bool:
     Raises:
         SystemExit: If it has failed or was canceled.
     """
-    job = httpx.get(f"{service.url}/v1/jobs/{job_id}", timeout=60).json()
+    job = httpx2.get(f"{service.url}/v1/jobs/{job_id}", timeout=60).json()
     if job["status"] in ("failed", "canceled"):
         raise SystemExit(f"{job_id}: {job['error']}")
     return bool(job["status"] == "succeeded")

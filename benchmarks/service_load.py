@@ -29,7 +29,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import psutil
 import uvloop
 
@@ -54,7 +54,7 @@ _SUBMITTERS, _STATUS_CONNECTIONS = 16, 32
 _PIECE = 1 << 20
 
 
-async def upload(client: httpx.AsyncClient, path: Path) -> str:
+async def upload(client: httpx2.AsyncClient, path: Path) -> str:
     """Upload a small file, and return the upload's id."""
     name = base64.b64encode(path.name.encode()).decode()
     length = str(path.stat().st_size)
@@ -262,7 +262,7 @@ def _moment(timestamp: str | None) -> float:
     return datetime.fromisoformat(timestamp).timestamp() if timestamp else 0.0
 
 
-async def large_upload(client: httpx.AsyncClient, path: Path, api: psutil.Process) -> dict[str, Any]:
+async def large_upload(client: httpx2.AsyncClient, path: Path, api: psutil.Process) -> dict[str, Any]:
     """Upload a large file in one request, and measure the API's memory meanwhile."""
     size = path.stat().st_size
     begun = await client.post("/v1/uploads", headers=_TUS | {"Upload-Length": str(size)})
@@ -310,7 +310,7 @@ async def measure(
     """Measure all figures one after the other. The first of the services has the dispatcher."""
     service, urls = services[0], [each.url for each in services]
     apis = [process for each in services for process in each.processes(_API)]
-    async with httpx.AsyncClient(base_url=service.url, timeout=120) as client:
+    async with httpx2.AsyncClient(base_url=service.url, timeout=120) as client:
         ids = {role: await upload(client, path) for role, path in files.items()}
         body = {"scene": ids["scene"], "style": ids["style"], "cameras": [ids["cameras"]], "parameters": LONG}
         running = (await client.post("/v1/jobs", json=body)).json()["id"]
@@ -339,7 +339,7 @@ async def measure(
     return figures
 
 
-async def _until_it_runs(client: httpx.AsyncClient, job_id: str) -> None:
+async def _until_it_runs(client: httpx2.AsyncClient, job_id: str) -> None:
     while (job := (await client.get(f"/v1/jobs/{job_id}")).json())["status"] != "running" or not job["progress"][
         "step"
     ]:
@@ -348,7 +348,7 @@ async def _until_it_runs(client: httpx.AsyncClient, job_id: str) -> None:
         await asyncio.sleep(0.5)
 
 
-async def _speed(client: httpx.AsyncClient, job_id: str, seconds: float) -> float:
+async def _speed(client: httpx2.AsyncClient, job_id: str, seconds: float) -> float:
     steps = []
     for wait in (seconds, 0):
         steps.append((await client.get(f"/v1/jobs/{job_id}")).json()["progress"]["step"])

@@ -17,7 +17,7 @@ from concurrent.futures import Future
 from contextlib import asynccontextmanager
 from functools import cache
 
-import httpx
+import httpx2
 
 _MAX_URL = 2000
 #: Host name as in DNS; `_` is not allowed in host names but is in use.
@@ -30,7 +30,7 @@ _PROTOCOL_ASSIGNMENTS = ipaddress.IPv4Network("192.0.0.0/24")
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
 
 
-def parse_url(url: str) -> httpx.URL:
+def parse_url(url: str) -> httpx2.URL:
     """Parse a URL in the same way as the client that sends the request.
 
     Raises:
@@ -39,10 +39,10 @@ def parse_url(url: str) -> httpx.URL:
     if len(url) > _MAX_URL:
         raise ValueError(f"it has {len(url):,} characters, at most {_MAX_URL:,} are allowed")
     try:
-        parsed = httpx.URL(url)
+        parsed = httpx2.URL(url)
         host, port = parsed.raw_host.decode(), parsed.port
         _ = parsed.host  # decodes IDNA
-    except (httpx.InvalidURL, UnicodeError) as error:
+    except (httpx2.InvalidURL, UnicodeError) as error:
         raise ValueError(f"it is not a valid URL ({error})") from error
     if parsed.scheme not in ("http", "https"):
         raise ValueError("its scheme is neither http nor https")
@@ -50,7 +50,7 @@ def parse_url(url: str) -> httpx.URL:
         raise ValueError("it holds a user name or password")
     if port is not None and not 0 < port < 65536:
         raise ValueError("its port must be between 1 and 65535")
-    if "%" in host or not (_NAME.fullmatch(host) or ":" in host):  # httpx has checked bracketed hosts
+    if "%" in host or not (_NAME.fullmatch(host) or ":" in host):  # httpx2 has checked bracketed hosts
         raise ValueError("it has no valid host name")
     return parsed
 
@@ -104,7 +104,7 @@ async def checked_address(host: str, port: int, *, private_allowed: bool) -> str
     return addresses[0]
 
 
-def origin(url: httpx.URL) -> tuple[str, str, int]:
+def origin(url: httpx2.URL) -> tuple[str, str, int]:
     """Return the scheme, host and port of a URL, as they are looked up and connected to."""
     return url.scheme, url.raw_host.decode(), url.port or (443 if url.scheme == "https" else 80)
 
@@ -130,19 +130,19 @@ def parse_origins(text: str) -> frozenset[tuple[str, str, int]]:
 @cache
 def public_authorities() -> ssl.SSLContext:
     """Return the settings that verify servers by the public certificate authorities, which are read from a file."""
-    return httpx.create_ssl_context(trust_env=False)
+    return httpx2.create_ssl_context(trust_env=False)
 
 
 @asynccontextmanager
 async def send(
     method: str,
-    url: httpx.URL,
+    url: httpx2.URL,
     headers: Mapping[str, str],
     *,
     private_allowed: bool,
     content: bytes | None = None,
     tls: ssl.SSLContext | None = None,
-) -> AsyncIterator[httpx.Response]:
+) -> AsyncIterator[httpx2.Response]:
     """Send a request to a checked address, and provide the response, whose body has not been read.
 
     Redirects are not followed. The certificate must belong to the host of the URL.
@@ -155,14 +155,14 @@ async def send(
     Raises:
         PermissionError: If an address of the host is not allowed.
         OSError: If the host is unknown.
-        httpx.TransportError: If there is no valid response.
+        httpx2.TransportError: If there is no valid response.
     """
     _, host, port = origin(url)
     address = await checked_address(host, port, private_allowed=private_allowed)
     verify = await asyncio.to_thread(public_authorities) if tls is None else tls
     async with (
         # one client per request: a pooled connection to an address would be reused for other names
-        httpx.AsyncClient(verify=verify, timeout=None, follow_redirects=False, trust_env=False) as client,
+        httpx2.AsyncClient(verify=verify, timeout=None, follow_redirects=False, trust_env=False) as client,
         client.stream(
             method,
             url.copy_with(host=address, port=port),

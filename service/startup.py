@@ -75,7 +75,7 @@ def set_up(log_format: str) -> None:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter() if log_format == "json" else TextFormatter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-    for noisy in ("httpx", "httpcore", "alembic", "botocore", "uvicorn.access"):
+    for noisy in ("httpx2", "httpcore", "alembic", "botocore", "uvicorn.access"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import httpx
-from httpx_sse import ServerSentEvent
+import httpx2
 
 from service.states import ENDED
 from sgsst_core.errors import InvalidInputError, SgsstError
@@ -69,12 +68,12 @@ class Event:
     data: Mapping[str, Any]
 
     @staticmethod
-    def of(event: ServerSentEvent) -> Event:
+    def of(event: httpx2.ServerSentEvent) -> Event:
         """Return the event from the service's stream."""
         return Event(int(event.id or 0), event.event, json.loads(event.data))
 
 
-def checked(response: httpx.Response) -> httpx.Response:
+def checked(response: httpx2.Response) -> httpx2.Response:
     """Return the response if it is not an error. Its body must have been read.
 
     Raises:
@@ -92,7 +91,7 @@ def checked(response: httpx.Response) -> httpx.Response:
     raise refusal(message, response.status_code, problem)
 
 
-def _check_origin(response: httpx.Response) -> None:
+def _check_origin(response: httpx2.Response) -> None:
     """Raise an ApiError if a successful response is not the service's, whose responses are JSON or empty."""
     kind = response.headers.get("content-type", "no type")
     if response.has_redirect_location:
@@ -112,4 +111,4 @@ def refusal(message: str, status: int, problem: Mapping[str, Any]) -> ApiError:
 
 def is_temporary(error: Exception) -> bool:
     """Return whether the same request may succeed later: there was no response, or it reports a temporary failure."""
-    return isinstance(error, httpx.TransportError) or (isinstance(error, ApiError) and error.status in _TEMPORARY)
+    return isinstance(error, httpx2.TransportError) or (isinstance(error, ApiError) and error.status in _TEMPORARY)

@@ -9,8 +9,7 @@ from typing import Any, Self
 from urllib.parse import quote
 
 import anyio
-import httpx
-from httpx_sse import aconnect_sse
+import httpx2
 
 from api.client import uploads
 from api.client.answers import Event, Job, RequestError, checked
@@ -147,23 +146,23 @@ class AsyncClient:
     async def watch(self, job_id: str, after: int = 0) -> AsyncIterator[Event]:
         """Yield the events of a job as they happen, until it has ended. No event is lost when a connection breaks."""
         failures = 0
-        timeout = httpx.Timeout(30.0, read=_SILENCE_SECONDS)
+        timeout = httpx2.Timeout(30.0, read=_SILENCE_SECONDS)
         while True:
             headers = {"Last-Event-ID": str(after)} if after else {}
             path = f"{_job_path(job_id)}/events"
             try:
-                async with aconnect_sse(self._transport.http, "GET", path, headers=headers, timeout=timeout) as source:
+                async with self._transport.http.sse(path, headers=headers, timeout=timeout) as source:
                     self._transport.reached = True
-                    if source.response.status_code != httpx.codes.OK:  # 204: no events will follow
+                    if source.response.status_code != httpx2.codes.OK:  # 204: no events will follow
                         await source.response.aread()
                         checked(source.response)
                         return
-                    async for sent in source.aiter_sse():
+                    async for sent in source:
                         if sent.data:  # messages without data only keep the connection alive
                             event = Event.of(sent)
                             after, failures = event.id, 0
                             yield event
-            except httpx.TransportError as error:
+            except httpx2.TransportError as error:
                 # stamina cannot do this: each event resets the count of failures
                 failures += 1
                 if failures >= TRIES or self._transport.gives_up(error):

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import anyio.to_thread
-import httpx
+import httpx2
 import stamina
-from httpx_sse import ServerSentEvent, aconnect_sse
 
 from api.client.answers import ApiError, RequestError, checked, is_temporary, refusal
 from sgsst_core.errors import OutputError
@@ -69,7 +68,7 @@ class Download:
         tag = f'"{self._stamp.read_text()}"'
         return {"Accept-Encoding": "identity", "Range": f"bytes={self._done}-", "If-Range": tag}
 
-    def begin(self, response: httpx.Response) -> bool:
+    def begin(self, response: httpx2.Response) -> bool:
         """Process the headers of a successful response, or of status 416, which means that all bytes were received.
 
         Returns:
@@ -79,7 +78,7 @@ class Download:
             ApiError: If the response does not state the SHA-256 of the file.
             OutputError: If the disk is full.
         """
-        if response.status_code == httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
+        if response.status_code == httpx2.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
             return False
         stated = _SHA256.search(response.headers.get("etag", ""))
         if stated is None:
@@ -87,7 +86,7 @@ class Download:
                 f"{response.url}: has no SHA-256 as its ETag, so the file cannot be checked. Check the address, and "
                 "which headers a proxy removes."
             )
-        if response.status_code != httpx.codes.PARTIAL_CONTENT:
+        if response.status_code != httpx2.codes.PARTIAL_CONTENT:
             self._done = self._hashed = 0
             self._digest = hashlib.sha256()
             with disk_errors(self._target, self._part):
@@ -177,7 +176,7 @@ class Transport:
             wait_exp_base=2,
         )
 
-    async def call(self, method: str, path: str, **options: Any) -> httpx.Response:
+    async def call(self, method: str, path: str, **options: Any) -> httpx2.Response:
         """Send a request, and return its complete response.
 
         Raises:
@@ -186,7 +185,7 @@ class Transport:
         """
         json_text(options.get("json"))
 
-        async def once() -> httpx.Response:
+        async def once() -> httpx2.Response:
             response = await self.http.request(method, path, **options)
             self.reached = True
             return checked(response)
@@ -194,8 +193,8 @@ class Transport:
         return await self._retry(once, reading=method in _READS)
 
     async def listen(
-        self, method: str, path: str, take: Callable[[ServerSentEvent], None], **options: Any
-    ) -> httpx.Response | None:
+        self, method: str, path: str, take: Callable[[httpx2.ServerSentEvent], None], **options: Any
+    ) -> httpx2.Response | None:
         """Send a request, and pass each event of its response to `take`.
 
         Returns:
@@ -206,13 +205,13 @@ class Transport:
         """
         json_text(options.get("json"))
 
-        async def once() -> httpx.Response | None:
-            async with aconnect_sse(self.http, method, path, **options) as source:
+        async def once() -> httpx2.Response | None:
+            async with self.http.sse(path, method=method, **options) as source:
                 self.reached = True
                 if not source.response.headers.get("content-type", "").startswith("text/event-stream"):
                     await source.response.aread()
                     return checked(source.response)
-                async for event in source.aiter_sse():
+                async for event in source:
                     take(event)
                 return None
 
@@ -232,7 +231,7 @@ class Transport:
         """
         result: dict[str, Any] = {}
 
-        def take(event: ServerSentEvent) -> None:
+        def take(event: httpx2.ServerSentEvent) -> None:
             if not event.data:
                 return
             data = json.loads(event.data)
@@ -264,7 +263,7 @@ class Transport:
             async with self.http.stream("GET", download.path, headers=headers) as response:
                 self.reached = True
                 # Status 416 means that all bytes were received before.
-                if response.is_error and response.status_code != httpx.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
+                if response.is_error and response.status_code != httpx2.codes.REQUESTED_RANGE_NOT_SATISFIABLE:
                     await response.aread()
                     checked(response)
                 if await in_thread(download.begin, response):
@@ -281,7 +280,7 @@ class Transport:
 
     def gives_up(self, error: Exception) -> bool:
         """Return whether a read error means that there is no service, rather than that it is restarting."""
-        return isinstance(error, httpx.ConnectError) and not self.reached
+        return isinstance(error, httpx2.ConnectError) and not self.reached
 
     def unreachable(self, error: Exception) -> ApiError:
         """Return the error for a service that did not respond."""
@@ -297,21 +296,21 @@ class Transport:
 
         try:
             return await self._retrying(may_pass, once)
-        except httpx.TransportError as error:
+        except httpx2.TransportError as error:
             raise self.unreachable(error) from None
 
 
 def _is_address(url: str) -> bool:
     """Return whether a text is an http or https URL with a host and a port that can exist."""
     try:
-        parsed = httpx.URL(url)
+        parsed = httpx2.URL(url)
         parsed.host.encode("idna")
-    except (httpx.InvalidURL, UnicodeError):
+    except (httpx2.InvalidURL, UnicodeError):
         return False
     return parsed.scheme in ("http", "https") and bool(parsed.host) and 0 <= (parsed.port or 0) < 1 << 16
 
 
-def _http_client(url: str, headers: dict[str, str]) -> httpx.AsyncClient:
+def _http_client(url: str, headers: dict[str, str]) -> httpx2.AsyncClient:
     """Return an HTTP client, which takes proxies and certificate authorities from the environment.
 
     Raises:
@@ -321,8 +320,8 @@ def _http_client(url: str, headers: dict[str, str]) -> httpx.AsyncClient:
         proxy = _proxy_for(url)
         if proxy.startswith("http") and not _is_address(proxy):
             raise ValueError(f"{_without_password(proxy)} is no address")
-        return httpx.AsyncClient(base_url=url, headers=headers, timeout=httpx.Timeout(30.0, read=900.0, write=120.0))
-    except Exception as error:  # httpx raises errors of many types here, some of them built-in
+        return httpx2.AsyncClient(base_url=url, headers=headers, timeout=httpx2.Timeout(30.0, read=900.0, write=120.0))
+    except Exception as error:  # httpx2 raises errors of many types here, some of them built-in
         names = _CERTIFICATES if isinstance(error, OSError) else _PROXIES
         given = {name: value for name, value in sorted(os.environ.items()) if name.upper() in names and value}
         shown = " or ".join(f"{name}={_without_password(value)}" for name, value in given.items())
@@ -331,7 +330,7 @@ def _http_client(url: str, headers: dict[str, str]) -> httpx.AsyncClient:
 
 def _proxy_for(url: str) -> str:
     """Return the address of the proxy that the environment names for a URL; empty for none."""
-    parsed, proxies = httpx.URL(url), urllib.request.getproxies()
+    parsed, proxies = httpx2.URL(url), urllib.request.getproxies()
     proxy = proxies.get(parsed.scheme) or proxies.get("all")
     if not proxy or urllib.request.proxy_bypass(parsed.host):
         return ""

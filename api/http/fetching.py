@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import PurePosixPath
 
-import httpx
+import httpx2
 
 from api.http.multipart import check_file
 from api.http.receipts import Receipt
@@ -46,7 +46,7 @@ def is_url(text: str) -> bool:
 
 def file_name(url: str) -> str:
     """Return the file name of an input by URL, which must be valid: the last component of its path."""
-    return PurePosixPath(httpx.URL(url).path).name
+    return PurePosixPath(httpx2.URL(url).path).name
 
 
 @dataclass
@@ -114,7 +114,7 @@ class Fetcher:
             await asyncio.to_thread(receipt.charge, 0)
             return {url: await self._fetch(_Input(url, role), state) for url, role in urls.items()}
 
-    def _parse(self, url: str, source: _Input) -> httpx.URL:
+    def _parse(self, url: str, source: _Input) -> httpx2.URL:
         """Parse the URL of an input, or of a redirect from it, and check that its host is allowed."""
         if not self._allowed:
             raise problems.URLS_OFF(input=source.role)
@@ -161,9 +161,9 @@ class Fetcher:
             url = self._parse(_joined(url, location, source), source)
         raise _not_fetched(source, f"the server redirects more than {_MAX_REDIRECTS} times")
 
-    async def _body(self, source: _Input, state: _Fetch, response: httpx.Response) -> AsyncIterator[bytes]:
+    async def _body(self, source: _Input, state: _Fetch, response: httpx2.Response) -> AsyncIterator[bytes]:
         """Check the head of a response, and return the chunks of its body."""
-        if response.status_code != httpx.codes.OK:
+        if response.status_code != httpx2.codes.OK:
             raise _not_fetched(source, f"the server answered {response.status_code}")
         if response.headers.get("content-encoding", "identity").strip().lower() != "identity":
             raise _not_fetched(source, "the server compresses the file")
@@ -202,9 +202,9 @@ class Fetcher:
             raise _not_fetched(source, reason) from error
         except PermissionError as error:  # its message has the address, which is none of the client's business
             raise _invalid(source, "its host has an address that is not public") from error
-        except httpx.InvalidURL as error:  # httpx parses the target of a redirect even if it does not follow it
+        except httpx2.InvalidURL as error:  # httpx2 parses the target of a redirect even if it does not follow it
             raise _not_fetched(source, _INVALID_REDIRECT) from error
-        except (httpx.HTTPError, OSError) as error:
+        except (httpx2.HTTPError, OSError) as error:
             reason = (str(error) or type(error).__name__)[:_MAX_REASON].rstrip(".")
             raise _not_fetched(source, reason) from error
 
@@ -222,9 +222,9 @@ def _write(chunk: bytes, file: Receiver, receipt: Receipt) -> None:
     file.write(chunk)
 
 
-def _joined(url: httpx.URL, location: str, source: _Input) -> str:
+def _joined(url: httpx2.URL, location: str, source: _Input) -> str:
     """Return the target of a redirect, which may be relative."""
     try:
         return str(url.join(location))
-    except (httpx.InvalidURL, ValueError) as error:
+    except (httpx2.InvalidURL, ValueError) as error:
         raise _not_fetched(source, _INVALID_REDIRECT) from error

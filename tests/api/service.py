@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import psutil
 
 from api.http.app import create_app
@@ -80,14 +80,14 @@ class Service:
         assert self._process is not None
         assert self._process.poll() is None, f"the service has ended:\n{self.said()}"
         try:
-            return httpx.get(f"{self.url}/readyz", timeout=5, verify=False).status_code == 200
-        except httpx.TransportError:
+            return httpx2.get(f"{self.url}/readyz", timeout=5, verify=False).status_code == 200
+        except httpx2.TransportError:
             return False
 
-    def client(self, key: str | None = None) -> httpx.Client:
+    def client(self, key: str | None = None) -> httpx2.Client:
         """Return an HTTP client of the service, without certificates: there is no TLS, and they take time to load."""
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        return httpx.Client(base_url=self.url, headers=headers, timeout=60, verify=False)
+        return httpx2.Client(base_url=self.url, headers=headers, timeout=60, verify=False)
 
     def processes(self, module: str) -> list[psutil.Process]:
         """Return the service's processes that run `module` or have it as their title."""
@@ -181,7 +181,7 @@ def _document() -> dict[str, Any]:
     return create_app(ServiceSettings()).openapi()
 
 
-def check_documented(answer: httpx.Response) -> None:
+def check_documented(answer: httpx2.Response) -> None:
     """Fail unless the OpenAPI document lists the problem's status and code for the operation that returned it."""
     path, method = answer.request.url.path, answer.request.method.lower()
     for template, operations in _document()["paths"].items():

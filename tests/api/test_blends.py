@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 import torch
 
@@ -48,8 +48,8 @@ def jobs(service: Service, files: dict[str, Path]) -> list[str]:
     return [done(service, each) for each in ids]
 
 
-def post(service: Service, job_id: str, **body: object) -> httpx.Response:
-    return httpx.post(f"{service.url}/v1/jobs/{job_id}/blends", json=body, timeout=120)
+def post(service: Service, job_id: str, **body: object) -> httpx2.Response:
+    return httpx2.post(f"{service.url}/v1/jobs/{job_id}/blends", json=body, timeout=120)
 
 
 def test_blend_is_that_of_the_command(
@@ -82,7 +82,7 @@ def test_same_blend_is_stored_once(service: Service, jobs: list[str]) -> None:
     assert first.json() == second.json()
     assert first.json()["name"] == "blends/stylized_0.25.ply"
     assert first.headers["location"] == first.json()["url"]
-    download = httpx.get(service.url + first.headers["location"])
+    download = httpx2.get(service.url + first.headers["location"])
     assert download.headers["content-disposition"] == 'attachment; filename="scene_style-stylized_0.25.ply"'
 
 
@@ -105,8 +105,8 @@ def test_unusable_blends_are_refused(service: Service, files: dict[str, Path], j
         assert (answer.status_code, message in answer.text) == (status, True), answer.text
     assert post(service, unfinished, weight=0.5).status_code == 404
     assert post(service, missing, weight=0.5).status_code == 404
-    httpx.post(f"{service.url}/v1/jobs/{unfinished}/cancel")
-    listed = httpx.get(f"{service.url}/v1/jobs/{other}/artifacts").json()["artifacts"]
+    httpx2.post(f"{service.url}/v1/jobs/{unfinished}/cancel")
+    listed = httpx2.get(f"{service.url}/v1/jobs/{other}/artifacts").json()["artifacts"]
     assert not any(entry["name"].startswith("blends/") for entry in listed)
 
 

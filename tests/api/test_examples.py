@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import httpx
+import httpx2
 import numpy as np
 import pytest
 import torch
@@ -49,8 +49,8 @@ def url(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def newest_result(service: Service) -> bytes:
     """Return the stylized PLY of the newest job."""
-    job = httpx.get(f"{service.url}/v1/jobs").json()["jobs"][0]
-    return httpx.get(f"{service.url}{job['links']['result']}").content
+    job = httpx2.get(f"{service.url}/v1/jobs").json()["jobs"][0]
+    return httpx2.get(f"{service.url}{job['links']['result']}").content
 
 
 @pytest.fixture(scope="module")

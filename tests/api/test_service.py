@@ -17,7 +17,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import numpy as np
 import psutil
 import pytest
@@ -77,7 +77,7 @@ def short_job(files: dict[str, Path], service: Service) -> str:
     return ended.id
 
 
-def submit(client: httpx.Client, files: dict[str, Path], **parameters: Any) -> str:
+def submit(client: httpx2.Client, files: dict[str, Path], **parameters: Any) -> str:
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     data = {"parameters": json.dumps(PARAMETERS | parameters)}
     answer = client.post("/v1/jobs", files=body, data=data)
@@ -86,12 +86,12 @@ def submit(client: httpx.Client, files: dict[str, Path], **parameters: Any) -> s
     return str(answer.json()["id"])
 
 
-def job(client: httpx.Client, job_id: str) -> dict[str, Any]:
+def job(client: httpx2.Client, job_id: str) -> dict[str, Any]:
     content: dict[str, Any] = client.get(f"/v1/jobs/{job_id}").json()
     return content
 
 
-def wait_until(service: Service, client: httpx.Client, job_id: str, *statuses: str) -> dict[str, Any]:
+def wait_until(service: Service, client: httpx2.Client, job_id: str, *statuses: str) -> dict[str, Any]:
     def there() -> dict[str, Any] | None:
         current = job(client, job_id)
         return current if current["status"] in statuses else None
@@ -100,7 +100,7 @@ def wait_until(service: Service, client: httpx.Client, job_id: str, *statuses: s
     return reached
 
 
-def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int, attempt: int = 1) -> None:
+def wait_for_step(service: Service, client: httpx2.Client, job_id: str, step: int, attempt: int = 1) -> None:
     def there() -> bool:
         progress = job(client, job_id)["progress"] or {}
         stepping = progress.get("stage") not in ("planning", "probing", "starting")
@@ -109,7 +109,7 @@ def wait_for_step(service: Service, client: httpx.Client, job_id: str, step: int
     wait_for(there, f"step {step}", service.said)
 
 
-def events(client: httpx.Client, job_id: str, after: int = 0) -> list[tuple[int, str, dict[str, Any]]]:
+def events(client: httpx2.Client, job_id: str, after: int = 0) -> list[tuple[int, str, dict[str, Any]]]:
     """Return all events until the service closes the stream."""
     headers = {"Last-Event-ID": str(after)} if after else {}
     received = []
@@ -124,11 +124,11 @@ def events(client: httpx.Client, job_id: str, after: int = 0) -> list[tuple[int,
     return received
 
 
-def result(client: httpx.Client, job_id: str) -> bytes:
+def result(client: httpx2.Client, job_id: str) -> bytes:
     return client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply").content
 
 
-def check_colors(client: httpx.Client, job_id: str, scene: Path) -> None:
+def check_colors(client: httpx2.Client, job_id: str, scene: Path) -> None:
     """Check that the file of stylized colors contains those of the PLY, rounded to float16."""
     colors = np.frombuffer(client.get(f"/v1/jobs/{job_id}/artifacts/colors.f16").content, "<f2").reshape(-1, 3)
     stylized = PlyData.read(io.BytesIO(result(client, job_id)))["vertex"]
@@ -137,7 +137,7 @@ def check_colors(client: httpx.Client, job_id: str, scene: Path) -> None:
     assert len(colors) == len(read_scene(scene).scene), "each belongs to a row of what was sent"
 
 
-def check_course(client: httpx.Client, job_id: str, steps: list[int]) -> None:
+def check_course(client: httpx2.Client, job_id: str, steps: list[int]) -> None:
     """Check the loss history of the whole job, from the first reported step to the last."""
     points = client.get(f"/v1/jobs/{job_id}/progress").json()["points"]
     assert {point["step"] for point in points} <= set(steps)
@@ -281,7 +281,7 @@ def test_compressed_scene_and_results_in_other_formats(
 def test_concurrent_requests_share_one_compression(service: Service, short_job: str) -> None:
     where = f"{service.url}/v1/jobs/{short_job}/artifacts/stylized.ply?format=spz"
     with ThreadPoolExecutor(6) as pool:
-        answers = list(pool.map(lambda _: httpx.get(where, timeout=120), range(6)))
+        answers = list(pool.map(lambda _: httpx2.get(where, timeout=120), range(6)))
     assert {answer.status_code for answer in answers} == {200}
     assert len({answer.headers["etag"] for answer in answers}) == 1
     stored = list((service.data / "artifacts" / short_job).rglob("stylized.spz"))

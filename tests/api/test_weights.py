@@ -7,7 +7,7 @@ import os
 import shutil
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 
 from tests.api.service import Service, check_documented, wait_for
@@ -22,8 +22,8 @@ class Unready(Service):
     def ready(self) -> bool:
         """Return whether the service responds."""
         try:
-            return httpx.get(f"{self.url}/livez", timeout=5).status_code == 200
-        except httpx.TransportError:
+            return httpx2.get(f"{self.url}/livez", timeout=5).status_code == 200
+        except httpx2.TransportError:
             return False
 
 
@@ -51,7 +51,7 @@ def test_damaged_weights_block_jobs(cache: Path, tmp_path: Path) -> None:
     sound = tmp_path / "sound"
     shutil.copy2(weights, sound)
 
-    def submit(client: httpx.Client) -> httpx.Response:
+    def submit(client: httpx2.Client) -> httpx2.Response:
         return client.post("/v1/jobs", files=files, data={"parameters": json.dumps(PARAMETERS)})
 
     with Service(data, alone=True, SGSST_CACHE=str(cache)) as service, service.client() as client:

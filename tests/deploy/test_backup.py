@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import psutil
 import pytest
 
@@ -43,7 +43,7 @@ def s3() -> Iterator[str]:
 
 def bucket(s3: str, name: str) -> dict[str, str]:
     """Create a bucket, and return the environment of a service that stores its files there."""
-    assert httpx.put(f"{s3}/{name}").status_code == 200
+    assert httpx2.put(f"{s3}/{name}").status_code == 200
     return {**environment_of(s3), "SGSST_ARTIFACTS": f"s3://{name}/service"}
 
 
@@ -53,7 +53,7 @@ def backup(environment: dict[str, str], *words: str | Path) -> subprocess.Comple
     return subprocess.run(command, env=own, capture_output=True, text=True)
 
 
-def submit(client: httpx.Client, folder: Path, **parameters: Any) -> str:
+def submit(client: httpx2.Client, folder: Path, **parameters: Any) -> str:
     files = zip(("scene", "cameras", "style"), write_files(folder, wall()), strict=True)
     body = {role: (path.name, path.read_bytes()) for role, path in files}
     answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(PARAMETERS | parameters)})
@@ -61,11 +61,11 @@ def submit(client: httpx.Client, folder: Path, **parameters: Any) -> str:
     return str(answer.json()["id"])
 
 
-def job(client: httpx.Client, job_id: str) -> dict[str, Any]:
+def job(client: httpx2.Client, job_id: str) -> dict[str, Any]:
     return dict(client.get(f"/v1/jobs/{job_id}").json())
 
 
-def has_ended(client: httpx.Client, job_id: str) -> bool:
+def has_ended(client: httpx2.Client, job_id: str) -> bool:
     return job(client, job_id)["status"] in ("succeeded", "failed")
 
 

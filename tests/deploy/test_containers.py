@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 
 from tests.api.service import wait_for
@@ -83,20 +83,20 @@ class Composed:
     def health(self) -> dict[str, Any]:
         """Return the response of `/readyz`; an empty dictionary if there is none."""
         try:
-            return dict(httpx.get(f"{self.url}/readyz", timeout=5).json())
-        except (httpx.TransportError, ValueError):
+            return dict(httpx2.get(f"{self.url}/readyz", timeout=5).json())
+        except (httpx2.TransportError, ValueError):
             return {}
 
-    def client(self) -> httpx.Client:
+    def client(self) -> httpx2.Client:
         """Return an HTTP client with the API key."""
-        return httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {self.key}"}, timeout=60)
+        return httpx2.Client(base_url=self.url, headers={"Authorization": f"Bearer {self.key}"}, timeout=60)
 
     def job(self, job_id: str) -> dict[str, Any]:
         """Return a job from the API; an empty dictionary if the API does not respond."""
         try:
             with self.client() as client:
                 return dict(client.get(f"/v1/jobs/{job_id}").json())
-        except (httpx.TransportError, ValueError):
+        except (httpx2.TransportError, ValueError):
             return {}
 
 
@@ -169,7 +169,7 @@ def test_submit_to_container_equals_stylize(
 
 
 def test_container_requires_a_key(composed: Composed) -> None:
-    assert httpx.get(f"{composed.url}/v1/jobs").status_code == 401
+    assert httpx2.get(f"{composed.url}/v1/jobs").status_code == 401
 
 
 def test_container_health_follows_its_process(composed: Composed) -> None:

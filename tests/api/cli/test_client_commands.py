@@ -14,7 +14,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from PIL import Image
 
@@ -174,7 +174,7 @@ def test_interrupted_watch_says_that_the_job_continues(
         assert process.returncode == 130, shown + rest
         assert "The job continues on the service." in rest
         assert "Cancel: sgsst cancel job_" in rest
-    assert httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["status"] == "queued"
+    assert httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["status"] == "queued"
 
 
 def test_download_replaces_no_file_of_another_job(
@@ -238,7 +238,7 @@ def test_outputs_are_checked_before_a_job_is_queued(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:
     """Neither the scene nor a file of another kind is overwritten, and nothing fails after the job has ended."""
-    before = len(httpx.get(f"{service.url}/v1/jobs").json()["jobs"])
+    before = len(httpx2.get(f"{service.url}/v1/jobs").json()["jobs"])
     (tmp_path / "file").touch()
     for out, message in (
         (files[0], "is the scene itself"),
@@ -248,7 +248,7 @@ def test_outputs_are_checked_before_a_job_is_queued(
     ):
         assert main(["submit", *files, "--out", str(out)]) == 2
         assert message in capsys.readouterr().err
-    assert len(httpx.get(f"{service.url}/v1/jobs").json()["jobs"]) == before
+    assert len(httpx2.get(f"{service.url}/v1/jobs").json()["jobs"]) == before
 
 
 def test_download_names_a_target_that_cannot_be_written(

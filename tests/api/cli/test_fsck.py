@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 
 from api.cli.main import main
@@ -43,7 +43,7 @@ def umask() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def server() -> Iterator[str]:
     with s3_server() as url:
-        assert httpx.put(f"{url}/fsck").status_code == 200
+        assert httpx2.put(f"{url}/fsck").status_code == 200
         yield url
 
 

@@ -8,7 +8,7 @@ import re
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 from fastapi.responses import StreamingResponse
 from starlette.responses import Response
@@ -47,7 +47,7 @@ class Refusing:
         await (Response(status_code=418) if scope["path"] == "/refused" else self._app)(scope, receive, send)
 
 
-async def request_all(folder: Path) -> tuple[dict[str, httpx.Response], str]:
+async def request_all(folder: Path) -> tuple[dict[str, httpx2.Response], str]:
     """Send requests to the app with a few routes that fail, and return the responses by path and the metrics."""
     app = create_app(ServiceSettings(data=folder, min_free_bytes=0))
     app.add_middleware(Refusing)
@@ -60,8 +60,8 @@ async def request_all(folder: Path) -> tuple[dict[str, httpx.Response], str]:
     for route in (fail, break_off, hang):
         app.add_api_route(f"/{route.__name__}", route)
     async with app.router.lifespan_context(app):
-        transport = httpx.ASGITransport(app, raise_app_exceptions=False)
-        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+        transport = httpx2.ASGITransport(app, raise_app_exceptions=False)
+        async with httpx2.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
             answers = {path: await client.get(path) for path in ("/livez", "/fail", "/break_off", "/refused", "/x")}
             hanging = asyncio.create_task(client.get("/hang"))
             await reached.wait()

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-import httpx
+import httpx2
 import numpy as np
 import psutil
 import pytest
@@ -64,7 +64,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> I
 
 
 @pytest.fixture
-def client(service: Service) -> Iterator[httpx.Client]:
+def client(service: Service) -> Iterator[httpx2.Client]:
     with service.client() as opened:
         yield opened
 
@@ -80,7 +80,7 @@ def form(files: dict[str, bytes], **changed: bytes | tuple[str, bytes] | None) -
     return parts
 
 
-def refused(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
+def refused(answer: httpx2.Response, status: int, code: str) -> dict[str, Any]:
     """Check that a response is a problem document with this status and code, and return the document."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
@@ -93,7 +93,7 @@ def refused(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
     return problem
 
 
-def jobs_of(client: httpx.Client) -> list[str]:
+def jobs_of(client: httpx2.Client) -> list[str]:
     return [entry["id"] for entry in client.get("/v1/jobs", params={"limit": 200}).json()["jobs"]]
 
 
@@ -151,7 +151,7 @@ HOSTILE = [
 
 @pytest.mark.parametrize(("role", "make", "code"), [case[1:] for case in HOSTILE], ids=[case[0] for case in HOSTILE])
 def test_unusable_files_are_rejected(
-    client: httpx.Client, files: dict[str, bytes], role: str, make: Any, code: str
+    client: httpx2.Client, files: dict[str, bytes], role: str, make: Any, code: str
 ) -> None:
     before = jobs_of(client)
     name = {"photos": "view_0.png", "cameras": "cameras.json"}.get(role, role)
@@ -185,7 +185,7 @@ PARAMETERS = [
 
 
 @pytest.mark.parametrize(("text", "code"), PARAMETERS, ids=[text[:30] for text, _ in PARAMETERS])
-def test_invalid_parameters_are_rejected(client: httpx.Client, files: dict[str, bytes], text: str, code: str) -> None:
+def test_invalid_parameters_are_rejected(client: httpx2.Client, files: dict[str, bytes], text: str, code: str) -> None:
     refused(client.post("/v1/jobs", files=form(files), data={"parameters": text}), 422, code)
 
 
@@ -209,7 +209,7 @@ def test_invalid_parameters_are_rejected(client: httpx.Client, files: dict[str, 
     ],
 )
 def test_value_of_several_types_gets_one_message(
-    client: httpx.Client, files: dict[str, bytes], values: dict[str, Any], at: str, message: str
+    client: httpx2.Client, files: dict[str, bytes], values: dict[str, Any], at: str, message: str
 ) -> None:
     """The message lists the types, and names the parameter rather than one of its types."""
     answer = client.post("/v1/jobs", files=form(files), data={"parameters": json.dumps(values)})
@@ -218,7 +218,7 @@ def test_value_of_several_types_gets_one_message(
     assert problem["detail"].startswith(f"{at}: {message}")
 
 
-def test_style_scale_beyond_image_limit_is_rejected(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_style_scale_beyond_image_limit_is_rejected(client: httpx2.Client, files: dict[str, bytes]) -> None:
     line = form(files, style=png(5000, 1, zlib.compress(bytes(1 + 3 * 5000))))
     for where in ("/v1/jobs", "/v1/jobs?dry_run=true"):
         answer = client.post(where, files=line, data={"parameters": '{"style_scale": 4}'})
@@ -226,7 +226,7 @@ def test_style_scale_beyond_image_limit_is_rejected(client: httpx.Client, files:
 
 
 @pytest.mark.slow
-def test_plan_lists_controls(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_plan_lists_controls(client: httpx2.Client, files: dict[str, bytes]) -> None:
     asked = {"preserve_colors": "luminance", "sh_attenuation": 0.5, "scales": [1, 0.5], "coarsest_side": 16}
     answer = client.post("/v1/jobs?dry_run=true", files=form(files), data={"parameters": json.dumps(asked)})
     assert answer.status_code == 200, answer.text
@@ -234,7 +234,7 @@ def test_plan_lists_controls(client: httpx.Client, files: dict[str, bytes]) -> N
     assert {"colors", "weights of scales"} <= items
 
 
-def test_missing_and_surplus_files_are_rejected(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_missing_and_surplus_files_are_rejected(client: httpx2.Client, files: dict[str, bytes]) -> None:
     assert refused(client.post("/v1/jobs", files=form(files, style=None)), 422, "invalid-request")["input"] == "style"
     refused(client.post("/v1/jobs", files=form(files, cameras=None)), 422, "invalid-cameras")
     refused(client.post("/v1/jobs", files=[*form(files), ("scene", ("b.ply", files["scene"]))]), 422, "invalid-request")
@@ -243,7 +243,7 @@ def test_missing_and_surplus_files_are_rejected(client: httpx.Client, files: dic
 
 
 @pytest.mark.slow
-def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_several_styles_are_mixed(client: httpx2.Client, files: dict[str, bytes]) -> None:
     """Styles keep their order, whether uploaded or sent, and each needs one weight."""
     other = png(40, 30, zlib.compress(bytes(30 * (1 + 3 * 40))))
     headers = {
@@ -271,11 +271,11 @@ def test_several_styles_are_mixed(client: httpx.Client, files: dict[str, bytes])
 
 
 @pytest.mark.slow
-def test_regions_name_style_files(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_regions_name_style_files(client: httpx2.Client, files: dict[str, bytes]) -> None:
     other = png(40, 30, zlib.compress(bytes(30 * (1 + 3 * 40))))
     parts = [*form(files), ("style", ("night sky.png", other))]
 
-    def answer(*regions: dict[str, Any], files: Any = parts, **more: Any) -> httpx.Response:
+    def answer(*regions: dict[str, Any], files: Any = parts, **more: Any) -> httpx2.Response:
         data = {"parameters": json.dumps({"regions": regions, "preset": "preview", **more})}
         return client.post("/v1/jobs?dry_run=true", files=files, data=data)
 
@@ -286,7 +286,7 @@ def test_regions_name_style_files(client: httpx.Client, files: dict[str, bytes])
     assert "use night sky.png, with weight 2" in decisions["region right"]
     assert "stay unchanged" in decisions["region left"]
     assert "regions" in decisions
-    wrong: list[tuple[httpx.Response, str]] = [
+    wrong: list[tuple[httpx2.Response, str]] = [
         (answer({**right, "style": "day.png"}), "invalid-request"),
         (answer(right, style_weights=[1, 1]), "invalid-request"),
         (answer(right, files=form(files, style=("night sky.png", other))), "invalid-request"),
@@ -307,7 +307,7 @@ WHOLE = np.packbits(np.ones(616, bool)).tobytes()
 LEFT = np.packbits(np.arange(616) % 28 < 14, bitorder="little").tobytes()
 
 
-def test_masks_select_regions(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_masks_select_regions(client: httpx2.Client, files: dict[str, bytes]) -> None:
     """Columns 14 to 27 of the wall fill the right half of the views, where the images are white."""
     right = Image.new("L", (64, 48))
     right.paste(255, (32, 0, 64, 48))
@@ -350,7 +350,7 @@ PHOTOS = {
 }
 
 
-def test_photos_and_masks_keep_the_names_of_cameras(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_photos_and_masks_keep_the_names_of_cameras(client: httpx2.Client, files: dict[str, bytes]) -> None:
     """A dry run uses every photo and mask. One that belongs to no camera is refused, however it is sent."""
     views = json.loads(files["cameras"])
     named = [{**views[index % len(views)], "id": index, "img_name": name} for index, name in enumerate(PHOTOS)]
@@ -404,7 +404,7 @@ def test_photos_and_masks_keep_the_names_of_cameras(client: httpx.Client, files:
     ],
 )
 def test_unusable_masks_are_refused(
-    client: httpx.Client, files: dict[str, bytes], select: str, name: str, content: bytes, code: str, detail: str
+    client: httpx2.Client, files: dict[str, bytes], select: str, name: str, content: bytes, code: str, detail: str
 ) -> None:
     regions = [{"name": "a", "select": select, "freeze": True}]
     parts = [*form(files), ("mask", (name, content))]
@@ -415,7 +415,7 @@ def test_unusable_masks_are_refused(
     assert "mask/" not in problem["detail"]
 
 
-def test_file_names_cannot_escape_folder(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_file_names_cannot_escape_folder(client: httpx2.Client, files: dict[str, bytes]) -> None:
     for name in (
         "../../../../etc/passwd",
         "/etc/passwd",
@@ -436,7 +436,7 @@ def test_file_names_cannot_escape_folder(client: httpx.Client, files: dict[str, 
 
 
 def test_stored_jobs_are_shown_as_they_were_stored(
-    service: Service, client: httpx.Client, files: dict[str, bytes]
+    service: Service, client: httpx2.Client, files: dict[str, bytes]
 ) -> None:
     """Parameter names that this version lacks are shown as stored. Only a retry of such a job is refused."""
     created = client.post("/v1/jobs", files=form(files)).json()
@@ -469,7 +469,7 @@ def value_of(option: Declared) -> object:
 
 
 def test_submit_sends_every_parameter(
-    service: Service, client: httpx.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    service: Service, client: httpx2.Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parameters = {"name": "all", "resolution": 64, "background": [1.0, 1.0, 1.0], "style_weights": [1.0, 2.5]}
     parameters["style_background"] = [0.0, 0.0, 0.0]
@@ -523,7 +523,7 @@ def until_closed(service: Service, head: str) -> tuple[bytes, bytes]:
     return first, body
 
 
-def test_truncated_body_is_rejected(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_truncated_body_is_rejected(service: Service, client: httpx2.Client, files: dict[str, bytes]) -> None:
     request = client.build_request("POST", "/v1/jobs", files=form(files))
     body = request.read()
     before = jobs_of(client)
@@ -558,11 +558,11 @@ def test_slow_body_is_rejected(service: Service) -> None:
 
 
 @pytest.mark.parametrize("kind", ["text/plain", ""])
-def test_other_media_types_are_rejected(client: httpx.Client, kind: str) -> None:
+def test_other_media_types_are_rejected(client: httpx2.Client, kind: str) -> None:
     refused(client.post("/v1/jobs", content=b"x", headers={"content-type": kind}), 415, "unsupported-media-type")
 
 
-def test_too_long_request_is_rejected(service: Service, client: httpx.Client) -> None:
+def test_too_long_request_is_rejected(service: Service, client: httpx2.Client) -> None:
     head = "POST /v1/jobs HTTP/1.1\nHost: 127.0.0.1\nContent-Length: 600000000\n"
     head += "Content-Type: multipart/form-data; boundary=x"
     assert b" 413 " in raw(service, head, b"--x\r\n", close=False).splitlines()[0]
@@ -570,7 +570,7 @@ def test_too_long_request_is_rejected(service: Service, client: httpx.Client) ->
 
 
 def test_memory_is_constant_while_receiving_files(
-    service: Service, client: httpx.Client, files: dict[str, bytes]
+    service: Service, client: httpx2.Client, files: dict[str, bytes]
 ) -> None:
     client.get("/readyz")
     api = service.process("api.http.server")
@@ -598,7 +598,7 @@ def test_memory_is_constant_while_receiving_files(
 # --- uploads -------------------------------------------------------------------------------------------------------
 
 
-def begin(client: httpx.Client, size: int, name: str = "scene.ply") -> str:
+def begin(client: httpx2.Client, size: int, name: str = "scene.ply") -> str:
     metadata = f"filename {base64.b64encode(name.encode()).decode()}"
     answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(size), "Upload-Metadata": metadata})
     assert answer.status_code == 201, answer.text
@@ -606,18 +606,18 @@ def begin(client: httpx.Client, size: int, name: str = "scene.ply") -> str:
     return str(answer.headers["location"])
 
 
-def send(client: httpx.Client, where: str, offset: int, data: bytes, **headers: str) -> httpx.Response:
+def send(client: httpx2.Client, where: str, offset: int, data: bytes, **headers: str) -> httpx2.Response:
     fixed = {**TUS, "Upload-Offset": str(offset), "Content-Type": OFFSET_STREAM}
     return client.patch(where, content=data, headers={**fixed, **headers})
 
 
-def upload(client: httpx.Client, data: bytes, name: str) -> str:
+def upload(client: httpx2.Client, data: bytes, name: str) -> str:
     where = begin(client, len(data), name)
     assert send(client, where, 0, data).status_code == 204
     return where.rsplit("/", 1)[1]
 
 
-def test_upload_in_parts_becomes_job(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_upload_in_parts_becomes_job(service: Service, client: httpx2.Client, files: dict[str, bytes]) -> None:
     scene = files["scene"]
     where = begin(client, len(scene))
     assert client.head(where, headers=TUS).headers["upload-offset"] == "0"
@@ -645,7 +645,7 @@ def test_upload_in_parts_becomes_job(service: Service, client: httpx.Client, fil
     assert mixed.status_code == 202, mixed.text
 
 
-def test_method_of_an_upload_can_be_sent_as_a_header(client: httpx.Client) -> None:
+def test_method_of_an_upload_can_be_sent_as_a_header(client: httpx2.Client) -> None:
     where = begin(client, 10)
     part = {**TUS, "Upload-Offset": "0", "Content-Type": OFFSET_STREAM, "X-HTTP-Method-Override": "PATCH"}
     answer = client.post(where, content=b"01234", headers=part)
@@ -658,7 +658,7 @@ def test_method_of_an_upload_can_be_sent_as_a_header(client: httpx.Client) -> No
     assert client.post("/v1/uploads/x", headers={**TUS, "X-HTTP-Method-Override": "DELETE"}).status_code == 404
 
 
-def test_method_is_overridden_for_uploads_only(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_method_is_overridden_for_uploads_only(client: httpx2.Client, files: dict[str, bytes]) -> None:
     where = f"/v1/jobs/{client.post('/v1/jobs', files=form(files)).json()['id']}"
     assert client.get(where, headers={"X-HTTP-Method-Override": "DELETE"}).status_code == 200
     assert client.post(where, headers={"X-HTTP-Method-Override": "DELETE"}).status_code == 405
@@ -675,7 +675,7 @@ def test_method_is_overridden_for_uploads_only(client: httpx.Client, files: dict
         {"Content-Type": OFFSET_STREAM},
     ],
 )
-def test_extensions_that_are_not_offered_are_refused(client: httpx.Client, headers: dict[str, str]) -> None:
+def test_extensions_that_are_not_offered_are_refused(client: httpx2.Client, headers: dict[str, str]) -> None:
     answer = client.post("/v1/uploads", content=b"01234", headers={**TUS, "Upload-Length": "5", **headers})
     problem = refused(answer, 400, "unsupported-tus-extension")
     assert problem["detail"].startswith(next(iter(headers)))
@@ -687,7 +687,7 @@ def test_extensions_that_are_not_offered_are_refused(client: httpx.Client, heade
 
 
 def test_links_among_unfinished_uploads_are_not_followed(
-    service: Service, client: httpx.Client, tmp_path: Path
+    service: Service, client: httpx2.Client, tmp_path: Path
 ) -> None:
     target = tmp_path / "target"
     target.write_bytes(b"untouched!")
@@ -704,7 +704,7 @@ def test_links_among_unfinished_uploads_are_not_followed(
     assert target.read_bytes() == b"untouched!"
 
 
-def test_broken_connection_preserves_received_bytes(service: Service, client: httpx.Client) -> None:
+def test_broken_connection_preserves_received_bytes(service: Service, client: httpx2.Client) -> None:
     where = begin(client, 5 * MB)
     head = f"PATCH {where} HTTP/1.1\nHost: 127.0.0.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\n"
     head += f"Content-Type: {OFFSET_STREAM}\nContent-Length: {5 * MB}"
@@ -717,7 +717,7 @@ def test_broken_connection_preserves_received_bytes(service: Service, client: ht
     assert client.get(where).json()["sha256"] == hashlib.sha256(bytes(5 * MB)).hexdigest()
 
 
-def test_jobs_share_stored_scene(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_jobs_share_stored_scene(service: Service, client: httpx2.Client, files: dict[str, bytes]) -> None:
     for _ in range(3):
         upload(client, files["scene"], "again.ply")
         assert client.post("/v1/jobs", files=form(files)).status_code == 202
@@ -725,7 +725,7 @@ def test_jobs_share_stored_scene(service: Service, client: httpx.Client, files: 
     assert len(list((service.data / "blobs").glob(f"*/{digest}*"))) == 1
 
 
-def test_uploads_follow_tus_protocol(client: httpx.Client) -> None:
+def test_uploads_follow_tus_protocol(client: httpx2.Client) -> None:
     options = client.options("/v1/uploads")
     assert options.status_code == 204
     assert set(options.headers["tus-extension"].split(",")) == {"creation", "expiration", "checksum", "termination"}
@@ -739,7 +739,7 @@ def test_uploads_follow_tus_protocol(client: httpx.Client) -> None:
     refused(client.get(where), 404, "not-found")
 
 
-def test_idempotency_keys_prevent_duplicates(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_idempotency_keys_prevent_duplicates(client: httpx2.Client, files: dict[str, bytes]) -> None:
     headers = {"Idempotency-Key": "the-same"}
     first = client.post("/v1/jobs", files=form(files), headers=headers)
     again = client.post("/v1/jobs", files=form(files), headers=headers)
@@ -754,7 +754,7 @@ def test_idempotency_keys_prevent_duplicates(client: httpx.Client, files: dict[s
 # --- who is asking -------------------------------------------------------------------------------------------------
 
 
-def test_keys_cannot_access_each_others_jobs(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_keys_cannot_access_each_others_jobs(service: Service, client: httpx2.Client, files: dict[str, bytes]) -> None:
     store = open_store(ServiceSettings(data=service.data))
     (mine, text), (_, other) = store.keys.create("mine"), store.keys.create("other")
     with service.client(text) as me, service.client(other) as you:
@@ -785,7 +785,7 @@ def test_keys_cannot_access_each_others_jobs(service: Service, client: httpx.Cli
     store.close()
 
 
-def test_web_pages_cannot_use_a_service_without_keys(client: httpx.Client) -> None:
+def test_web_pages_cannot_use_a_service_without_keys(client: httpx2.Client) -> None:
     refused(client.get("/v1/jobs", headers={"Host": "evil.example"}), 403, "foreign-site")
     refused(client.get("/v1/jobs", headers={"Origin": "https://evil.example"}), 403, "foreign-site")
     refused(client.get("/v1/jobs", headers={"Origin": "null"}), 403, "foreign-site")
@@ -865,14 +865,14 @@ def test_job_limit_and_full_disk_reject_requests(tmp_path: Path, files: dict[str
 
 def _answers(url: str) -> bool:
     try:
-        return httpx.get(f"{url}/livez", timeout=5).status_code == 200
-    except httpx.TransportError:
+        return httpx2.get(f"{url}/livez", timeout=5).status_code == 200
+    except httpx2.TransportError:
         return False
 
 
 @pytest.mark.parametrize("name", ["background", "style_background"])
-def test_colors_are_names_numbers_or_fractions(client: httpx.Client, files: dict[str, bytes], name: str) -> None:
-    def sent(color: object) -> httpx.Response:
+def test_colors_are_names_numbers_or_fractions(client: httpx2.Client, files: dict[str, bytes], name: str) -> None:
+    def sent(color: object) -> httpx2.Response:
         return client.post("/v1/jobs", files=form(files), data={"parameters": json.dumps({name: color})})
 
     for color, fractions in (("white", [1, 1, 1]), ("0,51,255", [0, 0.2, 1]), ([0, 0.2, 1], [0, 0.2, 1])):
@@ -881,7 +881,7 @@ def test_colors_are_names_numbers_or_fractions(client: httpx.Client, files: dict
         assert name in refused(sent(wrong), 422, "invalid-request")["detail"]
 
 
-def test_job_is_named_by_its_files_and_renamed(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_job_is_named_by_its_files_and_renamed(client: httpx2.Client, files: dict[str, bytes]) -> None:
     named = form(files, scene=("plush.compressed.ply", files["scene"]), style=("starry_night.jpg", files["style"]))
     job = client.post("/v1/jobs", files=named).json()
     here = f"/v1/jobs/{job['id']}"
@@ -897,7 +897,7 @@ def test_job_is_named_by_its_files_and_renamed(client: httpx.Client, files: dict
     refused(client.patch("/v1/jobs/job_1", json={"name": "a"}), 404, "not-found")
 
 
-def test_stream_after_last_event_is_empty(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_stream_after_last_event_is_empty(client: httpx2.Client, files: dict[str, bytes]) -> None:
     """A stream would never end after the last event of an ended job, or after an event that does not exist."""
     job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
     client.post(f"/v1/jobs/{job_id}/cancel")
@@ -909,7 +909,7 @@ def test_stream_after_last_event_is_empty(client: httpx.Client, files: dict[str,
     assert client.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": str(last - 1)}).status_code == 200
 
 
-def test_stream_after_unknown_event_starts_again(client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_stream_after_unknown_event_starts_again(client: httpx2.Client, files: dict[str, bytes]) -> None:
     where = f"/v1/jobs/{client.post('/v1/jobs', files=form(files)).json()['id']}"
     first = ""
     for headers in ({}, {"Last-Event-ID": "100000"}, {"Last-Event-ID": str(2**61)}):
@@ -920,7 +920,7 @@ def test_stream_after_unknown_event_starts_again(client: httpx.Client, files: di
     client.post(f"{where}/cancel")
 
 
-def test_head_is_get_without_body(service: Service, client: httpx.Client, files: dict[str, bytes]) -> None:
+def test_head_is_get_without_body(service: Service, client: httpx2.Client, files: dict[str, bytes]) -> None:
     job = client.post("/v1/jobs", files=form(files)).json()["id"]
     where = f"/v1/jobs/{job}"
     paths = ["/", "/docs", "/openapi.json", "/livez", "/readyz", "/v1/jobs", "/v1/session", "/v1/jobs/job_1"]
@@ -943,7 +943,7 @@ def test_head_is_get_without_body(service: Service, client: httpx.Client, files:
 
 @pytest.mark.parametrize("path", ["/events", "/inputs/scene", "", "/none"])
 def test_responses_to_http_1_0_are_not_chunked(
-    service: Service, client: httpx.Client, files: dict[str, bytes], path: str
+    service: Service, client: httpx2.Client, files: dict[str, bytes], path: str
 ) -> None:
     where = f"/v1/jobs/{client.post('/v1/jobs', files=form(files)).json()['id']}"
     client.post(f"{where}/cancel")  # the stream ends
@@ -954,12 +954,12 @@ def test_responses_to_http_1_0_are_not_chunked(
     assert body == wanted
 
 
-def test_prefix_of_untrusted_proxy_is_ignored(client: httpx.Client) -> None:
+def test_prefix_of_untrusted_proxy_is_ignored(client: httpx2.Client) -> None:
     headers = {**TUS, "Upload-Length": "10", "X-Forwarded-Prefix": "/sgsst"}
     assert client.post("/v1/uploads", headers=headers).headers["location"].startswith("/v1/uploads/")
 
 
-def test_unknown_paths_and_methods(client: httpx.Client) -> None:
+def test_unknown_paths_and_methods(client: httpx2.Client) -> None:
     answer = client.get("/v1/nothing")
     refused(answer, 404, "not-found")
     assert answer.json()["detail"] == "There is nothing at '/v1/nothing'. /docs lists all paths."
@@ -976,7 +976,7 @@ def test_unknown_paths_and_methods(client: httpx.Client) -> None:
     refused(client.get("/v1/jobs", params={"status": "x"}), 422, "invalid-request")
 
 
-def test_readiness_reports_dispatchers(service: Service, client: httpx.Client) -> None:
+def test_readiness_reports_dispatchers(service: Service, client: httpx2.Client) -> None:
     answer = client.get("/readyz")
     assert (answer.status_code, answer.json()["status"]) == (200, "waiting")
     parts = dict.fromkeys(("database", "artifacts", "disk", "weights"), "ok")
@@ -1033,7 +1033,7 @@ def test_metrics_count_attempts_by_outcome(tmp_path: Path, files: dict[str, byte
         store.close()
 
 
-def test_metrics_and_documentation(client: httpx.Client) -> None:
+def test_metrics_and_documentation(client: httpx2.Client) -> None:
     client.get("/v1/jobs")
     text = client.get("/metrics").text
     assert 'sgsst_requests_total{method="GET",route="/v1/jobs",status="200"}' in text
@@ -1043,7 +1043,7 @@ def test_metrics_and_documentation(client: httpx.Client) -> None:
     assert "JobParameters" in document["components"]["schemas"]
 
 
-def test_broken_requests_leave_no_files(service: Service, client: httpx.Client) -> None:
+def test_broken_requests_leave_no_files(service: Service, client: httpx2.Client) -> None:
     rubbish = b"\x00\xff" * 1000
     for boundary in ("x", "--", "a b"):
         client.post(

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 
 from api.http.routes import artifacts as routes
@@ -44,12 +44,12 @@ def store(service: Service) -> Iterator[Store]:
 
 
 @pytest.fixture
-def client(service: Service) -> Iterator[httpx.Client]:
+def client(service: Service) -> Iterator[httpx2.Client]:
     with service.client() as opened:
         yield opened
 
 
-def submit(client: httpx.Client, files: dict[str, tuple[str, bytes]]) -> str:
+def submit(client: httpx2.Client, files: dict[str, tuple[str, bytes]]) -> str:
     answer = client.post("/v1/jobs", files=files)
     assert answer.status_code == 202, answer.text
     return str(answer.json()["id"])
@@ -83,7 +83,7 @@ def flip(path: Path) -> None:
         file.write(bytes([byte ^ 4]))
 
 
-def refused(answer: httpx.Response, code: str) -> None:
+def refused(answer: httpx2.Response, code: str) -> None:
     assert (answer.status_code, answer.json()["code"]) == (500, code), answer.text
     check_documented(answer)
     assert "etag" not in answer.headers
@@ -95,7 +95,7 @@ def blob_of(service: Service, store: Store, job_id: str, role: str) -> Path:
 
 
 def test_damaged_result_is_not_sent(
-    service: Service, store: Store, client: httpx.Client, files: dict[str, Any], tmp_path: Path
+    service: Service, store: Store, client: httpx2.Client, files: dict[str, Any], tmp_path: Path
 ) -> None:
     job_id = submit(client, files)
     path = publish(service, store, job_id, "plan.json", b'{"a": 1}' * 1000, tmp_path)
@@ -112,7 +112,7 @@ def test_damaged_result_is_not_sent(
 
 
 def test_replaced_result_is_not_reported_lost(
-    service: Service, store: Store, client: httpx.Client, files: dict[str, Any], tmp_path: Path
+    service: Service, store: Store, client: httpx2.Client, files: dict[str, Any], tmp_path: Path
 ) -> None:
     job_id = submit(client, files)
     path = publish(service, store, job_id, "plan.json", b"{}", tmp_path)
@@ -131,7 +131,7 @@ def test_replaced_result_is_not_reported_lost(
 
 @pytest.mark.parametrize("lost", [True, False])
 def test_uploading_again_restores_lost_file(
-    service: Service, store: Store, client: httpx.Client, files: dict[str, Any], lost: bool
+    service: Service, store: Store, client: httpx2.Client, files: dict[str, Any], lost: bool
 ) -> None:
     job_id = submit(client, files)
     path, where = blob_of(service, store, job_id, "scene"), f"/v1/jobs/{job_id}/inputs/scene"
@@ -146,7 +146,7 @@ def test_uploading_again_restores_lost_file(
     assert blob_of(service, store, again, "scene") == path
 
 
-def test_data_folder_is_private(service: Service, client: httpx.Client, files: dict[str, Any]) -> None:
+def test_data_folder_is_private(service: Service, client: httpx2.Client, files: dict[str, Any]) -> None:
     submit(client, files)
     assert stat.S_IMODE(service.data.stat().st_mode) == 0o700
     # Folders below that of the results belong to the process of this test.

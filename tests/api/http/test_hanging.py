@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 import uvicorn
 from fastapi import FastAPI, Request
@@ -41,7 +41,7 @@ def hanging_store(folder: Path) -> Iterator[Hanging]:
     """Provide settings with a store that can hang, and functions that make it hang and answer again."""
     with s3_server() as url:
         s3 = FaultyS3(url)
-        assert httpx.put(f"{url}/results").status_code == 200
+        assert httpx2.put(f"{url}/results").status_code == 200
         settings = {"SGSST_ARTIFACTS": "s3://results/files", **environment_of(s3.url)}
         yield settings, lambda: s3.fail("silence", 10**6), s3.heal
         s3.close()
@@ -83,7 +83,7 @@ def test_hanging_files_delay_only_requests_that_need_them(
         store = open_store(ServiceSettings(data=data))
         mine, others = (service.client(store.keys.create(name)[1]) for name in ("me", "other"))
         store.close()
-        mine.timeout = httpx.Timeout(PATIENCE)
+        mine.timeout = httpx2.Timeout(PATIENCE)
         job_id = mine.post("/v1/jobs", files=form(files)).json()["id"]
         hang()
         pool = stack.enter_context(ThreadPoolExecutor(MANY))
@@ -163,17 +163,17 @@ def server() -> Iterator[str]:
 
 
 def test_deadline_is_of_a_request_without_progress(server: str) -> None:
-    answer = httpx.get(f"{server}/hang")
+    answer = httpx2.get(f"{server}/hang")
     assert (answer.status_code, answer.json()["code"]) == (503, problems.DEADLINE_EXCEEDED.code)
     assert int(answer.headers["retry-after"]) > 0
-    assert httpx.get(f"{server}/works").json() == "done"
-    assert httpx.get(f"{server}/stream?stall=false").text == "x" * 10
-    with pytest.raises(httpx.RemoteProtocolError):
-        httpx.get(f"{server}/stream?stall=true")
+    assert httpx2.get(f"{server}/works").json() == "done"
+    assert httpx2.get(f"{server}/stream?stall=false").text == "x" * 10
+    with pytest.raises(httpx2.RemoteProtocolError):
+        httpx2.get(f"{server}/stream?stall=true")
 
     def slow_body() -> Iterator[bytes]:
         for _ in range(10):
             threading.Event().wait(0.1)
             yield b"x"
 
-    assert httpx.post(f"{server}/body", content=slow_body()).json() == 10
+    assert httpx2.post(f"{server}/body", content=slow_body()).json() == 10

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
 
-import httpx
+import httpx2
 import psutil
 import pytest
 from annotated_types import Ge
@@ -103,7 +103,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, files: Files) -> Iterator[
 
 
 @pytest.fixture
-def client(service: Service) -> Iterator[httpx.Client]:
+def client(service: Service) -> Iterator[httpx2.Client]:
     with service.client() as opened:
         yield opened
 
@@ -158,7 +158,7 @@ def form(files: Files, **changed: bytes | tuple[str, bytes] | None) -> list[tupl
     return parts
 
 
-def refused(answer: httpx.Response, status: int, *codes: str) -> dict[str, Any]:
+def refused(answer: httpx2.Response, status: int, *codes: str) -> dict[str, Any]:
     """Check that a response is a problem document with this status and one of the codes, and return the document."""
     assert answer.status_code == status, f"{answer.status_code} {answer.text[:500]}"
     assert answer.headers["content-type"] == "application/problem+json"
@@ -384,7 +384,7 @@ def text_scene(scene: bytes, first: str) -> bytes:
 
 @pytest.mark.parametrize("make", [case[1] for case in SCENES], ids=[case[0] for case in SCENES])
 def test_false_scene_headers_are_rejected(
-    client: httpx.Client, store: Store, files: Files, packed: Files, make: Make
+    client: httpx2.Client, store: Store, files: Files, packed: Files, make: Make
 ) -> None:
     before = count_jobs(store)
     answer = client.post("/v1/jobs", files=form(files, scene=make({**files, **packed})))
@@ -396,7 +396,7 @@ def test_false_scene_headers_are_rejected(
 
 @pytest.mark.parametrize("what", [format.name for format in FORMATS if format is not PLY])
 def test_compressed_scenes_are_detected_from_their_content(
-    client: httpx.Client, store: Store, files: Files, packed: Files, what: str
+    client: httpx2.Client, store: Store, files: Files, packed: Files, what: str
 ) -> None:
     """The format is detected regardless of the file name, for files in the request and for tus uploads."""
     answer = client.post("/v1/jobs", files=form(files, scene=("my scan.ply", packed[what])))
@@ -503,7 +503,7 @@ IMAGES: list[tuple[str, Make]] = [
 
 
 @pytest.mark.parametrize("make", [case[1] for case in IMAGES], ids=[case[0] for case in IMAGES])
-def test_false_image_headers_are_rejected(client: httpx.Client, store: Store, files: Files, make: Make) -> None:
+def test_false_image_headers_are_rejected(client: httpx2.Client, store: Store, files: Files, make: Make) -> None:
     before = count_jobs(store)
     answer = client.post("/v1/jobs", files=form(files, style=make(files)))
     problem = refused(answer, 422, "invalid-image", "image-too-large", "inspection-limit")
@@ -511,7 +511,7 @@ def test_false_image_headers_are_rejected(client: httpx.Client, store: Store, fi
     assert count_jobs(store) == before
 
 
-def test_long_color_profile_is_fast(client: httpx.Client, files: Files) -> None:
+def test_long_color_profile_is_fast(client: httpx2.Client, files: Files) -> None:
     file = io.BytesIO()
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     Image.open(io.BytesIO(files["style"])).save(file, "PNG", icc_profile=with_float_steps(srgb, 50_000))
@@ -573,7 +573,7 @@ CAMERAS: list[tuple[str, str, Make]] = [
 
 @pytest.mark.parametrize(("name", "make"), [case[1:] for case in CAMERAS], ids=[case[0] for case in CAMERAS])
 def test_false_camera_files_are_rejected(
-    client: httpx.Client, store: Store, files: Files, name: str, make: Make
+    client: httpx2.Client, store: Store, files: Files, name: str, make: Make
 ) -> None:
     before = count_jobs(store)
     answer = client.post("/v1/jobs", files=form(files, cameras=(name, make(files))))
@@ -589,7 +589,7 @@ MODEL: list[tuple[str, bytes]] = [
 
 
 @pytest.mark.parametrize("name", ["points3D.bin", "rigs.bin", "frames.bin"])
-def test_false_colmap_models_are_rejected(client: httpx.Client, files: Files, name: str) -> None:
+def test_false_colmap_models_are_rejected(client: httpx2.Client, files: Files, name: str) -> None:
     """Eight bytes declare 2^60 entries; nothing reads these files."""
     model = [*MODEL, (name, struct.pack("<Q", 2**60))]
     answer = client.post("/v1/jobs", files=[*form(files, cameras=None), *(("cameras", file) for file in model)])
@@ -600,7 +600,7 @@ def test_false_colmap_models_are_rejected(client: httpx.Client, files: Files, na
     "photos", [[], [("photos", ("other.png", image_bytes("PNG", 64, 48)))]], ids=["none", "others"]
 )
 def test_camera_files_cannot_read_server_files(
-    client: httpx.Client, files: Files, tmp_path: Path, photos: list[tuple[str, tuple[str, bytes]]]
+    client: httpx2.Client, files: Files, tmp_path: Path, photos: list[tuple[str, tuple[str, bytes]]]
 ) -> None:
     """If a transforms.json lacks image sizes, the reader opens the image at any path that the file contains."""
     there = tmp_path / "secret.png"
@@ -654,7 +654,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize("role", ["scene", "style", pytest.param("photos", marks=pytest.mark.slow)])
-def test_file_names_cannot_escape_folder(client: httpx.Client, service: Service, files: Files, role: str) -> None:
+def test_file_names_cannot_escape_folder(client: httpx2.Client, service: Service, files: Files, role: str) -> None:
     def outside_blobs() -> set[Path]:
         places = {*service.stored(), *service.data.parent.iterdir()}
         return {path for path in places if "blobs" not in path.parts}
@@ -688,7 +688,7 @@ def test_file_names_cannot_escape_folder(client: httpx.Client, service: Service,
 BOUNDARY = "b0undary"
 
 
-def post(client: httpx.Client, body: bytes | Iterator[bytes], kind: str = "", **headers: str) -> httpx.Response:
+def post(client: httpx2.Client, body: bytes | Iterator[bytes], kind: str = "", **headers: str) -> httpx2.Response:
     kind = kind or f"multipart/form-data; boundary={BOUNDARY}"
     return client.post("/v1/jobs", content=body, headers={"content-type": kind, **headers})
 
@@ -730,7 +730,7 @@ BODIES: list[tuple[str, bytes, int]] = [
 
 
 @pytest.mark.parametrize(("body", "status"), [case[1:] for case in BODIES], ids=[case[0] for case in BODIES])
-def test_malformed_bodies_are_rejected(client: httpx.Client, store: Store, body: bytes, status: int) -> None:
+def test_malformed_bodies_are_rejected(client: httpx2.Client, store: Store, body: bytes, status: int) -> None:
     before = count_jobs(store)
     codes = ("malformed-body",) if status == 400 else ("invalid-request", "unknown-upload", "invalid-scene")
     refused(post(client, body), status, *codes)
@@ -752,12 +752,12 @@ def test_malformed_bodies_are_rejected(client: httpx.Client, store: Store, body:
         ("multipart/form-data; boundary*=none''%ff", 400),
     ],
 )
-def test_malformed_content_types_are_rejected(client: httpx.Client, kind: str, status: int) -> None:
+def test_malformed_content_types_are_rejected(client: httpx2.Client, kind: str, status: int) -> None:
     answer = client.post("/v1/jobs", content=b"x=y", headers=[(b"content-type", kind.encode("latin-1"))])
     refused(answer, status, "unsupported-media-type" if status == 415 else "malformed-body")
 
 
-def test_encoded_body_is_rejected(client: httpx.Client, files: Files) -> None:
+def test_encoded_body_is_rejected(client: httpx2.Client, files: Files) -> None:
     """Nothing decompresses bodies, so a body cannot be a decompression bomb."""
     request = client.build_request("POST", "/v1/jobs", files=form(files))
     answer = post(
@@ -768,7 +768,7 @@ def test_encoded_body_is_rejected(client: httpx.Client, files: Files) -> None:
     refused(answer, 415, "unsupported-media-type")
 
 
-def test_too_many_parts_are_rejected(client: httpx.Client, files: Files) -> None:
+def test_too_many_parts_are_rejected(client: httpx2.Client, files: Files) -> None:
     small = part(FILE.format("photos"), b"x")
     refused(post(client, small * 1000 + END), 422, "too-many-files")
     named = part('Content-Disposition: form-data; name="photos"', b"upl_00000000000")
@@ -780,7 +780,7 @@ def test_too_many_parts_are_rejected(client: httpx.Client, files: Files) -> None
         refused(client.post("/v1/jobs", json=job), 422, "too-many-files")
 
 
-def test_endless_part_header_is_rejected(client: httpx.Client) -> None:
+def test_endless_part_header_is_rejected(client: httpx2.Client) -> None:
     def body() -> Iterator[bytes]:
         yield f"--{BOUNDARY}\r\nContent-Disposition: ".encode()
         for _ in range(90):
@@ -789,7 +789,7 @@ def test_endless_part_header_is_rejected(client: httpx.Client) -> None:
     refused(post(client, body()), 400, "malformed-body")
 
 
-def test_too_long_bodies_are_rejected(client: httpx.Client, files: Files) -> None:
+def test_too_long_bodies_are_rejected(client: httpx2.Client, files: Files) -> None:
     def chunked(size: int) -> Iterator[bytes]:
         yield part(FILE.format("style"))[:-3]
         for _ in range(size):
@@ -811,14 +811,14 @@ MAY_BE_0 = {name for name in FIELDS if Ge(0) in OPTIONS[name].limits}
 MAY_BE_NEGATIVE = {"elevation", "style_rotation"}  # angles
 
 
-def submit_text(client: httpx.Client, parameters: str) -> httpx.Response:
+def submit_text(client: httpx2.Client, parameters: str) -> httpx2.Response:
     """Submit a job with these parameters and files that do not exist, because parameters are validated first."""
     body = f'{{"scene": "upl_00000000000", "style": "upl_00000000000", "parameters": {parameters}}}'
     return post(client, body.encode(), "application/json")
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_malformed_numbers_are_rejected(client: httpx.Client, field: str) -> None:
+def test_malformed_numbers_are_rejected(client: httpx2.Client, field: str) -> None:
     refused(submit_text(client, "{}"), 422, "unknown-upload")
     for number in NUMBERS:
         if field in MAY_BE_0 | MAY_BE_NEGATIVE and number == "1.5e-400":
@@ -859,7 +859,7 @@ TEXTS = [
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=[text[:25] for text in TEXTS])
-def test_malformed_parameters_are_rejected(client: httpx.Client, files: Files, text: str) -> None:
+def test_malformed_parameters_are_rejected(client: httpx2.Client, files: Files, text: str) -> None:
     refused(submit_text(client, text), 422, "invalid-request", "invalid-settings")
     answer = post(client, part('Content-Disposition: form-data; name="parameters"', text.encode()) + END)
     refused(answer, 422, "invalid-request", "invalid-settings")
@@ -887,12 +887,12 @@ JSON_BODIES = [
 
 
 @pytest.mark.parametrize("body", JSON_BODIES, ids=[body[:30].decode("latin-1") for body in JSON_BODIES])
-def test_json_with_unknown_uploads_is_rejected(client: httpx.Client, body: bytes) -> None:
+def test_json_with_unknown_uploads_is_rejected(client: httpx2.Client, body: bytes) -> None:
     answer = post(client, body, "application/json")
     refused(answer, 400 if body == b"\xff" else 422, "malformed-body", "invalid-request", "unknown-upload")
 
 
-def test_webhooks_are_rejected_while_switched_off(client: httpx.Client, files: Files) -> None:
+def test_webhooks_are_rejected_while_switched_off(client: httpx2.Client, files: Files) -> None:
     for url in ("http://169.254.169.254/latest", "file:///etc/passwd", "http://[::1", "x" * 60_000):
         refused(client.post("/v1/jobs", files=form(files), data={"webhook": url}), 422, "webhooks-off")
 
@@ -900,13 +900,13 @@ def test_webhooks_are_rejected_while_switched_off(client: httpx.Client, files: F
 # --- tus -----------------------------------------------------------------------------------------------------------
 
 
-def begin(client: httpx.Client, size: int) -> str:
+def begin(client: httpx2.Client, size: int) -> str:
     answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(size)})
     assert answer.status_code == 201, answer.text
     return str(answer.headers["location"])
 
 
-def send(client: httpx.Client, where: str, offset: object, data: Any, **headers: Any) -> httpx.Response:
+def send(client: httpx2.Client, where: str, offset: object, data: Any, **headers: Any) -> httpx2.Response:
     fixed = {**TUS, "Upload-Offset": str(offset), "Content-Type": OFFSET_STREAM}
     return client.patch(where, content=data, headers={**fixed, **headers})
 
@@ -915,7 +915,7 @@ def send(client: httpx.Client, where: str, offset: object, data: Any, **headers:
 NO_DIGITS: list[Any] = ["1_0", "+10", "10.0", "1 0", "\u0661\u0660".encode(), "\uff11\uff10".encode()]
 
 
-def test_numbers_must_be_digits(client: httpx.Client, service: Service, done: str) -> None:
+def test_numbers_must_be_digits(client: httpx2.Client, service: Service, done: str) -> None:
     """Queries and headers accept digits only; malformed body lengths are refused below the app."""
     for number in ("1_0", "+10", " 10", "10 ", "\u0661\u0660", "10.0"):
         refused(client.get("/v1/jobs", params={"limit": number}), 422, "invalid-request")
@@ -928,7 +928,7 @@ def test_numbers_must_be_digits(client: httpx.Client, service: Service, done: st
         assert json.loads(body)["code"] == "malformed-request"
 
 
-def test_uploads_require_protocol_version(client: httpx.Client) -> None:
+def test_uploads_require_protocol_version(client: httpx2.Client) -> None:
     """tus 1.0 requires the version in all requests except OPTIONS. `GET` is not part of tus."""
     where = begin(client, 5)
     data = {"Upload-Length": "5", "Upload-Offset": "0", "Content-Type": OFFSET_STREAM}
@@ -943,7 +943,7 @@ def test_uploads_require_protocol_version(client: httpx.Client) -> None:
     assert client.delete(where, headers=TUS).status_code == 204
 
 
-def test_malformed_upload_creation_is_rejected(client: httpx.Client) -> None:
+def test_malformed_upload_creation_is_rejected(client: httpx2.Client) -> None:
     for length in ("-1", "x", "1.5", "1e3", "0x10", "", str(2**60), "9" * 5000, "NaN", *NO_DIGITS):
         refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": length}), 422, "invalid-request")
     refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": "0"}), 400, "malformed-body")
@@ -967,7 +967,7 @@ def test_malformed_upload_creation_is_rejected(client: httpx.Client) -> None:
     )
 
 
-def test_lists_of_many_photos_take_little_memory(client: httpx.Client, service: Service, store: Store) -> None:
+def test_lists_of_many_photos_take_little_memory(client: httpx2.Client, service: Service, store: Store) -> None:
     """Six lists at once of jobs with 2,000 photos each, and lists that are not read; pages have every name once."""
     sha256 = store.jobs.inputs(store.jobs.page(None, limit=1)[0].row.id)[0]["sha256"]
     entry = {"name": "scene.ply", "sha256": sha256, "size": 1}
@@ -1002,7 +1002,7 @@ def test_lists_of_many_photos_take_little_memory(client: httpx.Client, service: 
         store.jobs.delete(job_id, None)
 
 
-def test_upload_names_cannot_escape_folder(client: httpx.Client, service: Service) -> None:
+def test_upload_names_cannot_escape_folder(client: httpx2.Client, service: Service) -> None:
     for name in NAMES:
         metadata = f"filename {base64.b64encode(name.encode()[:2900]).decode()}".strip()
         answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": "5", "Upload-Metadata": metadata})
@@ -1016,7 +1016,7 @@ def test_upload_names_cannot_escape_folder(client: httpx.Client, service: Servic
     assert not list((service.data / "uploads").iterdir())
 
 
-def test_malformed_upload_parts_are_rejected(client: httpx.Client, service: Service) -> None:
+def test_malformed_upload_parts_are_rejected(client: httpx2.Client, service: Service) -> None:
     where = begin(client, 1000)
     file = service.data / "uploads" / (where.rsplit("/", 1)[1] + ".part")
     assert send(client, where, 0, bytes(100)).status_code == 204
@@ -1053,7 +1053,7 @@ def test_malformed_upload_parts_are_rejected(client: httpx.Client, service: Serv
     assert client.delete(where, headers=TUS).status_code == 204
 
 
-def test_ended_uploads_reject_parts(client: httpx.Client, store: Store, files: Files) -> None:
+def test_ended_uploads_reject_parts(client: httpx2.Client, store: Store, files: Files) -> None:
     where = begin(client, 1000)
     upload_id = where.rsplit("/", 1)[1]
     with store.database.writing() as session:
@@ -1074,7 +1074,7 @@ def test_ended_uploads_reject_parts(client: httpx.Client, store: Store, files: F
         assert client.get(f"/v1/uploads/{name}").status_code in (404, 405)
 
 
-def test_second_writer_of_upload_is_locked_out(client: httpx.Client, service: Service) -> None:
+def test_second_writer_of_upload_is_locked_out(client: httpx2.Client, service: Service) -> None:
     where = begin(client, 1000)
     head = f"PATCH {where} HTTP/1.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\n"
     head += f"Content-Type: {OFFSET_STREAM}\nContent-Length: 1000"
@@ -1090,7 +1090,7 @@ def test_second_writer_of_upload_is_locked_out(client: httpx.Client, service: Se
 # --- other people's things -----------------------------------------------------------------------------------------
 
 
-def test_other_keys_ids_are_not_found(client: httpx.Client, service: Service, store: Store, files: Files) -> None:
+def test_other_keys_ids_are_not_found(client: httpx2.Client, service: Service, store: Store, files: Files) -> None:
     _, mine = store.keys.create("hostile-mine")
     _, other = store.keys.create("hostile-other")
     with service.client(mine) as me, service.client(other) as you:
@@ -1130,7 +1130,7 @@ def test_other_keys_ids_are_not_found(client: httpx.Client, service: Service, st
         b"Bearer ' OR 1=1 --",
     ],
 )
-def test_malformed_keys_are_rejected(client: httpx.Client, header: bytes) -> None:
+def test_malformed_keys_are_rejected(client: httpx2.Client, header: bytes) -> None:
     answer = client.get("/v1/jobs", headers=[(b"authorization", header)])
     refused(answer, 401, "unauthorized")
     assert answer.headers["www-authenticate"] == "Bearer"
@@ -1195,7 +1195,7 @@ RANGES: list[tuple[str, int]] = [
 
 
 @pytest.mark.parametrize(("text", "status"), RANGES, ids=[text[:25] or "empty" for text, _ in RANGES])
-def test_ranges_follow_rfc_9110(client: httpx.Client, files: Files, done: str, text: str, status: int) -> None:
+def test_ranges_follow_rfc_9110(client: httpx2.Client, files: Files, done: str, text: str, status: int) -> None:
     where = f"/v1/jobs/{done}/artifacts/stylized.ply"
     answer = client.get(where, headers=[(b"range", text.encode("latin-1"))])
     if status == 416:
@@ -1211,7 +1211,7 @@ def test_ranges_follow_rfc_9110(client: httpx.Client, files: Files, done: str, t
     )
 
 
-def test_results_have_safe_headers(client: httpx.Client, done: str) -> None:
+def test_results_have_safe_headers(client: httpx2.Client, done: str) -> None:
     answer = client.get(f"/v1/jobs/{done}/artifacts/report.html")
     assert re.fullmatch(r'inline; filename="[A-Za-z0-9._-]+"', answer.headers["content-disposition"])
     assert "set-cookie" not in answer.headers
@@ -1309,7 +1309,7 @@ def closed(connection: socket.socket) -> bytes:
 
 
 def test_slow_clients_are_disconnected_without_blocking_others(
-    service: Service, client: httpx.Client, files: Files
+    service: Service, client: httpx2.Client, files: Files
 ) -> None:
     """Connections that send nothing, half a head or half a body all end, and others are served meanwhile."""
     body = f"POST /v1/jobs HTTP/1.1\nContent-Type: multipart/form-data; boundary={BOUNDARY}\nContent-Length: 100000"
@@ -1392,7 +1392,7 @@ HEADS: list[tuple[str, bytes]] = [
 
 
 @pytest.mark.parametrize("data", [case[1] for case in HEADS], ids=[case[0] for case in HEADS])
-def test_malformed_heads_are_rejected(service: Service, client: httpx.Client, data: bytes) -> None:
+def test_malformed_heads_are_rejected(service: Service, client: httpx2.Client, data: bytes) -> None:
     """Malformed heads are refused below the app. The connection is closed, so no remainder is read as a request."""
     with connect(service) as connection:
         connection.sendall(data)
@@ -1460,7 +1460,7 @@ def test_endless_trailers_are_rejected(service: Service, path: str, start: bytes
         assert send_on(connection, more) < 60 * MB, "it was all taken in"
 
 
-def test_trailers_are_not_headers(service: Service, client: httpx.Client) -> None:
+def test_trailers_are_not_headers(service: Service, client: httpx2.Client) -> None:
     """Trailers do not become headers, not even of the next request on the connection."""
     where = begin(client, 5)
     head = f"PATCH {where} HTTP/1.1\nTus-Resumable: 1.0.0\nUpload-Offset: 0\nContent-Type: {OFFSET_STREAM}"
@@ -1529,7 +1529,7 @@ def test_quoted_cookies_take_linear_time(service: Service) -> None:
             assert answer_on(connection)[0].startswith(b"HTTP/1.1 200 ")
 
 
-def test_session_cookie_is_found_among_others(service: Service, client: httpx.Client) -> None:
+def test_session_cookie_is_found_among_others(service: Service, client: httpx2.Client) -> None:
     cookies = 'theme=dark; sgsst_session=unknown; quoted="a\\073b"'
     answer = client.delete("/v1/session", headers={"Cookie": cookies, "Origin": "https://example.com"})
     assert (answer.status_code, answer.json()["code"]) == (403, "cross-origin"), "it counts as a session"
@@ -1568,7 +1568,7 @@ def is_busy(connection: socket.socket) -> bool:
         return False
 
 
-def test_concurrent_bodies_share_memory_budget(service: Service, client: httpx.Client) -> None:
+def test_concurrent_bodies_share_memory_budget(service: Service, client: httpx2.Client) -> None:
     """Large bodies are refused while too many are arriving; small ones are accepted."""
     large = json.dumps({"scene": "x" * (MB - 1000), "style": "x"}).encode()
     head = lines(f"POST /v1/jobs HTTP/1.1\nContent-Type: application/json\nContent-Length: {len(large)}")
@@ -1602,8 +1602,8 @@ def test_connections_beyond_system_limit_are_rejected(tmp_path: Path) -> None:
     """Connections beyond the limit are answered with 503 or closed, and existing ones keep working."""
     running = Service(tmp_path / "data", alone=True)
     running._command = ["sh", "-c", 'ulimit -n 200 && exec "$@"', "sh", *running._command]
-    limits = httpx.Limits(keepalive_expiry=None)
-    with running, httpx.Client(base_url=running.url, timeout=60, limits=limits) as client:
+    limits = httpx2.Limits(keepalive_expiry=None)
+    with running, httpx2.Client(base_url=running.url, timeout=60, limits=limits) as client:
         assert client.get("/livez").status_code == 200
         with contextlib.ExitStack() as stack:
             held = [stack.enter_context(connect(running)) for _ in range(400)]
@@ -1685,7 +1685,7 @@ OWN = [
 ]
 
 
-def test_foreign_host_headers_are_rejected(client: httpx.Client) -> None:
+def test_foreign_host_headers_are_rejected(client: httpx2.Client) -> None:
     for host in [*FOREIGN, ""]:
         refused(client.get("/v1/jobs", headers={"Host": host}), 403, "foreign-site")
     for host in OWN:
@@ -1699,7 +1699,7 @@ def test_service_on_address_like_name_requires_keys() -> None:
         assert not ServiceSettings(host=host).keys_required
 
 
-def test_paths_cannot_inject_log_lines(service: Service, client: httpx.Client) -> None:
+def test_paths_cannot_inject_log_lines(service: Service, client: httpx2.Client) -> None:
     before = service.log.stat().st_size
     for text in ("\n12:00:00 error   forged", "\r\nforged", "\u2028forged", "\x1b[2Jforged", "a status=200 forged"):
         assert client.get(f"/v1/{quote(text, safe='')}").status_code == 404
@@ -1714,7 +1714,7 @@ def test_paths_cannot_inject_log_lines(service: Service, client: httpx.Client) -
         assert re.fullmatch(pattern, line)
 
 
-def test_hostile_requests_leave_no_files(service: Service, client: httpx.Client, store: Store) -> None:
+def test_hostile_requests_leave_no_files(service: Service, client: httpx2.Client, store: Store) -> None:
     """This test runs last: the service is still ready, and a database row refers to each stored file."""
     assert client.get("/readyz").status_code == 200
     metrics = client.get("/metrics").text

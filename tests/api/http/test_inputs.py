@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-import httpx
+import httpx2
 import pytest
 
 from api.http.schemas import MOST_POINTS
@@ -60,7 +60,7 @@ def store(service: Service) -> Iterator[Store]:
 
 
 @pytest.fixture(scope="module")
-def client(service: Service) -> Iterator[httpx.Client]:
+def client(service: Service) -> Iterator[httpx2.Client]:
     with service.client() as opened:
         yield opened
 
@@ -71,7 +71,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"scene": ply, "cameras": cameras, "style": style}
 
 
-def submit(client: httpx.Client, files: dict[str, Path], styles: list[str]) -> str:
+def submit(client: httpx2.Client, files: dict[str, Path], styles: list[str]) -> str:
     parts = [(role, (files[role].name, files[role].read_bytes())) for role in ("scene", "cameras")]
     # Bytes after the end of the image make it a different file.
     parts += [("style", (name, files["style"].read_bytes() + bytes(place))) for place, name in enumerate(styles)]
@@ -81,16 +81,16 @@ def submit(client: httpx.Client, files: dict[str, Path], styles: list[str]) -> s
 
 
 @pytest.fixture(scope="module")
-def job_id(client: httpx.Client, files: dict[str, Path]) -> str:
+def job_id(client: httpx2.Client, files: dict[str, Path]) -> str:
     return submit(client, files, ["first.png", "second.PNG"])
 
 
-def refused(answer: httpx.Response, status: int, code: str) -> None:
+def refused(answer: httpx2.Response, status: int, code: str) -> None:
     assert (answer.status_code, answer.json()["code"]) == (status, code), answer.text
     check_documented(answer)
 
 
-def test_inputs_are_returned_unchanged(client: httpx.Client, files: dict[str, Path], job_id: str) -> None:
+def test_inputs_are_returned_unchanged(client: httpx2.Client, files: dict[str, Path], job_id: str) -> None:
     listed = client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]
     style = files["style"].read_bytes()
     sent = [
@@ -114,7 +114,7 @@ def test_inputs_are_returned_unchanged(client: httpx.Client, files: dict[str, Pa
     assert client.get(f"/v1/jobs/{job_id}/inputs/style:0").content == style
 
 
-def test_inputs_are_sent_in_ranges(client: httpx.Client, files: dict[str, Path], job_id: str) -> None:
+def test_inputs_are_sent_in_ranges(client: httpx2.Client, files: dict[str, Path], job_id: str) -> None:
     url, whole = f"/v1/jobs/{job_id}/inputs/scene", files["scene"].read_bytes()
     size = len(whole)
     for asked, start, stop in (("0-99", 0, 100), ("100-", 100, size), ("-7", size - 7, size), ("5-999999999", 5, size)):
@@ -151,11 +151,11 @@ def test_inputs_are_sent_in_ranges(client: httpx.Client, files: dict[str, Path],
         "style:\u0661",
     ],
 )
-def test_missing_inputs_are_not_found(client: httpx.Client, job_id: str, role: str) -> None:
+def test_missing_inputs_are_not_found(client: httpx2.Client, job_id: str, role: str) -> None:
     refused(client.get(f"/v1/jobs/{job_id}/inputs/{role}"), 404, "not-found")
 
 
-def test_inputs_of_deleted_job_are_not_found(client: httpx.Client, files: dict[str, Path], store: Store) -> None:
+def test_inputs_of_deleted_job_are_not_found(client: httpx2.Client, files: dict[str, Path], store: Store) -> None:
     job_id = submit(client, files, ["style.png"])
     client.post(f"/v1/jobs/{job_id}/cancel")
     assert client.get(f"/v1/jobs/{job_id}/inputs/scene").status_code == 200
@@ -195,7 +195,7 @@ def test_safe_file_names_are_unchanged() -> None:
     assert disposition("caf\u00e9.png", inline=True) == "inline; filename=\"caf_.png\"; filename*=UTF-8''caf%C3%A9.png"
 
 
-def test_hostile_file_names_are_sanitized(client: httpx.Client, files: dict[str, Path]) -> None:
+def test_hostile_file_names_are_sanitized(client: httpx2.Client, files: dict[str, Path]) -> None:
     names = [name for name in HOSTILE if name.strip() and "\ud800" not in name][:14]
     job_id = submit(client, files, names)
     for entry in client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]:
@@ -211,7 +211,7 @@ def test_hostile_file_names_are_sanitized(client: httpx.Client, files: dict[str,
         )
 
 
-def test_previews_and_loss_history(client: httpx.Client, files: dict[str, Path], store: Store, tmp_path: Path) -> None:
+def test_previews_and_loss_history(client: httpx2.Client, files: dict[str, Path], store: Store, tmp_path: Path) -> None:
     job_id = submit(client, files, ["style.png"])
     assert client.get(f"/v1/jobs/{job_id}/progress").json() == {"points": []}
     image_path = tmp_path / "p.jpg"
@@ -245,7 +245,7 @@ def test_previews_and_loss_history(client: httpx.Client, files: dict[str, Path],
 
 
 def test_new_job_uses_inputs_of_an_earlier_one(
-    service: Service, store: Store, client: httpx.Client, files: dict[str, Path]
+    service: Service, store: Store, client: httpx2.Client, files: dict[str, Path]
 ) -> None:
     first = submit(client, files, ["one.png", "two.png"])
     used, blobs = client.get(f"/v1/jobs/{first}").json()["inputs"], store.inputs.locations()
@@ -274,7 +274,7 @@ def test_new_job_uses_inputs_of_an_earlier_one(
 
 @pytest.mark.parametrize("name", ["scene:1", "style:2", "photos", "style:-1", "style:1/..", "stylized.ply", "scene:x"])
 def test_reference_to_an_input_that_a_job_has_not_is_refused(
-    client: httpx.Client, files: dict[str, Path], name: str
+    client: httpx2.Client, files: dict[str, Path], name: str
 ) -> None:
     at = f"/v1/jobs/{submit(client, files, ['one.png', 'two.png'])}/inputs"
     answer = client.post("/v1/jobs", json={"scene": f"{at}/{name}", "style": f"{at}/style", "cameras": [at]})

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 
 from api.http.app import create_app
@@ -46,7 +46,7 @@ class Outage:
     upload_id: str
     postgres: Postgres
 
-    def client(self) -> httpx.Client:
+    def client(self) -> httpx2.Client:
         """Return an HTTP client of the service, with a key."""
         return self.service.client(self.key)
 
@@ -70,7 +70,7 @@ class Outage:
             wait_for(lambda: create_upload(client).status_code == 201, "writes", self.service.said)
 
 
-def create_upload(client: httpx.Client) -> httpx.Response:
+def create_upload(client: httpx2.Client) -> httpx2.Response:
     return client.post("/v1/uploads", headers={**TUS, "Upload-Length": "100"})
 
 
@@ -111,7 +111,7 @@ def operations() -> list[tuple[str, str]]:
     return [each for each in pairs if each not in WITHOUT_DATABASE]
 
 
-def request(client: httpx.Client, method: str, path: str, outage: Outage, files: dict[str, bytes]) -> httpx.Response:
+def request(client: httpx2.Client, method: str, path: str, outage: Outage, files: dict[str, bytes]) -> httpx2.Response:
     """Send a request that would succeed, or be refused for the job's state, if the database were available."""
     body: dict[str, Any] = {}
     if (method, path) == ("post", "/v1/jobs"):
@@ -132,7 +132,7 @@ def request(client: httpx.Client, method: str, path: str, outage: Outage, files:
     return client.request(method, path.format(**values), **body)
 
 
-def check_away(answer: httpx.Response) -> None:
+def check_away(answer: httpx2.Response) -> None:
     """Fail unless the response says that the database is unavailable and when to retry."""
     assert answer.status_code == 503, (answer.request.method, str(answer.request.url), answer.text)
     assert int(answer.headers["retry-after"]) > 0
@@ -143,13 +143,13 @@ def check_away(answer: httpx.Response) -> None:
 
 def check_health(service: Service, ready: int) -> None:
     """Fail unless liveness responds with 200 and readiness with the status `ready`."""
-    assert httpx.get(f"{service.url}/livez", timeout=HEALTH_SECONDS).status_code == 200
-    answer = httpx.get(f"{service.url}/readyz", timeout=HEALTH_SECONDS)
+    assert httpx2.get(f"{service.url}/livez", timeout=HEALTH_SECONDS).status_code == 200
+    answer = httpx2.get(f"{service.url}/readyz", timeout=HEALTH_SECONDS)
     assert answer.status_code == ready, answer.text
     assert (answer.json()["checks"]["database"] == "ok") == (ready == 200)
 
 
-def at_once(send: Callable[[], httpx.Response]) -> contextlib.ExitStack:
+def at_once(send: Callable[[], httpx2.Response]) -> contextlib.ExitStack:
     """Start `MANY` concurrent requests; at the end of the block, wait for the responses and check them."""
     stack = contextlib.ExitStack()
     pool = stack.enter_context(ThreadPoolExecutor(MANY))

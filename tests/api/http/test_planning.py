@@ -10,10 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 import torch
-from httpx_sse import ServerSentEvent, connect_sse
 from PIL import Image
 
 from tests.api.service import PATIENCE, Service, wait_for
@@ -45,10 +44,10 @@ def request(files: dict[str, bytes], **parameters: Any) -> dict[str, Any]:
     }
 
 
-def events(client: httpx.Client, files: dict[str, bytes], **parameters: Any) -> list[ServerSentEvent]:
-    with connect_sse(client, "POST", "/v1/jobs", **request(files, **parameters)) as source:
+def events(client: httpx2.Client, files: dict[str, bytes], **parameters: Any) -> list[httpx2.ServerSentEvent]:
+    with client.sse("/v1/jobs", method="POST", **request(files, **parameters)) as source:
         assert source.response.status_code == 200, source.response.read()
-        return [sent for sent in source.iter_sse() if sent.data]
+        return [sent for sent in source if sent.data]
 
 
 @pytest.mark.slow
@@ -175,7 +174,7 @@ def test_disconnect_cancels_planning_without_events(service: Service, files: dic
         begin_and_leave(service, client, many, both, seed=2)  # validated by now, and not planned
 
     async def leave() -> None:
-        async with httpx.AsyncClient(base_url=service.url, headers=client.headers, timeout=PATIENCE) as waiting:
+        async with httpx2.AsyncClient(base_url=service.url, headers=client.headers, timeout=PATIENCE) as waiting:
             answer = asyncio.create_task(waiting.post("/v1/jobs", **request(many, resolution=1024, seed=2)))
             await asyncio.to_thread(
                 wait_for, lambda: len(service.processes("service.inspection.process")) >= both, "the planning to begin"
@@ -196,8 +195,8 @@ def with_many_views(files: dict[str, bytes]) -> dict[str, bytes]:
     return {**files, "cameras": json.dumps(many).encode()}
 
 
-def begin_and_leave(service: Service, client: httpx.Client, files: dict[str, bytes], both: int, seed: int) -> None:
+def begin_and_leave(service: Service, client: httpx2.Client, files: dict[str, bytes], both: int, seed: int) -> None:
     """Start a dry run, disconnect at the first event, and wait until fewer than `both` inspecting processes run."""
-    with connect_sse(client, "POST", "/v1/jobs", **request(files, resolution=1024, seed=seed)) as source:
-        next(source.iter_sse())
+    with client.sse("/v1/jobs", method="POST", **request(files, resolution=1024, seed=seed)) as source:
+        next(iter(source))
     wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")

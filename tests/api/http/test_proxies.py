@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin
 
-import httpx
+import httpx2
 import pytest
 
 from tests.api.service import Service
@@ -70,39 +70,39 @@ def job_form(folder: Path) -> dict[str, Any]:
 
 def test_pages_and_their_files_are_found(proxy: Proxy) -> None:
     for page in ("/", "/docs", "/shared"):
-        answer = httpx.get(proxy.url + page)
+        answer = httpx2.get(proxy.url + page)
         assert answer.status_code == 200
         named = re.findall(r'(?:src|href)="([^"]+)"', answer.text)
         assert named
         for name in named:
             if not name.startswith("data:"):
-                assert httpx.get(urljoin(str(answer.url), name)).status_code == 200, name
-    unchanged = httpx.get(f"{proxy.url}/", headers={"If-None-Match": httpx.get(f"{proxy.url}/").headers["etag"]})
+                assert httpx2.get(urljoin(str(answer.url), name)).status_code == 200, name
+    unchanged = httpx2.get(f"{proxy.url}/", headers={"If-None-Match": httpx2.get(f"{proxy.url}/").headers["etag"]})
     assert unchanged.status_code == 304  # nginx has made the tag a weak one
-    servers = httpx.get(f"{proxy.url}/openapi.json").json().get("servers", [])
+    servers = httpx2.get(f"{proxy.url}/openapi.json").json().get("servers", [])
     assert servers == ([{"url": proxy.subpath}] if proxy.subpath else [])
 
 
 def test_addresses_lead_through_the_proxy(proxy: Proxy, tmp_path: Path) -> None:
-    created = httpx.post(f"{proxy.url}/v1/uploads", headers={**TUS, "Upload-Length": "10"})
+    created = httpx2.post(f"{proxy.url}/v1/uploads", headers={**TUS, "Upload-Length": "10"})
     where = urljoin(proxy.url, created.headers["location"])
     assert where.startswith(f"{proxy.url}/v1/uploads/")
-    assert httpx.head(where, headers=TUS).headers["upload-offset"] == "0"
-    answer = httpx.post(f"{proxy.url}/v1/jobs", **job_form(tmp_path), timeout=60)
+    assert httpx2.head(where, headers=TUS).headers["upload-offset"] == "0"
+    answer = httpx2.post(f"{proxy.url}/v1/jobs", **job_form(tmp_path), timeout=60)
     job = answer.json()
     assert answer.headers["location"] == job["links"]["self"]
-    assert httpx.get(urljoin(proxy.url, job["links"]["self"])).json()["id"] == job["id"]
-    with httpx.stream("GET", urljoin(proxy.url, job["links"]["events"])) as events:
+    assert httpx2.get(urljoin(proxy.url, job["links"]["self"])).json()["id"] == job["id"]
+    with httpx2.stream("GET", urljoin(proxy.url, job["links"]["events"])) as events:
         assert next(line for line in events.iter_lines() if line.startswith("event:")) == "event: status"
-    (scene, *_) = httpx.get(f"{job_url(proxy, job)}/inputs").json()["inputs"]
-    assert httpx.get(urljoin(proxy.url, scene["url"])).headers["etag"] == f'"{scene["sha256"]}"'
-    assert httpx.get(urljoin(proxy.url, scene["url"])).headers["cache-control"] == "private, no-cache, no-transform"
+    (scene, *_) = httpx2.get(f"{job_url(proxy, job)}/inputs").json()["inputs"]
+    assert httpx2.get(urljoin(proxy.url, scene["url"])).headers["etag"] == f'"{scene["sha256"]}"'
+    assert httpx2.get(urljoin(proxy.url, scene["url"])).headers["cache-control"] == "private, no-cache, no-transform"
     names = {"scene": scene["url"], "style": job["id"], "cameras": [f"/v1/jobs/{job['id']}/inputs/cameras"]}
-    refused = httpx.post(f"{proxy.url}/v1/jobs", json=names).json()
+    refused = httpx2.post(f"{proxy.url}/v1/jobs", json=names).json()
     assert refused["input"] == "style", "the scene, named by its address, is found"
-    slash = httpx.get(f"{proxy.url}/v1/jobs/").headers["location"]
+    slash = httpx2.get(f"{proxy.url}/v1/jobs/").headers["location"]
     assert slash == f"{proxy.url}/v1/jobs"
-    httpx.post(f"{job_url(proxy, job)}/cancel").raise_for_status()
+    httpx2.post(f"{job_url(proxy, job)}/cancel").raise_for_status()
 
 
 def job_url(proxy: Proxy, job: dict[str, Any]) -> str:
@@ -110,19 +110,19 @@ def job_url(proxy: Proxy, job: dict[str, Any]) -> str:
 
 
 def test_session_cookie_is_limited_to_the_subpath(proxy: Proxy) -> None:
-    cookie = httpx.delete(f"{proxy.url}/v1/session").headers["set-cookie"]
+    cookie = httpx2.delete(f"{proxy.url}/v1/session").headers["set-cookie"]
     assert f"; Path={proxy.subpath or '/'};" in cookie
 
 
 @pytest.mark.parametrize("prefix", ["//evil.example", "/a/../b", "/a b", "a", "/" + "a" * 300])
 def test_unusable_prefixes_are_ignored(trusting: Service, prefix: str) -> None:
     headers = {**TUS, "Upload-Length": "10", "X-Forwarded-Prefix": prefix}
-    answer = httpx.post(f"{trusting.url}/v1/uploads", headers=headers)
+    answer = httpx2.post(f"{trusting.url}/v1/uploads", headers=headers)
     assert answer.headers["location"].startswith("/v1/uploads/")
 
 
 def test_setting_takes_precedence_over_header(configured: Service) -> None:
     headers = {**TUS, "Upload-Length": "10", "X-Forwarded-Prefix": "/other"}
-    answer = httpx.post(f"{configured.url}/v1/uploads", headers=headers)
+    answer = httpx2.post(f"{configured.url}/v1/uploads", headers=headers)
     assert answer.headers["location"].startswith("/sgsst/v1/uploads/")
-    assert httpx.get(f"{configured.url}/sgsst").headers["location"].endswith("/sgsst/")
+    assert httpx2.get(f"{configured.url}/sgsst").headers["location"].endswith("/sgsst/")

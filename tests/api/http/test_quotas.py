@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 
 from api.http.limits import Rates
@@ -134,7 +134,7 @@ def test_connections_are_limited(service: Service) -> None:
     finally:
         for each in held:
             each.close()
-    wait_for(lambda: httpx.get(f"{service.url}/livez").status_code == 200, "room for a connection", service.said)
+    wait_for(lambda: httpx2.get(f"{service.url}/livez").status_code == 200, "room for a connection", service.said)
 
 
 # --- bytes without a charge ----------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ MB = 1_000_000
 def body_of(scene: int) -> tuple[bytes, dict[str, str]]:
     """Return a multipart body with a unique scene of `scene` bytes, and the request headers."""
     content = b"ply\n" + os.urandom(32) + bytes(scene)
-    request = httpx.Request("POST", "http://x", files={"scene": ("scene.ply", content)})
+    request = httpx2.Request("POST", "http://x", files={"scene": ("scene.ply", content)})
     return request.read(), {"Content-Type": request.headers["content-type"]}
 
 

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 from sqlalchemy import text
 
@@ -33,7 +33,7 @@ COPIES = 2
 class Job:
     """Job of one round, with a share, and a client and a store that all operations use."""
 
-    client: httpx.Client
+    client: httpx2.Client
     store: Store
     id: str
     share: str

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, settings
@@ -223,7 +223,7 @@ def name_of(case: schemathesis.Case) -> str:
     return str(case.operation.definition.raw["operationId"])
 
 
-def _upload(client: httpx.Client, path: Path) -> str:
+def _upload(client: httpx2.Client, path: Path) -> str:
     name = base64.b64encode(path.name.encode()).decode()
     tus = {"Tus-Resumable": "1.0.0"}
     headers = {**tus, "Upload-Length": str(path.stat().st_size), "Upload-Metadata": f"filename {name}"}

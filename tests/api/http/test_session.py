@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from http.cookies import Morsel, SimpleCookie
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 
 from api.http.limits import MOST_FAILURES, WITHIN_SECONDS, SignIns
@@ -42,7 +42,7 @@ def store(service: Service) -> Iterator[Store]:
 
 
 @pytest.fixture
-def browser(service: Service) -> Iterator[httpx.Client]:
+def browser(service: Service) -> Iterator[httpx2.Client]:
     """Return a client that stores cookies and sends `Origin`, as browsers do."""
     with service.client() as opened:
         opened.headers["Origin"] = service.url
@@ -54,16 +54,16 @@ def key(store: Store) -> str:
     return store.keys.create("alice")[1]
 
 
-def sign_in(browser: httpx.Client, key: str, **headers: str) -> httpx.Response:
+def sign_in(browser: httpx2.Client, key: str, **headers: str) -> httpx2.Response:
     return browser.post("/v1/session", json={"key": key}, headers=headers)
 
 
-def cookie_of(answer: httpx.Response) -> Morsel[str]:
+def cookie_of(answer: httpx2.Response) -> Morsel[str]:
     cookies: SimpleCookie = SimpleCookie(answer.headers["set-cookie"])
     return cookies[COOKIE]
 
 
-def refused(answer: httpx.Response, status: int, code: str) -> None:
+def refused(answer: httpx2.Response, status: int, code: str) -> None:
     assert (answer.status_code, answer.json()["code"]) == (status, code), answer.text
     check_documented(answer)
 
@@ -76,7 +76,7 @@ def job_of(store: Store, owner: str) -> str:
     return store.jobs.create(NewJob(owner, "job", 0, {}, inputs), limit=1000)[0].id
 
 
-def test_key_is_exchanged_for_cookie(browser: httpx.Client, store: Store) -> None:
+def test_key_is_exchanged_for_cookie(browser: httpx2.Client, store: Store) -> None:
     row, key = store.keys.create("alice")
     job_id = job_of(store, row.id)
     refused(browser.get("/v1/jobs"), 401, "unauthorized")
@@ -102,7 +102,7 @@ def test_cookie_is_secure_on_https_pages(service: Service, key: str) -> None:
         assert cookie_of(sign_in(browser, key, Origin=f"https://{host}"))["secure"]
 
 
-def test_stored_session_digest_is_no_cookie(browser: httpx.Client, service: Service, data: Path, key: str) -> None:
+def test_stored_session_digest_is_no_cookie(browser: httpx2.Client, service: Service, data: Path, key: str) -> None:
     text = cookie_of(sign_in(browser, key)).value
     with sqlite3.connect(data / "sgsst.db") as connection:
         (stored,) = connection.execute("SELECT group_concat(sha256) FROM sessions").fetchone()
@@ -115,7 +115,7 @@ def test_stored_session_digest_is_no_cookie(browser: httpx.Client, service: Serv
         assert thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={text}"}).status_code == 200
 
 
-def test_signing_out_ends_session(browser: httpx.Client, service: Service, key: str) -> None:
+def test_signing_out_ends_session(browser: httpx2.Client, service: Service, key: str) -> None:
     text = cookie_of(sign_in(browser, key)).value
     answer = browser.delete("/v1/session")
     assert answer.status_code == 204
@@ -126,7 +126,7 @@ def test_signing_out_ends_session(browser: httpx.Client, service: Service, key: 
     assert browser.delete("/v1/session").status_code == 204, "again"
 
 
-def test_signing_in_again_ends_previous_session(browser: httpx.Client, service: Service, key: str) -> None:
+def test_signing_in_again_ends_previous_session(browser: httpx2.Client, service: Service, key: str) -> None:
     first = cookie_of(sign_in(browser, key)).value
     second = cookie_of(sign_in(browser, key)).value
     assert first != second
@@ -135,7 +135,7 @@ def test_signing_in_again_ends_previous_session(browser: httpx.Client, service: 
         assert thief.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={second}"}).status_code == 200
 
 
-def test_revoking_key_ends_its_sessions(browser: httpx.Client, store: Store) -> None:
+def test_revoking_key_ends_its_sessions(browser: httpx2.Client, store: Store) -> None:
     row, key = store.keys.create("bob")
     sign_in(browser, key)
     assert browser.get("/v1/jobs").status_code == 200
@@ -144,14 +144,14 @@ def test_revoking_key_ends_its_sessions(browser: httpx.Client, store: Store) -> 
     assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False}
 
 
-def test_api_processes_share_sessions(browser: httpx.Client, data: Path, key: str) -> None:
+def test_api_processes_share_sessions(browser: httpx2.Client, data: Path, key: str) -> None:
     text = cookie_of(sign_in(browser, key)).value
     with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as other, other.client() as client:
         assert client.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={text}"}).status_code == 200
     assert browser.get("/v1/jobs").status_code == 200
 
 
-def test_request_key_overrides_session(browser: httpx.Client, store: Store, key: str) -> None:
+def test_request_key_overrides_session(browser: httpx2.Client, store: Store, key: str) -> None:
     other, text = store.keys.create("carol")
     job_id = job_of(store, other.id)
     sign_in(browser, key)
@@ -200,7 +200,7 @@ ELSEWHERE: list[dict[str, str]] = [
 
 @pytest.mark.parametrize("headers", ELSEWHERE, ids=str)
 def test_cross_origin_changes_are_rejected(
-    service: Service, store: Store, headers: dict[str, str], browser: httpx.Client
+    service: Service, store: Store, headers: dict[str, str], browser: httpx2.Client
 ) -> None:
     row, key = store.keys.create("fred")
     job_id = job_of(store, row.id)
@@ -227,7 +227,7 @@ def test_cross_origin_changes_are_rejected(
 
 @pytest.mark.parametrize("headers", [{"Origin": "SELF"}, {"Sec-Fetch-Site": "same-origin"}], ids=str)
 def test_same_origin_changes_are_accepted(
-    service: Service, store: Store, headers: dict[str, str], browser: httpx.Client
+    service: Service, store: Store, headers: dict[str, str], browser: httpx2.Client
 ) -> None:
     row, key = store.keys.create("gina")
     job_id = job_of(store, row.id)
@@ -237,7 +237,7 @@ def test_same_origin_changes_are_accepted(
     assert browser.post(f"/v1/jobs/{job_id}/cancel", headers=sent).json()["status"] == "canceled"
 
 
-def test_reads_are_accepted_from_any_origin(browser: httpx.Client, store: Store) -> None:
+def test_reads_are_accepted_from_any_origin(browser: httpx2.Client, store: Store) -> None:
     """A link or an image of another site can make a browser GET anything (without the cookie, by SameSite)."""
     row, key = store.keys.create("hans")
     job_id = job_of(store, row.id)
@@ -283,7 +283,9 @@ def test_cross_origin_sign_in_is_rejected(service: Service, key: str) -> None:
         (b'{"key": "' + b"x" * 5000 + b'"}', "application/json", 413, "too-large"),
     ],
 )
-def test_malformed_sign_ins_are_rejected(browser: httpx.Client, body: bytes, kind: str, status: int, code: str) -> None:
+def test_malformed_sign_ins_are_rejected(
+    browser: httpx2.Client, body: bytes, kind: str, status: int, code: str
+) -> None:
     answer = browser.post("/v1/session", content=body, headers={"Content-Type": kind})
     refused(answer, status, code)
     assert answer.json()["detail"][0] not in ": "
@@ -292,8 +294,8 @@ def test_malformed_sign_ins_are_rejected(browser: httpx.Client, body: bytes, kin
 
 def test_failed_sign_ins_are_limited_temporarily(service: Service, store: Store) -> None:
     """The client has an address of its own. If it could invent one for each attempt, there would be no limit."""
-    transport = httpx.HTTPTransport(local_address="127.0.0.2", verify=False)
-    with httpx.Client(base_url=service.url, transport=transport, timeout=60) as browser:
+    transport = httpx2.HTTPTransport(local_address="127.0.0.2", verify=False)
+    with httpx2.Client(base_url=service.url, transport=transport, timeout=60) as browser:
         key = store.keys.create("ida")[1]
         for number in range(MOST_FAILURES):
             answer = sign_in(browser, "sgsst_wrong", **{"X-Forwarded-For": f"192.0.2.{number}"})
@@ -307,8 +309,8 @@ def test_failed_sign_ins_are_limited_temporarily(service: Service, store: Store)
 
 def test_parallel_sign_ins_cannot_pass_the_limit(service: Service) -> None:
     async def guess() -> list[int]:
-        transport = httpx.AsyncHTTPTransport(local_address="127.0.0.3", verify=False)
-        async with httpx.AsyncClient(base_url=service.url, transport=transport, timeout=60) as browser:
+        transport = httpx2.AsyncHTTPTransport(local_address="127.0.0.3", verify=False)
+        async with httpx2.AsyncClient(base_url=service.url, transport=transport, timeout=60) as browser:
             guesses = [browser.post("/v1/session", json={"key": f"sgsst_{each}"}) for each in range(60)]
             return [answer.status_code for answer in await asyncio.gather(*guesses)]
 
@@ -395,7 +397,7 @@ def test_invalid_cookie_is_ignored_without_keys(tmp_path: Path) -> None:
         refused(browser.get("/v1/jobs", headers={"Origin": "https://evil.example"}), 403, "foreign-site")
 
 
-def test_cookie_authorizes_streams_and_files(browser: httpx.Client, store: Store) -> None:
+def test_cookie_authorizes_streams_and_files(browser: httpx2.Client, store: Store) -> None:
     """`EventSource`, images and downloads cannot send a key."""
     row, key = store.keys.create("lea")
     job_id = job_of(store, row.id)

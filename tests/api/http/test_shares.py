@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from sqlalchemy import update
 
@@ -38,13 +38,13 @@ def store(service: Service) -> Iterator[Store]:
 
 
 @pytest.fixture
-def me(service: Service, store: Store) -> Iterator[httpx.Client]:
+def me(service: Service, store: Store) -> Iterator[httpx2.Client]:
     with service.client(store.keys.create("me")[1]) as client:
         yield client
 
 
 @pytest.fixture
-def visitor(service: Service) -> Iterator[httpx.Client]:
+def visitor(service: Service) -> Iterator[httpx2.Client]:
     """Yield a client without a key."""
     with service.client() as client:
         yield client
@@ -56,7 +56,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"scene": ply, "cameras": cameras, "style": style}
 
 
-def finished(client: httpx.Client, service: Service, store: Store, files: dict[str, Path], folder: Path) -> str:
+def finished(client: httpx2.Client, service: Service, store: Store, files: dict[str, Path], folder: Path) -> str:
     """Return a finished job, with results in place of those of a dispatcher."""
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     parameters = {"background": "white", "name": "my wall", "seed": 7}
@@ -74,7 +74,7 @@ def finished(client: httpx.Client, service: Service, store: Store, files: dict[s
     return job_id
 
 
-def share(client: httpx.Client, job_id: str, **body: Any) -> tuple[dict[str, Any], str]:
+def share(client: httpx2.Client, job_id: str, **body: Any) -> tuple[dict[str, Any], str]:
     """Share a job; return the share and its token."""
     answer = client.post(f"/v1/jobs/{job_id}/shares", json=body)
     assert answer.status_code == 201, answer.text
@@ -82,13 +82,13 @@ def share(client: httpx.Client, job_id: str, **body: Any) -> tuple[dict[str, Any
     return view, view["url"].partition("/shared#")[2]
 
 
-def assert_missing(answer: httpx.Response, code: str = "not-found") -> None:
+def assert_missing(answer: httpx2.Response, code: str = "not-found") -> None:
     assert (answer.status_code, answer.json()["code"]) == (404, code), answer.text
     check_documented(answer)
 
 
 def test_link_shows_the_result_and_nothing_else(
-    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     job_id = finished(me, service, store, files, tmp_path)
     view, token = share(me, job_id)
@@ -146,8 +146,8 @@ def test_link_shows_the_result_and_nothing_else(
 def test_token_opens_no_other_file(
     service: Service,
     store: Store,
-    me: httpx.Client,
-    visitor: httpx.Client,
+    me: httpx2.Client,
+    visitor: httpx2.Client,
     files: dict[str, Path],
     tmp_path: Path,
     name: str,
@@ -157,7 +157,7 @@ def test_token_opens_no_other_file(
 
 
 def test_token_is_no_key_and_of_one_job(
-    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     job_id, other = (finished(me, service, store, files, tmp_path) for _ in range(2))
     view, token = share(me, job_id)
@@ -182,7 +182,7 @@ def test_token_is_no_key_and_of_one_job(
 
 
 def test_wrong_tokens_open_nothing(
-    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     view, token = share(me, finished(me, service, store, files, tmp_path))
     secret = token.partition(".")[2]
@@ -195,7 +195,7 @@ def test_wrong_tokens_open_nothing(
 
 
 def test_link_ends_when_it_expires_or_is_revoked(
-    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     job_id = finished(me, service, store, files, tmp_path)
     (first, one), (second, two), (_, three) = (share(me, job_id) for _ in range(3))
@@ -214,7 +214,7 @@ def test_link_ends_when_it_expires_or_is_revoked(
 
 
 def test_link_ends_with_the_key_of_its_job(
-    service: Service, store: Store, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     key, text = store.keys.create("leaving")
     with service.client(text) as client:
@@ -225,7 +225,7 @@ def test_link_ends_with_the_key_of_its_job(
 
 
 def test_only_results_of_ones_own_can_be_shared(
-    service: Service, store: Store, me: httpx.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     job_id = finished(me, service, store, files, tmp_path)
     with service.client(store.keys.create("other")[1]) as other:
@@ -257,7 +257,7 @@ def test_only_results_of_ones_own_can_be_shared(
 
 
 def test_expired_links_do_not_count_toward_the_limit(
-    store: Store, service: Service, me: httpx.Client, files: dict[str, Path], tmp_path: Path
+    store: Store, service: Service, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     """A clock that runs ahead of the expiry time deletes no links, but they no longer work."""
     job_id = finished(me, service, store, files, tmp_path)
@@ -272,7 +272,7 @@ def test_expired_links_do_not_count_toward_the_limit(
 
 
 def test_stored_digest_is_no_token_and_logs_contain_none(
-    service: Service, store: Store, me: httpx.Client, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     job_id = finished(me, service, store, files, tmp_path)
     view, token = share(me, job_id)
@@ -305,7 +305,7 @@ def test_requests_of_a_link_are_limited(files: dict[str, Path], tmp_path: Path) 
 
 
 def test_client_shares_results(
-    service: Service, store: Store, visitor: httpx.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
     key = store.keys.create("client")[1]
     with service.client(key) as raw, Client(service.url, key) as client:

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 
 from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
@@ -22,7 +22,7 @@ BUNDLE = "vendor/swagger-ui/swagger-ui-bundle.js"
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx2.Client]:
     data = tmp_path_factory.mktemp("static") / "data"
     with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as running, running.client() as opened:
         yield opened
@@ -34,7 +34,7 @@ def files() -> StaticFiles:
 
 
 @pytest.mark.parametrize(("path", "policy"), [("/", POLICY), ("/docs", DOCS_POLICY)])
-def test_pages_reference_existing_files(client: httpx.Client, path: str, policy: str) -> None:
+def test_pages_reference_existing_files(client: httpx2.Client, path: str, policy: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "text/html; charset=utf-8"
@@ -57,7 +57,7 @@ def test_policies_forbid_inline_scripts() -> None:
         assert policy.startswith("default-src 'none'; script-src 'self';")
 
 
-def test_files_are_cached_by_digest(client: httpx.Client, files: StaticFiles) -> None:
+def test_files_are_cached_by_digest(client: httpx2.Client, files: StaticFiles) -> None:
     for name in files.files:
         path = f"/static/{files.digest}/{name}"
         plain = client.get(path, headers={"Accept-Encoding": "identity"})
@@ -70,19 +70,19 @@ def test_files_are_cached_by_digest(client: httpx.Client, files: StaticFiles) ->
         assert (known.status_code, known.content) == (304, b"")
 
 
-def test_page_knows_the_registered_scene_formats(client: httpx.Client, files: StaticFiles) -> None:
+def test_page_knows_the_registered_scene_formats(client: httpx2.Client, files: StaticFiles) -> None:
     module = client.get(f"/static/{files.digest}/scene_formats.js").text
     match = re.search(r"sceneFormats = .*\((\[.*\])\);", module)
     assert match
     assert [entry["suffix"] for entry in json.loads(match[1])] == [format.suffix for format in FORMATS]
 
 
-def test_page_knows_what_is_installed(client: httpx.Client, files: StaticFiles) -> None:
+def test_page_knows_what_is_installed(client: httpx2.Client, files: StaticFiles) -> None:
     assert '{"video": true, "heif": true}' in client.get(f"/static/{files.digest}/installed.js").text
     assert json.dumps(STRENGTHS) in client.get(f"/static/{files.digest}/strength.js").text
 
 
-def test_page_knows_the_states_of_jobs(client: httpx.Client, files: StaticFiles) -> None:
+def test_page_knows_the_states_of_jobs(client: httpx2.Client, files: StaticFiles) -> None:
     module = client.get(f"/static/{files.digest}/statuses.js").text
     states = re.search(r"states = .*\((\{.*\})\);", module)
     assert states
@@ -102,20 +102,22 @@ def test_page_knows_the_states_of_jobs(client: httpx.Client, files: StaticFiles)
     ("header", "status"),
     [("{}", 304), ("W/{}", 304), ('"a,b", {}', 304), ("*", 304), ('"x' + "{}", 200), ("", 200)],
 )
-def test_if_none_match_accepts_several_tags(client: httpx.Client, files: StaticFiles, header: str, status: int) -> None:
+def test_if_none_match_accepts_several_tags(
+    client: httpx2.Client, files: StaticFiles, header: str, status: int
+) -> None:
     path = f"/static/{files.digest}/api.js"
     tag = client.get(path, headers={"Accept-Encoding": "identity"}).headers["etag"]
     sent = {"Accept-Encoding": "identity", "If-None-Match": header.format(tag)}
     assert client.get(path, headers=sent).status_code == status
 
 
-def test_modules_have_javascript_type(client: httpx.Client, files: StaticFiles) -> None:
+def test_modules_have_javascript_type(client: httpx2.Client, files: StaticFiles) -> None:
     for name, file in files.files.items():
         if name.endswith(".js"):
             assert file.kind.startswith("text/javascript"), name
 
 
-def test_large_files_are_compressed_once(client: httpx.Client, files: StaticFiles) -> None:
+def test_large_files_are_compressed_once(client: httpx2.Client, files: StaticFiles) -> None:
     path = f"/static/{files.digest}/{BUNDLE}"
     with client.stream("GET", path, headers={"Accept-Encoding": "br, gzip;q=0.5"}) as answer:
         assert answer.headers["content-encoding"] == "gzip"
@@ -131,7 +133,7 @@ def test_large_files_are_compressed_once(client: httpx.Client, files: StaticFile
 @pytest.mark.parametrize(
     "name", ["0123456789abcdef/index.html", "{digest}/nothing.js", "{digest}/%2e%2e/%2e%2e/http/app.py", "{digest}/"]
 )
-def test_other_static_paths_are_not_found(client: httpx.Client, files: StaticFiles, name: str) -> None:
+def test_other_static_paths_are_not_found(client: httpx2.Client, files: StaticFiles, name: str) -> None:
     answer = client.get(f"/static/{name.replace('{digest}', files.digest)}")
     assert answer.status_code == 404
     assert answer.headers["content-type"] == "application/problem+json"
@@ -150,7 +152,7 @@ def test_changed_file_changes_digest(tmp_path: Path) -> None:
     assert first.pages["index.html"].digest != second.pages["index.html"].digest
 
 
-def test_static_files_reject_other_methods(client: httpx.Client) -> None:
+def test_static_files_reject_other_methods(client: httpx2.Client) -> None:
     for path in ("/", "/docs", "/static/x/y"):
         answer = client.post(path)
         assert (answer.status_code, answer.headers["allow"]) == (405, "GET, HEAD")

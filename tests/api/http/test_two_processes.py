@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import httpx
+import httpx2
 import pytest
 
 from service.settings import ServiceSettings
@@ -43,7 +43,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
         store.close()
 
 
-def begin(client: httpx.Client, length: int) -> str:
+def begin(client: httpx2.Client, length: int) -> str:
     answer = client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(length)})
     assert answer.status_code == 201, answer.text
     return str(answer.headers["location"])
@@ -100,7 +100,7 @@ class Patch:
         self.socket.close()
 
 
-def interleave(pair: Pair, clients: tuple[httpx.Client, httpx.Client], order: random.Random) -> set[int]:
+def interleave(pair: Pair, clients: tuple[httpx2.Client, httpx2.Client], order: random.Random) -> set[int]:
     """Write to one upload by concurrent requests to both processes, and return the response statuses."""
     length = order.choice([1, 7, 64, 1000, 300_000])
     where = begin(clients[0], length)

@@ -16,7 +16,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 
 from api.cli.main import main
@@ -525,13 +525,13 @@ def test_job_from_urls(service: Service, shared_files: FileServer, urls: dict[st
             for entry in job["inputs"]:
                 role = entry["role"]
                 content = client.get(f"/v1/jobs/{job['id']}/inputs/{role}").content
-                assert content == httpx.get(urls[role]).content
+                assert content == httpx2.get(urls[role]).content
                 assert hashlib.sha256(content).hexdigest() == entry["sha256"]
 
 
 def test_client_submits_urls_and_files(service: Service, urls: dict[str, str], tmp_path: Path) -> None:
     style = tmp_path / "local.png"
-    style.write_bytes(httpx.get(urls["style"]).content)
+    style.write_bytes(httpx2.get(urls["style"]).content)
     with Client(service.url) as client:
         styles: list[str | Path] = [urls["style"], style]
         job = client.submit(urls["scene"], styles, cameras=urls["cameras"], style_weights=[0.7, 0.3])
@@ -545,7 +545,7 @@ def test_submit_command_accepts_urls(
     service: Service, urls: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     style = tmp_path / "local.png"
-    style.write_bytes(httpx.get(urls["style"]).content)
+    style.write_bytes(httpx2.get(urls["style"]).content)
     command = ["submit", urls["scene"], "--cameras", urls["cameras"], "--url", service.url, "--json"]
     command += ["--style", f"{urls['style']}:2", "--style", str(style), "--region", "half:half-space=1,0,0,0"]
     assert main([*command, "--region-style", f"half={style}"]) == 0
@@ -588,7 +588,7 @@ def test_failures_are_problem_documents(service: Service, shared_files: FileServ
         "invalid-image": sends(b"no image"),
     }
     stored = sorted((service.data / "blobs").glob("*/*"))
-    scene = shared_files.url("/other.ply", sends(httpx.get(urls["scene"]).content + b"\n"))
+    scene = shared_files.url("/other.ply", sends(httpx2.get(urls["scene"]).content + b"\n"))
     with service.client() as client:
         for code, answer in bad.items():
             body = {"scene": scene, "style": shared_files.url("/bad", answer), "cameras": [urls["cameras"]]}

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import av
-import httpx
+import httpx2
 import pytest
-from httpx_sse import ServerSentEvent, connect_sse
 
 from api.client import Client
 from api.client.answers import RequestError
@@ -43,7 +42,7 @@ def job(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
         return job_id
 
 
-def frames(client: httpx.Client, job_id: str) -> list[Any]:
+def frames(client: httpx2.Client, job_id: str) -> list[Any]:
     """Return the decoded frames of a job's video."""
     answer = client.get(f"/v1/jobs/{job_id}/artifacts/video.mp4")
     assert answer.status_code == 200
@@ -53,13 +52,13 @@ def frames(client: httpx.Client, job_id: str) -> list[Any]:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-def events(client: httpx.Client, job_id: str, **options: Any) -> list[ServerSentEvent]:
-    with connect_sse(client, "POST", f"/v1/jobs/{job_id}/video", json=options) as source:
+def events(client: httpx2.Client, job_id: str, **options: Any) -> list[httpx2.ServerSentEvent]:
+    with client.sse(f"/v1/jobs/{job_id}/video", method="POST", json=options) as source:
         assert source.response.status_code == 200, source.response.read()
-        return [sent for sent in source.iter_sse() if sent.data]
+        return [sent for sent in source if sent.data]
 
 
-def names(client: httpx.Client, job_id: str) -> list[str]:
+def names(client: httpx2.Client, job_id: str) -> list[str]:
     return [entry["name"] for entry in client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]]
 
 
@@ -98,8 +97,8 @@ def test_video_that_nobody_waits_for_is_completed(service: Service, job: str) ->
     with service.client() as client:
         before = client.get(f"/v1/jobs/{job}/artifacts").json()
         options = {"fps": 10, "seconds": 6, "resolution": 200}
-        with connect_sse(client, "POST", f"/v1/jobs/{job}/video", json=options) as source:
-            next(source.iter_sse())
+        with client.sse(f"/v1/jobs/{job}/video", method="POST", json=options) as source:
+            next(iter(source))
             other = client.post(f"/v1/jobs/{job}/video", json={"seconds": 1})
             assert (other.status_code, other.json()["code"]) == (503, "busy")
         wait_for(lambda: client.get(f"/v1/jobs/{job}/artifacts").json() != before, "the video to be published")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 
 from service.settings import ServiceSettings
@@ -28,7 +28,7 @@ def test_uncallable_webhook_urls_are_rejected(service: Service, tmp_path: Path) 
         for role, path in (("scene", scene), ("cameras", cameras), ("style", style))
     ]
 
-    def submit(url: str) -> httpx.Response:
+    def submit(url: str) -> httpx2.Response:
         return client.post("/v1/jobs", files=files, data={"webhook": url})
 
     refused = ["http://[::1", "http://℀.com/", "http://a:99999/", "http://user:pw@example.com/", "ftp://example.com"]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 
 from tests.api.page.browser import Watched
 from tests.api.service import Service, wait_for
@@ -33,7 +33,7 @@ def done(service: Service, job_id: str) -> str:
     """Wait until a job has succeeded, and return its id."""
 
     def succeeded() -> bool:
-        status = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["status"]
+        status = httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["status"]
         assert status not in ("failed", "canceled"), service.said()
         return bool(status == "succeeded")
 

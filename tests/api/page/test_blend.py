@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import numpy as np
 import pytest
 import torch
@@ -158,7 +158,7 @@ def test_two_results_are_blended(
     path = saved(watched, tmp_path)
     paths = [tmp_path / f"{job_id}.ply" for job_id in pair]
     for job_id, file in zip(pair, paths, strict=True):
-        file.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+        file.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     expected = blend_scenes([read_scene(file) for file in (*paths, files["scene"])], [0.6, 0.2, 0.2])
     assert torch.allclose(read_scene(path).scene.sh_dc, expected.scene.sh_dc, atol=1e-6)
 
@@ -173,7 +173,7 @@ def test_two_results_are_blended(
 def test_long_labels_stay_within_the_triangle(visit: Visit, service: Service, pair: list[str]) -> None:
     for job_id in pair:
         name = f"a name that is longer than the triangle {job_id[-4:]}"
-        httpx.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": name}).raise_for_status()
+        httpx2.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": name}).raise_for_status()
     watched = visit(f"/#/compare/{pair[0]}/{pair[1]}", width=1100, height=800)
     triangle = watched.page.locator(".triangle")
     triangle.locator(".corner").nth(1).wait_for()
@@ -182,7 +182,7 @@ def test_long_labels_stay_within_the_triangle(visit: Visit, service: Service, pa
     assert all(box["x"] + box["width"] <= whole["x"] + whole["width"] for box in boxes)
     watched.settled()
     for job_id, name in zip(pair, ("run 1", "run 900"), strict=True):
-        httpx.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": name}).raise_for_status()
+        httpx2.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": name}).raise_for_status()
     watched.check()
 
 

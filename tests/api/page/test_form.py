@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from PIL import Image
 
@@ -279,8 +279,8 @@ def test_start_does_not_take_over_another_view(visit: Visit, service: Service, f
     tile.wait_for()
     page.locator("#said", has_text="made elsewhere").wait_for(state="attached")
     assert page.url.endswith("#/jobs")
-    (job,) = (job for job in httpx.get(f"{service.url}/v1/jobs").json()["jobs"] if job["name"] == "made elsewhere")
-    httpx.post(f"{service.url}/v1/jobs/{job['id']}/cancel").raise_for_status()
+    (job,) = (job for job in httpx2.get(f"{service.url}/v1/jobs").json()["jobs"] if job["name"] == "made elsewhere")
+    httpx2.post(f"{service.url}/v1/jobs/{job['id']}/cancel").raise_for_status()
     watched.check()
 
 

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from PIL import Image
 
@@ -46,7 +46,7 @@ def started(watched: Watched, service: Service, name: str = "Start") -> dict[str
         watched.page.get_by_role("button", name=name, exact=True).click()
     assert answer.value.status == 202, answer.value.text()
     watched.page.wait_for_url(re.compile("#/jobs/job_"))
-    job: dict[str, Any] = httpx.get(f"{service.url}/v1/jobs/{answer.value.json()['id']}").json()
+    job: dict[str, Any] = httpx2.get(f"{service.url}/v1/jobs/{answer.value.json()['id']}").json()
     return job
 
 
@@ -65,7 +65,7 @@ def test_another_painting_and_changes_send_nothing_again(
         "regions": regions,
         "name": "mine",
     }
-    before = httpx.get(f"{service.url}/v1/jobs/{done(service, submit(service, files, **values))}").json()
+    before = httpx2.get(f"{service.url}/v1/jobs/{done(service, submit(service, files, **values))}").json()
     watched = visit(f"/#/jobs/{before['id']}")
     page, sent = watched.page, uploads_of(watched)
     page.get_by_role("button", name="Try another painting").click()
@@ -104,8 +104,8 @@ def test_changes_restore_regions_with_masks(
     region = {"name": "left", "select": "mask=left.bin", "weight": 0.25, "style": "night.png"}
     body = [(role, (path.name, path.read_bytes())) for role, path in [*files.items(), ("style", night), ("mask", mask)]]
     values = STEPS | {"steps_sos": 2, "regions": [region]}
-    answer = httpx.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(values)}, timeout=60)
-    before = httpx.get(f"{service.url}/v1/jobs/{done(service, answer.json()['id'])}").json()
+    answer = httpx2.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(values)}, timeout=60)
+    before = httpx2.get(f"{service.url}/v1/jobs/{done(service, answer.json()['id'])}").json()
     watched = visit(f"/#/jobs/{before['id']}")
     page, sent = watched.page, uploads_of(watched)
     page.get_by_role("button", name="Same with changes").click()
@@ -134,8 +134,8 @@ def test_painting_of_a_region_is_not_one_of_the_job(
     region = {"name": "the left", "select": "half-space=1,0,0,0", "style": ["night.png:1.0"], "content_weight": "light"}
     body = [(role, (path.name, path.read_bytes())) for role, path in [*files.items(), ("style", night)]]
     values = STEPS | {"steps_sos": 2, "regions": [region]}
-    answer = httpx.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(values)}, timeout=60)
-    before = httpx.get(f"{service.url}/v1/jobs/{done(service, answer.json()['id'])}").json()
+    answer = httpx2.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(values)}, timeout=60)
+    before = httpx2.get(f"{service.url}/v1/jobs/{done(service, answer.json()['id'])}").json()
     assert before["name"] == "scene · style"
     watched = visit(f"/#/jobs/{before['id']}")
     page = watched.page
@@ -158,7 +158,7 @@ def test_painting_of_a_region_is_not_one_of_the_job(
     assert again["name"] == "scene · style"
     assert [each["style"] for each in again["parameters"]["regions"]] == ["night.png"]
     assert digests(again, "style") == [digests(before, "style")[1], digests(before, "style")[0]]
-    httpx.post(f"{service.url}/v1/jobs/{again['id']}/cancel").raise_for_status()
+    httpx2.post(f"{service.url}/v1/jobs/{again['id']}/cancel").raise_for_status()
     watched.check()
 
 
@@ -169,7 +169,7 @@ def test_input_that_is_gone_is_asked_for_at_its_field(visit: Visit, service: Ser
     page.get_by_role("button", name="Same with changes").click()
     page.get_by_role("img", name="style.png").wait_for()
     watched.settled()
-    httpx.delete(f"{service.url}/v1/jobs/{job_id}").raise_for_status()
+    httpx2.delete(f"{service.url}/v1/jobs/{job_id}").raise_for_status()
     page.get_by_role("button", name="Start", exact=True).click()
     slot = page.locator(".slot").first
     slot.get_by_text("Upload the file again.").wait_for()
@@ -193,7 +193,7 @@ def test_each_painting_can_be_a_job_of_its_own(
     assert len(sent) == 4, "the scene is sent once for both"
     ids = page.url.split("/")[-2:]
     for job_id, name in zip(ids, ("scene · style", "scene · night"), strict=True):
-        job = httpx.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()
+        job = httpx2.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()
         assert (job["name"], len(digests(job, "style"))) == (name, 1)
     page.get_by_label("Wipe", exact=True).wait_for()
     tiles = page.get_by_role("list", name="Jobs side by side").get_by_role("listitem")
@@ -215,14 +215,14 @@ def test_job_is_finished_early_on_the_page(visit: Visit, service: Service, files
     page.get_by_role("button", name="Stop here and keep it").click()
     page.locator(".badge", has_text="Done").wait_for()
     page.get_by_role("link", name="Download", exact=True).wait_for()
-    assert httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["result"]["stopped"] == "on-request"
+    assert httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["result"]["stopped"] == "on-request"
     watched.check()
 
 
 def test_paintings_are_chosen_from_the_gallery(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     """Paintings of earlier jobs are not sent again."""
     earlier = submit(service, files, **LONG, name="earlier")
-    httpx.post(f"{service.url}/v1/jobs/{earlier}/cancel").raise_for_status()
+    httpx2.post(f"{service.url}/v1/jobs/{earlier}/cancel").raise_for_status()
     watched = visit(width=900, height=700)
     page, sent = watched.page, uploads_of(watched)
     choose(watched, {role: files[role] for role in ("scene", "cameras")})
@@ -244,7 +244,7 @@ def test_paintings_are_chosen_from_the_gallery(visit: Visit, service: Service, f
     assert len(sent) == 3, "the scene, its cameras and the painting of the page"
     assert job["parameters"]["content_weight"] == STRENGTHS["light"]
     assert job["name"] == "scene · style + great_wave"
-    httpx.post(f"{service.url}/v1/jobs/{job['id']}/cancel").raise_for_status()
+    httpx2.post(f"{service.url}/v1/jobs/{job['id']}/cancel").raise_for_status()
     watched.check()
 
 

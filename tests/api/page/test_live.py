@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import httpx
+import httpx2
 import numpy as np
 import pytest
 
@@ -29,11 +29,11 @@ def watch(visit: Visit, job_id: str) -> Watched:
 
 def finish(service: Service, job_id: str) -> None:
     """Ask a running job to end with its present colors."""
-    httpx.post(f"{service.url}/v1/jobs/{job_id}/finish").raise_for_status()
+    httpx2.post(f"{service.url}/v1/jobs/{job_id}/finish").raise_for_status()
 
 
 def names(service: Service, job_id: str) -> set[str]:
-    listed = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts").json()["artifacts"]
+    listed = httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts").json()["artifacts"]
     return {entry["name"] for entry in listed}
 
 
@@ -47,7 +47,7 @@ def test_colors_arrive_while_the_job_runs(visit: Visit, service: Service, files:
     watched.wipe("Home")
     first = watched.pixels()
     wait_for(lambda: not np.array_equal(watched.pixels(), first), "other colors", service.said)
-    assert httpx.head(f"{service.url}/v1/jobs/{job_id}/artifacts/live/colors.f16").headers["content-length"] == "3696"
+    assert httpx2.head(f"{service.url}/v1/jobs/{job_id}/artifacts/live/colors.f16").headers["content-length"] == "3696"
     assert page.get_by_label("Amount of style").is_hidden()
     assert "live" not in page.locator(".files").inner_text()
     page.get_by_label("Latest preview").check(force=True)
@@ -67,7 +67,7 @@ def test_view_of_a_running_job_becomes_its_result(visit: Visit, service: Service
     assert page.locator("canvas.view").get_attribute("id") == "same"
     page.get_by_label("Amount of style").wait_for()
     result = files["scene"].with_name("result.ply")
-    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{done(service, job_id)}/artifacts/stylized.ply").content)
+    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{done(service, job_id)}/artifacts/stylized.ply").content)
     wanted = rendered(result, resized(read_cameras(files["cameras"])[1], 384))
     watched.wipe("Home")
     assert psnr(frame_of(watched, wanted), wanted) > 38
@@ -79,7 +79,7 @@ def test_refined_scene_is_watched(visit: Visit, service: Service, files: dict[st
     job_id = submit(service, files, **LONG, refine=2)
     watched = watch(visit, job_id)
     watched.settled()
-    (tmp_path / "live.ply").write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/live/scene.ply").content)
+    (tmp_path / "live.ply").write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/live/scene.ply").content)
     assert read_scene_header(tmp_path / "live.ply").count > 616
     finish(service, job_id)
     watched.page.locator(".side.right", has_text="Stylized").wait_for(state="attached")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 from PIL import Image
 
@@ -24,7 +24,7 @@ def test_default_name_is_scene_and_painting(visit: Visit, service: Service, file
     set_options(watched, **LONG)
     page.get_by_role("button", name="Start").click()
     page.get_by_role("heading", name="scene · style").wait_for()
-    job = httpx.get(f"{service.url}/v1/jobs/{page.url.rsplit('/', 1)[1]}").json()
+    job = httpx2.get(f"{service.url}/v1/jobs/{page.url.rsplit('/', 1)[1]}").json()
     assert job["name"] == "scene · style"
     page.get_by_role("button", name="Cancel").click()
     page.locator(".badge", has_text="Canceled").wait_for()
@@ -39,12 +39,12 @@ def test_job_is_renamed(visit: Visit, service: Service, files: dict[str, Path]) 
     page.get_by_label("New name").fill("second <b>name</b>")
     page.keyboard.press("Enter")
     page.get_by_role("heading", name="second <b>name</b>").wait_for()
-    assert httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["name"] == "second <b>name</b>"
+    assert httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["name"] == "second <b>name</b>"
     page.get_by_role("button", name="Rename").click()
     page.get_by_label("New name").fill("third")
     page.keyboard.press("Escape")
     page.get_by_role("heading", name="second").wait_for()
-    httpx.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": "point_cloud · wheat_field_with_cypresses"})
+    httpx2.patch(f"{service.url}/v1/jobs/{job_id}", json={"name": "point_cloud · wheat_field_with_cypresses"})
     tile = visit("/#/jobs", width=390, height=844).page.locator(".tile", has_text="wheat_field_with_cypresses")
     assert tile.locator("strong").evaluate(
         "(it) => it.scrollWidth <= it.clientWidth && it.scrollHeight <= it.clientHeight"

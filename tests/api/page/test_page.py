@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import numpy as np
 import pytest
 import torch
@@ -51,7 +51,7 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.get_by_text("616 Gaussians · SH degree 1").wait_for()
     watched.settled()
     page.get_by_text("3 cameras shown in the scene").wait_for()
-    assert httpx.get(f"{service.url}/v1/jobs").json()["jobs"] == []  # nothing was sent for the preview
+    assert httpx2.get(f"{service.url}/v1/jobs").json()["jobs"] == []  # nothing was sent for the preview
 
     set_options(watched, **STEPS)
     page.get_by_role("button", name="Estimate time").click()
@@ -73,7 +73,7 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.get_by_label("Camera", exact=True).select_option("1")
     camera = resized(read_cameras(files["cameras"])[1], 384)
     result = tmp_path / "stylized.ply"
-    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     original, stylized = rendered(files["scene"], camera), rendered(result, camera)
     watched.wipe("End")
     before = frame_of(watched, original)
@@ -288,13 +288,13 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     page.get_by_role("button", name="Delete run 2 of three").click()
     page.get_by_role("button", name="Delete", exact=True).click()
     page.locator(".tile", has_text="run 2 of three").wait_for(state="detached")
-    assert httpx.get(f"{service.url}/v1/jobs/{ids[2]}").status_code == 404
+    assert httpx2.get(f"{service.url}/v1/jobs/{ids[2]}").status_code == 404
     watched.check()
 
 
 def test_refined_result_has_a_geometry_of_its_own(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     job_id = done(service, submit(service, files, refine=2, name="refined"))
-    stylized = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content
+    stylized = httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content
     path = files["scene"].with_name("refined.ply")
     path.write_bytes(stylized)
     assert len(read_scene(path).scene) > 616
@@ -312,7 +312,7 @@ def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service
     write_scene(packed, read_scene(files["scene"]).scene, SPZ)
     job_id = done(service, submit(service, files | {"scene": packed}, name="packed"))
     result = files["scene"].with_name("stylized.ply")
-    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     watched = visit(f"/#/jobs/{job_id}", width=600, height=500)
     watched.page.get_by_label("Camera", exact=True).select_option("1")
     camera = resized(read_cameras(files["cameras"])[1], 384)
@@ -331,7 +331,7 @@ def test_requested_render_mode_is_shown(visit: Visit, service: Service, files: d
     write_scene(small, scene)
     job_id = done(service, submit(service, files | {"scene": small}, name="antialiased", render_mode="antialiased"))
     result = files["scene"].with_name("stylized.ply")
-    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     assert read_scene(result).scene.rendering.antialiased
     watched = visit(f"/#/jobs/{job_id}", width=600, height=500)
     watched.page.get_by_label("Camera", exact=True).select_option("1")
@@ -491,12 +491,12 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
     page.get_by_role("button", name="Start").click()
     page.locator(".badge", has_text="Done").wait_for()
     job_id = page.url.rsplit("/", 1)[1]
-    parameters = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()["parameters"]
+    parameters = httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["parameters"]
     assert parameters["style_weights"] == [3.0, 1.0]
     (own_region,) = parameters["regions"]
     assert (own_region["name"], own_region["select"], own_region["freeze"]) == ("left", "half-space=1,0,0,0", True)
     result = tmp_path / "stylized.ply"
-    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     before, after = read_scene(files["scene"]).scene, read_scene(result).scene
     moved = (before.sh_dc != after.sh_dc).any(dim=1)
     side = before.means[:, 0] > 0

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import av
-import httpx
+import httpx2
 import pytest
 
 from sgsst_core.files.formats import RESULT_FORMATS, read_scene_header
@@ -53,8 +53,8 @@ def test_result_is_downloaded_in_every_format(visit: Visit, finished: str) -> No
 
 def test_chart_ends_with_the_loss_of_the_result(visit: Visit, service: Service, finished: str) -> None:
     """The page draws the mean over a round of views, which the job's result states too, and single views thin."""
-    job = httpx.get(f"{service.url}/v1/jobs/{finished}").json()
-    points = httpx.get(f"{service.url}/v1/jobs/{finished}/progress").json()["points"]
+    job = httpx2.get(f"{service.url}/v1/jobs/{finished}").json()
+    points = httpx2.get(f"{service.url}/v1/jobs/{finished}/progress").json()["points"]
     assert points[-1]["mean_loss"] == pytest.approx(job["result"]["loss_after"])
     assert points[-1]["mean_loss"] != points[-1]["loss"]
     watched = visit(f"/#/jobs/{finished}")
@@ -263,7 +263,7 @@ def test_result_without_webgl_is_the_sheet(browser: Any, service: Service, finis
     page.get_by_label("3D", exact=True).check(force=True)
     page.get_by_text("needs WebGL 2").wait_for()
     assert page.locator(".stage").bounding_box()["height"] < 200
-    assert httpx.get(f"{service.url}/v1/jobs/{finished}").json()["preview"] == "previews/thumbnail.jpg"
+    assert httpx2.get(f"{service.url}/v1/jobs/{finished}").json()["preview"] == "previews/thumbnail.jpg"
     page.goto(f"{service.url}/#/compare/{finished}/{finished}")
     page.get_by_text("needs WebGL 2").wait_for()
     assert page.get_by_label("Left", exact=True).is_hidden()

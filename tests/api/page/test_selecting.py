@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import numpy as np
 import pytest
 import torch
@@ -309,14 +309,14 @@ def test_selected_region_stays_frozen(visit: Visit, service: Service, files: dic
     page.get_by_role("button", name="Start").click()
     page.locator(".badge", has_text="Done").wait_for()
     job_id = page.url.rsplit("/", 1)[1]
-    job = httpx.get(f"{service.url}/v1/jobs/{job_id}").json()
+    job = httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()
     (region,) = job["parameters"]["regions"]
     assert (region["name"], region["select"], region["freeze"]) == ("near", "mask=region_1.bin", True)
-    mask = httpx.get(f"{service.url}/v1/jobs/{job_id}/inputs/mask").content
+    mask = httpx2.get(f"{service.url}/v1/jobs/{job_id}/inputs/mask").content
     frozen = np.unpackbits(np.frombuffer(mask, np.uint8), bitorder="little").astype(bool)[:616]
     assert 10 < frozen.sum() == count < 600
     result = tmp_path / "stylized.ply"
-    result.write_bytes(httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
     before, after = read_scene(files["scene"]).scene, read_scene(result).scene
     same = (before.sh_dc.numpy().view(np.uint32) == after.sh_dc.numpy().view(np.uint32)).all(axis=1)
     assert same[frozen].all()

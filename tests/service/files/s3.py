@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Literal
 
-import httpx
+import httpx2
 import pytest
 
 from tests.http_servers import serve
@@ -63,7 +63,7 @@ class FaultyS3:
         self._lock = threading.Lock()
         self._healed = threading.Event()
         faulty = self
-        client = httpx.Client(base_url=behind, timeout=60)
+        client = httpx2.Client(base_url=behind, timeout=60)
 
         class Handler(BaseHTTPRequestHandler):
             protocol_version = "HTTP/1.1"
@@ -107,7 +107,7 @@ class FaultyS3:
                 return self._faults.pop(0)[0]
         return None
 
-    def _answer(self, handler: BaseHTTPRequestHandler, client: httpx.Client, body: bytes) -> None:
+    def _answer(self, handler: BaseHTTPRequestHandler, client: httpx2.Client, body: bytes) -> None:
         fault = self._fault(handler.command, handler.path)
         if fault == "slow-down":
             self._send(handler, 503, {"Content-Type": "application/xml"}, _SLOW_DOWN)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 
 from service import problems
@@ -36,16 +36,16 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         yield running
 
 
-def append(service: Service, where: str, offset: int, content: bytes, checksum: str = "") -> httpx.Response:
+def append(service: Service, where: str, offset: int, content: bytes, checksum: str = "") -> httpx2.Response:
     headers = {**TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream"}
     headers |= {"Upload-Checksum": checksum} if checksum else {}
-    return httpx.patch(f"{service.url}{where}", content=content, headers=headers, timeout=60)
+    return httpx2.patch(f"{service.url}{where}", content=content, headers=headers, timeout=60)
 
 
 def begin(service: Service, content: bytes) -> str:
     """Create an upload with all bytes except the last one, and return its URL path."""
     headers = {**TUS, "Upload-Length": str(len(content))}
-    where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
+    where = str(httpx2.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
     assert append(service, where, 0, content[:-1]).status_code == 204
     return where
 
@@ -73,9 +73,9 @@ def test_last_part_can_be_sent_again(service: Service) -> None:
     service.start()
     for linked, content in contents.items():
         where, sha256 = places[linked], hashlib.sha256(content).hexdigest()
-        assert httpx.head(f"{service.url}{where}", headers=TUS).headers["upload-offset"] == str(len(content))
+        assert httpx2.head(f"{service.url}{where}", headers=TUS).headers["upload-offset"] == str(len(content))
         assert append(service, where, len(content), b"").status_code == 204
-        shown = httpx.get(f"{service.url}{where}").json()
+        shown = httpx2.get(f"{service.url}{where}").json()
         assert (shown["complete"], shown["sha256"]) == (True, sha256)
     blobs = [path.read_bytes() for path in (service.data / "blobs").glob("*/*") if path.is_file()]
     assert [blobs.count(content) for content in contents.values()] == [1, 1]
@@ -91,9 +91,9 @@ def test_job_can_use_the_finished_upload_at_once(service: Service, tmp_path: Pat
     service.start()
     body = {"style": ("style.png", style.read_bytes())}
     data = {"scene": where.rsplit("/", 1)[1], "parameters": '{"orbit": 2}'}
-    answer = httpx.post(f"{service.url}/v1/jobs", files=body, data=data, timeout=60)
+    answer = httpx2.post(f"{service.url}/v1/jobs", files=body, data=data, timeout=60)
     assert answer.status_code == 202, answer.text
-    assert httpx.get(f"{service.url}{where}").json()["complete"]
+    assert httpx2.get(f"{service.url}{where}").json()["complete"]
 
 
 def test_missing_bytes_are_not_read_as_zeros(service: Service) -> None:
@@ -158,7 +158,7 @@ def test_digest_of_an_upload_in_parts_equals_that_of_its_file(service: Service, 
     content = os.urandom(30_000)
     middle = len(content) // 2
     headers = {**TUS, "Upload-Length": str(len(content))}
-    where = str(httpx.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
+    where = str(httpx2.post(f"{service.url}/v1/uploads", headers=headers, timeout=60).headers["location"])
     assert append(service, where, 0, content[:middle]).status_code == 204
     wrong = base64.b64encode(hashlib.sha256(b"another").digest()).decode()
     assert append(service, where, middle, bytes(100), f"sha256 {wrong}").status_code == 460
@@ -167,5 +167,5 @@ def test_digest_of_an_upload_in_parts_equals_that_of_its_file(service: Service, 
         service.start()
     assert append(service, where, middle, content[middle:-1]).status_code == 204
     assert append(service, where, len(content) - 1, content[-1:]).status_code == 204
-    shown = httpx.get(f"{service.url}{where}").json()
+    shown = httpx2.get(f"{service.url}{where}").json()
     assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import httpx
+import httpx2
 import pytest
 
 from service.files.artifacts import Artifacts
@@ -36,7 +36,7 @@ def environment(endpoint: str) -> Iterator[dict[str, str]]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in values.items():
             patch.setenv(name, value)
-        assert httpx.put(f"{endpoint}/results").status_code == 200
+        assert httpx2.put(f"{endpoint}/results").status_code == 200
         yield values
 
 
@@ -102,10 +102,10 @@ def test_later_objects_are_visible_to_other_processes(
     first = artifacts.put("job_1", 1, "plan.json", source)
     artifacts.sweep("job_1", 9, {first.location})
     late = f"{environment['AWS_ENDPOINT_URL']}/results/{prefix}/job_1/2/x/late"
-    assert httpx.put(late, content=b"0123456789").status_code == 200
+    assert httpx2.put(late, content=b"0123456789").status_code == 200
     assert b"".join(artifacts.read("job_1/2/x/late", 0, 10)) == b"0123456789"
     artifacts.sweep("job_1", 9, {first.location})
-    assert httpx.head(late).status_code == 404
+    assert httpx2.head(late).status_code == 404
 
 
 def test_missing_bucket_is_not_ready(artifacts: Artifacts) -> None:
@@ -162,7 +162,7 @@ def test_api_and_dispatcher_share_a_bucket_and_no_folder(
             assert len(list((folder / "cache" / "files").glob("*/*"))) == 3
         assert client.delete(where).status_code == 204
         assert client.get(f"{where}/artifacts/stylized.ply").status_code == 404
-    listing = httpx.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "service/job_"})
+    listing = httpx2.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "service/job_"})
     assert "<Key>" not in listing.text
 
 
@@ -179,7 +179,7 @@ def test_parts_of_an_upload_go_to_any_api_process(environment: dict[str, str], t
     ):
         where = first.post("/v1/uploads", headers={**tus, "Upload-Length": str(len(content))}).headers["location"]
 
-        def send(client: httpx.Client, start: int, stop: int) -> httpx.Response:
+        def send(client: httpx2.Client, start: int, stop: int) -> httpx2.Response:
             return client.patch(where, content=content[start:stop], headers={**tus, "Upload-Offset": str(start)})
 
         assert send(first, 0, SIZE).status_code == 204
@@ -190,7 +190,7 @@ def test_parts_of_an_upload_go_to_any_api_process(environment: dict[str, str], t
         for client in (first, second):
             shown = client.get(where).json()
             assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())
-        listing = httpx.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "uploads/"}).text
+        listing = httpx2.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "uploads/"}).text
         assert listing.count("<Key>") == 1
         assert "<Key>uploads/blobs/" in listing
         given_up = first.post("/v1/uploads", headers={**tus, "Upload-Length": "100"}).headers["location"]
@@ -198,5 +198,5 @@ def test_parts_of_an_upload_go_to_any_api_process(environment: dict[str, str], t
         assert first.patch(given_up, content=bytes(60), headers=headers).status_code == 204
         assert second.delete(given_up, headers=tus).status_code == 204
         assert first.get(given_up).status_code == 404
-        listing = httpx.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "uploads/"}).text
+        listing = httpx2.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "uploads/"}).text
         assert listing.count("<Key>") == 1

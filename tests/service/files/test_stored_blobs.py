@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-import httpx
+import httpx2
 import pytest
 
 from service.errors import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
@@ -83,7 +83,7 @@ def fleet(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     for name, value in environment_of(s3.url).items():
         monkeypatch.setenv(name, value)
     url = f"s3://inputs/{os.urandom(4).hex()}"
-    assert httpx.put(f"{server}/inputs").status_code == 200
+    assert httpx2.put(f"{server}/inputs").status_code == 200
     store = new_store(ServiceSettings(data=tmp_path / "database"))
     yield Fleet(tmp_path, store, url, s3)
     s3.heal()

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import psutil
 import pytest
 import torch
@@ -47,19 +47,19 @@ def expected(files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -
     return undisturbed(files, PARAMETERS, tmp_path_factory.mktemp("cli"))
 
 
-def submit(service: Service, files: dict[str, Path], key: str, **parameters: Any) -> httpx.Response:
+def submit(service: Service, files: dict[str, Path], key: str, **parameters: Any) -> httpx2.Response:
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     data = {"parameters": json.dumps(PARAMETERS | parameters)}
-    return httpx.post(f"{service.url}/v1/jobs", files=body, data=data, headers={"Idempotency-Key": key}, timeout=60)
+    return httpx2.post(f"{service.url}/v1/jobs", files=body, data=data, headers={"Idempotency-Key": key}, timeout=60)
 
 
 def look(service: Service, job_id: str) -> dict[str, Any]:
     """Return the job's status, waiting while the API is down."""
 
-    def ask() -> httpx.Response | None:
+    def ask() -> httpx2.Response | None:
         try:
-            return httpx.get(f"{service.url}/v1/jobs/{job_id}", timeout=30)
-        except httpx.TransportError:
+            return httpx2.get(f"{service.url}/v1/jobs/{job_id}", timeout=30)
+        except httpx2.TransportError:
             return None
 
     answer = wait_for(ask, "an answer", service.said)
@@ -95,13 +95,13 @@ def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
 
 def check_published_once(service: Service, job_id: str) -> bytes:
     """Return the job's result; fail unless it was announced, ended the job and was stored exactly once."""
-    stream = httpx.get(f"{service.url}/v1/jobs/{job_id}/events", timeout=60).text
+    stream = httpx2.get(f"{service.url}/v1/jobs/{job_id}/events", timeout=60).text
     blocks = [dict(line.split(": ", 1) for line in block.splitlines()) for block in stream.split("\n\n") if block]
     events = [(block["event"], json.loads(block["data"])) for block in blocks if "data" in block]
     assert [data["name"] for kind, data in events if kind == "artifact"].count("stylized.ply") == 1
     assert [data["status"] for kind, data in events if kind == "status"].count("succeeded") == 1
     assert len(list((service.data / "artifacts" / job_id).rglob("stylized.ply"))) == 1
-    answer = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply", timeout=60)
+    answer = httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply", timeout=60)
     assert f'"{hashlib.sha256(answer.content).hexdigest()}"' == answer.headers["etag"]
     return answer.content
 
@@ -131,7 +131,7 @@ def test_job_survives_kills_of_all_its_processes(service: Service, files: dict[s
 
 def test_request_interrupted_by_an_api_kill_can_be_repeated(service: Service, files: dict[str, Path]) -> None:
     def names() -> list[str]:
-        return [entry["name"] for entry in httpx.get(f"{service.url}/v1/jobs", timeout=30).json()["jobs"]]
+        return [entry["name"] for entry in httpx2.get(f"{service.url}/v1/jobs", timeout=30).json()["jobs"]]
 
     for number in range(3):
         killer = threading.Timer(0.02 * 3**number, lambda: service.kill(API))
@@ -140,14 +140,14 @@ def test_request_interrupted_by_an_api_kill_can_be_repeated(service: Service, fi
         while answer is None:
             try:
                 answer = submit(service, files, f"again-{number}", name=f"again {number}", steps_sos=1)
-            except httpx.TransportError:
+            except httpx2.TransportError:
                 continue
         killer.join()
         assert answer.status_code == 202, answer.text
         wait_for(service.ready, "the API", service.said)
         assert names().count(f"again {number}") == 1
         assert look(service, answer.json()["id"])["name"] == f"again {number}"
-        httpx.post(f"{service.url}/v1/jobs/{answer.json()['id']}/cancel", timeout=30)
+        httpx2.post(f"{service.url}/v1/jobs/{answer.json()['id']}/cancel", timeout=30)
 
 
 def test_job_survives_kills_of_its_ranks(service: Service, files: dict[str, Path], expected: Path) -> None:
@@ -159,7 +159,7 @@ def test_job_survives_kills_of_its_ranks(service: Service, files: dict[str, Path
             process.kill()
     job = ended(service, job_id)
     assert job["result"]["steps"] == STEPS
-    log = httpx.get(f"{service.url}/v1/jobs/{job_id}/artifacts/log.txt", timeout=60).text
+    log = httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/log.txt", timeout=60).text
     assert "Resuming from step" in log
     (service.data / "two.ply").write_bytes(check_published_once(service, job_id))
     two, one = (read_scene(path).scene for path in (service.data / "two.ply", expected))

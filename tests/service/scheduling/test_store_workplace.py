@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
@@ -34,7 +34,7 @@ from tests.service.files.s3 import FaultyS3, environment_of, s3_server
 @pytest.fixture(scope="module")
 def server() -> Iterator[str]:
     with s3_server() as url:
-        assert httpx.put(f"{url}/files").status_code == 200
+        assert httpx2.put(f"{url}/files").status_code == 200
         yield url
 
 
