@@ -41,7 +41,6 @@ def parse_url(url: str) -> httpx2.URL:
     try:
         parsed = httpx2.URL(url)
         host, port = parsed.raw_host.decode(), parsed.port
-        _ = parsed.host  # decodes IDNA
     except (httpx2.InvalidURL, UnicodeError) as error:
         raise ValueError(f"it is not a valid URL ({error})") from error
     if parsed.scheme not in ("http", "https"):
