@@ -12,6 +12,7 @@ from __future__ import annotations
 import mmap
 import re
 import struct
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -188,9 +189,9 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
     if byte_order is None:
         raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")
     parsed = tuple(PlyElement(name, count, span, tuple(props.values())) for name, count, span, props in elements)
-    names = [each.name for each in parsed]
+    uses = Counter(each.name for each in parsed)
     for each in parsed:
-        if names.count(each.name) > 1:
+        if uses[each.name] > 1:
             raise SceneError(f"{path}: the PLY header declares element {each.name!r} twice. Export the scene again.")
         if each.count and not each.properties:
             raise SceneError(f"{path}: element {each.name!r} of the PLY header has no property. Export it again.")

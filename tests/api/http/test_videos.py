@@ -67,10 +67,10 @@ def test_finished_job_makes_another_video_with_progress(service: Service, job: s
     with service.client() as client:
         *rendering, last = events(client, job, path=path, fps=4, seconds=2, resolution=100)
         assert {sent.event for sent in rendering} == {"rendering"}
-        assert [sent.json()["total"] for sent in rendering] == [8] * len(rendering)
-        assert rendering[-1].json()["fraction"] == 1
+        assert [json.loads(sent.data)["total"] for sent in rendering] == [8] * len(rendering)
+        assert json.loads(rendering[-1].data)["fraction"] == 1
         assert last.event == "video", last.data
-        assert last.json()["name"] == "video.mp4"
+        assert json.loads(last.data)["name"] == "video.mp4"
         images = frames(client, job)
         assert len(images) == 8
         assert max(images[0].shape) == 100

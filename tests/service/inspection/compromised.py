@@ -15,6 +15,7 @@ from typing import Any
 from service.inspection import process, sandbox
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats import read_scene_header
+from worker import inputs
 
 
 def taken_over(path: Path) -> Any:
@@ -26,7 +27,7 @@ def taken_over(path: Path) -> Any:
     raise SceneError(json.dumps(namespace["reached"]))
 
 
-setattr(process, "read_scene_header", taken_over)  # noqa: B010 (it is another module's)
+setattr(inputs, "read_scene_header", taken_over)  # noqa: B010 (it is another module's)
 if "landlock" in sys.argv:
     sandbox._landlock_version = lambda: 0
 if "seccomp" in sys.argv:

@@ -10,6 +10,7 @@ import torch
 
 from sgsst_core.budget import Cache
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.images import Color
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
@@ -19,7 +20,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkp
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.training_background import Color, drawn_color, replace_background
+from sgsst_core.stylizing.training_background import drawn_color, replace_background
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
 

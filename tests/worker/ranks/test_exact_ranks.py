@@ -295,11 +295,11 @@ def test_gradients_of_views_in_a_step_are_averaged() -> None:
 
 
 def run_with_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
-    inputs: Any = wall(), cameras(2, 192, 144)
+    scene, views = wall(), cameras(2, 192, 144)
     settings, weights = make_settings("standard", steps_coarse=0, steps_sos=20, rebalance=False), tiny_weights()
-    plan = plan_job(*inputs, Style.of(style()), settings, weights=weights, collectives=collectives).plan
+    plan = plan_job(scene, views, Style.of(style()), settings, weights=weights, collectives=collectives).plan
     settings = settings.model_copy(update={"rebalance": rebalance})
-    job = prepare_job(plan, *inputs, Style.of(style()), settings, weights=weights, collectives=collectives)
+    job = prepare_job(plan, scene, views, Style.of(style()), settings, weights=weights, collectives=collectives)
     stylizer = Stylizer(job)
     forward = stylizer.job.network.forward
 
