@@ -30,6 +30,9 @@ class ServiceError(SgsstError):
         self.headers: dict[str, str] = {}
         self.extra: dict[str, object] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:  # ranks send errors to the dispatcher by pickle
+        return type(self), (self.problem, str(self), self.code, self.retry_after), self.__dict__
+
 
 class NotFoundError(ServiceError):
     """Object that does not exist or belongs to another owner."""
