@@ -15,6 +15,7 @@ from service.files.objects import ObjectStore
 from service.settings import ServiceSettings
 from service.startup import keep_private, set_up
 from service.store import open_store
+from sgsst_core.errors import SettingsError
 
 _RETRY_SECONDS = 2.0
 
@@ -27,7 +28,7 @@ def main() -> int:
     try:
         open_store(settings, patience=settings.start_seconds).close()
         _make_bucket(ObjectStore(settings.artifacts_url), settings.start_seconds)
-    except (DatabaseUnavailableError, StoreError) as error:
+    except (DatabaseUnavailableError, StoreError, SettingsError) as error:
         print(f"error: {error}\n{error.__cause__ or ''}", file=sys.stderr)
         return 1
     return 0
