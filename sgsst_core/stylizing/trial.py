@@ -108,10 +108,13 @@ class _Visitor:
     def run(self) -> Trial:
         job, device = self._job, self._job.network.device
         groups, (coarse, sos) = job.team.groups, job.schedule
-        order = list(dict.fromkeys(islice(drawn_views(job.views.covered, job.settings.seed), 2 * groups)))
+        # Every group visits as many views as the others, because their ranks communicate; and none that no step visits.
+        different = min(len(job.views.covered), job.total_steps * job.settings.views_per_step)
+        visits = 2 if 2 * groups <= different else 1
+        order = list(islice(drawn_views(job.views.covered, job.settings.seed), visits * groups))
         costs: list[tuple[StepCost, StepCost]] = []
         with _peak_of_process() as process:
-            for index in order[job.team.own_group :: groups] or order[:1]:
+            for index in order[job.team.own_group :: groups]:
                 self._visited.append(index)
                 costs.append((self._cost(index, coarse), self._cost(index, sos)))
                 if job.collectives.broadcast(lambda: costs[0][1].seconds > _SLOW):

@@ -294,6 +294,20 @@ def test_gradients_of_views_in_a_step_are_averaged() -> None:
     assert relative_error(stylizer.sh_dc.grad, mean_gradient_by_hand(views)) < 1e-6
 
 
+def planned_views(collectives: Collectives, views: int, groups: int) -> tuple[int, float]:
+    settings = make_settings(steps_coarse=2, steps_sos=2, coarsest_side=24, views_per_step=groups, rebalance=False)
+    job = plan_job(wall(), cameras(views), Style.of(style()), settings, weights=tiny_weights(), collectives=collectives)
+    record = Stylizer(job).run_step()
+    return job.team.groups, record.loss
+
+
+def test_views_that_groups_cannot_share_evenly_are_tried() -> None:
+    """All groups visit equally many views in the trial, or they would wait for each other in vain."""
+    (groups, loss), other = on_ranks(2, planned_views, 3, 2, timeout=20.0)
+    assert groups == 2
+    assert other == (groups, loss)
+
+
 def run_with_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
     scene, views = wall(), cameras(2, 192, 144)
     settings, weights = make_settings("standard", steps_coarse=0, steps_sos=20, rebalance=False), tiny_weights()
