@@ -120,7 +120,8 @@ def plan_job(
         draft = draft_plan(facts, settings, precision=context.precision, measured=measured)
         activations = memory_for("activations", context.machine.memory)
         pixels = network_pixels(draft, facts, make_loss(context.network, settings, activations).tiling)
-        draft = with_spare_memory(draft, facts, int(pixels.held * context.network.held_bytes_per_pixel()))
+        of_a_view = int(pixels.held * context.network.held_bytes_per_pixel())
+        draft = with_spare_memory(draft, facts, of_a_view)
         request_lines = [
             *about_inputs,
             *([refine_decision(refinement, settings)] if refinement is not None else []),
@@ -149,6 +150,7 @@ def plan_job(
         if job is not None and measures_launches(draft, facts, settings):
             cost = launch_cost(job)
         plan = collectives.broadcast(lambda: completed_plan(draft, facts, settings, pixels, trials, cost))
+        plan = with_spare_memory(plan, facts, of_a_view)  # graphs, which the draft lacks, leave less
         plan = replace(plan, refinement=refinement, decisions=(*request_lines, *plan.decisions))
         if job is None or (plan.ranks, plan.spare) != (job.collectives.size, draft.spare):
             job = None

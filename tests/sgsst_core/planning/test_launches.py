@@ -16,6 +16,7 @@ if torch.cuda.is_available():
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.planning.choices import LEAST_GRAPH_VISITS
+from sgsst_core.planning.facts import LaunchCost
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import StylizationJob
@@ -102,3 +103,18 @@ def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_w
         measured = "measured per view" in decision.reason
         assert measured is (steps == LEAST_GRAPH_VISITS)
         assert (stylizer.job.graphs is not None) is stylizer.job.plan.graphs
+
+
+def test_graphs_reduce_the_spare_memory(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A graph's activations are separate memory, which data of the views must not use too."""
+    spare = {}
+    for seconds in (1.0, 0.5):
+        monkeypatch.setattr("sgsst_core.stylizing.planner.launch_cost", lambda job, s=seconds: LaunchCost(s, 0.5))
+        settings = make_settings(steps_coarse=0, steps_sos=2 * LEAST_GRAPH_VISITS, coarsest_side=16)
+        inputs = wall(10, 8), cameras(1, 48, 32), Style.of(style())
+        planned = plan_job(*inputs, settings, weights=tiny_weights, rasterizer="cpu")
+        spare[planned.plan.graphs] = planned.plan.spare
+        assert (planned.graphs is not None) is planned.plan.graphs
+    assert 0 < spare[True] < spare[False]
