@@ -128,9 +128,10 @@ def completed_plan(
         trials: Trials by number of ranks.
         cost: Cost of launching a view's loss; None if it was not measured.
     """
-    steps = plan.steps_coarse + settings.steps_sos
+    coarse = plan.steps_coarse
+    sos = settings.steps_sos or int(not coarse)  # phase 1 may have been the only one and be skipped
     seconds = {
-        ranks: (plan.steps_coarse * trial.coarse.seconds + settings.steps_sos * trial.sos.seconds) / max(steps, 1)
+        ranks: (coarse * trial.coarse.seconds + sos * trial.sos.seconds) / (coarse + sos)
         for ranks, trial in trials.items()
     }
     ranks = choices.choose_ranks(seconds)

@@ -170,6 +170,13 @@ def test_smallest_number_of_ranks_near_the_fastest_is_used(seconds: dict[int, fl
     assert f"on {chosen}" in text
 
 
+def test_job_without_steps_uses_one_rank() -> None:
+    for machine in (Machine("cpu", GIGABYTE, 4, 4), Machine("cpu", GIGABYTE)):
+        plan = plan_of(facts(machine=machine), {1: TRIAL, machine.ranks: TRIAL}, steps_coarse=0, steps_sos=0)
+        assert plan.ranks == 1
+        assert expected(plan).job == expected(plan).measuring
+
+
 def test_graphs_are_used_if_they_save_time() -> None:
     gpu = facts(machine=Machine("cuda", 10 * GIGABYTE))
     for cost, used in ((LaunchCost(1.0, 0.5, 1.0), True), (LaunchCost(1.0, 0.99), False), (None, False)):
