@@ -47,10 +47,11 @@ _SECONDS_PER_BYTE = 120 / 1e9
 MEMORY_PER_BYTE = 6
 #: Maximum of the memory limit, as a fraction of the machine's memory.
 _MEMORY_FRACTION = 0.8
-#: Additions to the CPU time limit of planning, in seconds per Gaussian and view, and per pixel of each view. Actual use
-#: is less than a third of them.
+#: Additions to the CPU time limit of planning, in seconds per Gaussian and view, per pixel of each view, and per pixel
+#: of the view that the trial visits. Actual use is less than a third of them.
 _PLAN_SECONDS_PER_GAUSSIAN = 5e-6
 _PLAN_SECONDS_PER_PIXEL = 5e-6
+_TRIAL_SECONDS_PER_PIXEL = 2e-4
 #: Total size in bytes above which a job's files are checked in a separate process, so that small jobs do not wait.
 _LARGE_BYTES = 64 << 20
 
@@ -271,7 +272,8 @@ class Inspector:
         known = self.recall("validate", owner, inputs, parameters) or {"gaussians": 0, "views": 0, "pixels": 0}
         surveying: float = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
         surveying += _PLAN_SECONDS_PER_PIXEL * known["pixels"]
-        return self._settings.dry_run_seconds + reading + surveying
+        trial: float = _TRIAL_SECONDS_PER_PIXEL * known["pixels"] / max(known["views"], 1)
+        return self._settings.dry_run_seconds + reading + surveying + trial
 
     def _memory(self, inputs: Sequence[Mapping[str, Any]]) -> int:
         """Return the memory limit of reading in bytes; photos do not add to it, because they are read one at a time."""
