@@ -59,7 +59,19 @@ class Fault:
         _file(request).write_text(json.dumps(asdict(self)))
 
     def arm(self, request: JobSpec) -> None:
-        """Install the fault in this process."""
+        """Install the fault in this process once the job is planned: planning makes steps as well."""
+        from sgsst_core.stylizing.stylizer import Stylizer
+
+        create: Callable[..., None] = Stylizer.__init__
+
+        def create_and_install(stylizer: Stylizer, *arguments: Any, **options: Any) -> None:
+            create(stylizer, *arguments, **options)
+            setattr(Stylizer, "__init__", create)  # noqa: B010 (it is a method)
+            self._install(request)
+
+        setattr(Stylizer, "__init__", create_and_install)  # noqa: B010 (it is a method)
+
+    def _install(self, request: JobSpec) -> None:
         owner, name = _places()[self.place]
         original: Callable[..., Any] = getattr(owner, name)
         calls = 0
