@@ -96,7 +96,8 @@ def test_all_variants_are_evaluated_with_the_papers_loss(
     for style_loss in ("sos", "nnfm"):
         curves = error_time(scene, views, style(), variants, 1.0, weights=tiny_weights, style_loss=style_loss)
         assert all(len(curve.points) == 6 for curve in curves)
-    assert len(evaluations) == 2 * (1 + 2 * 6)
+    # Moments that fall into one step share an evaluation.
+    assert 2 * (1 + 2) <= len(evaluations) <= 2 * (1 + 2 * 6)
     assert all(terms["nearest"] == 0 < terms["gram"] for evaluation in evaluations for terms in evaluation.values())
 
 
