@@ -119,5 +119,5 @@ def test_number_of_blends_is_limited(service: Service, jobs: list[str]) -> None:
     store.close()
     answer = post(service, jobs[1], weight=0.5)
     assert (answer.status_code, answer.json()["limit"]) == (409, MOST_BLENDS)
-    with Client(service.url) as client, pytest.raises(RequestError, match="blends already"):
+    with Client(service.url) as client, pytest.raises(RequestError, match="already has 20 blends"):
         client.blend(jobs[1], 0.5)

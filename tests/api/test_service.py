@@ -412,7 +412,7 @@ def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path
             wait_for_step(service, client, job_id, 1)
         assert [job(client, job_id)["status"] for job_id in jobs] == ["running", "running", "queued"]
         tasks = [json.loads(path.read_text()) for path in service.data.glob("work/*/*/task.json")]
-        limits = [task["parameters"]["memory_limit"] for task in tasks]
+        limits = [task["spec"]["settings"]["memory_limit"] for task in tasks]
         assert len(limits) == 2
         assert 0 < sum(limits) <= 0.8 * psutil.virtual_memory().total
         threads = [
