@@ -148,7 +148,7 @@ def prepare(
 
 
 def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None) -> Plan:
-    """Plan a job as `prepare` would on one rank, without making a step.
+    """Plan a job as `prepare` would on one rank, and write nothing.
 
     Args:
         request: Job to plan.
