@@ -24,15 +24,9 @@ from sgsst_core.style import Style
 
 #: Background of all renders.
 BACKGROUND = (1.0, 0.25, 0.5)
-#: By rasterizer: relative distance from an alpha or transmittance cutoff within which float32 rounding may change the
-#: decision, then error bounds for images and for gradients. They are larger for gsplat, which projects in float32 and
-#: uses the fast exponential intrinsic.
-RASTERIZER_BOUNDS: dict[str, tuple[float, float, float]] = {
-    "cpu": (2e-5, 1e-5, 5e-6),
-    "triton": (2e-5, 1e-5, 5e-6),
-    "cached": (2e-5, 1e-5, 5e-6),
-    "cuda": (2e-3, 1e-4, 1e-4),
-}
+#: Relative distance from an alpha or transmittance cutoff within which float32 rounding may change the decision, and
+#: error bounds for images and for gradients.
+_CLOSE, _IMAGE_BOUND, _GRADIENT_BOUND = 2e-5, 1e-5, 5e-6
 #: Relative error bounds of float32 features, and of statistics of the same features.
 _FEATURE_BOUND, _STATISTICS_BOUND = 1e-5, 1e-5
 #: Number of freed blocks of memory that hold NaN, by size in bytes.
@@ -102,21 +96,18 @@ def check_device(name: str, device: torch.device, sizes: CheckSizes) -> Iterator
 
 def rasterizer_checks(fast: Rasterizer, scene: Scene, camera: Camera) -> Iterator[Check]:
     """Compare image, coverage and color gradient with the float64 reference, except at pixels close to a cutoff."""
-    close, image_bound, gradient_bound = RASTERIZER_BOUNDS[fast.name]
-    alpha_max = getattr(fast, "alpha_max", None)
-    options = {} if alpha_max is None else {"alpha_max": alpha_max}
-    reference = ReferenceRasterizer(scene, background=BACKGROUND, **options)
+    reference = ReferenceRasterizer(scene, background=BACKGROUND)
     colors = scene_colors(scene, camera)
     pixels = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
-    band = reference.near_cutoff(camera, close)
+    band = reference.near_cutoff(camera, _CLOSE)
     pixels[band] = 0
     image = _off(fast.render(colors, camera), reference.render(colors, camera)).amax(-1)
-    yield Check("image", float(image[~band].max()) / max(1.0, float(colors.max())), image_bound)
+    yield Check("image", float(image[~band].max()) / max(1.0, float(colors.max())), _IMAGE_BOUND)
     coverage = _off(fast.coverage(camera), reference.coverage(camera))
-    yield Check("coverage", float(coverage[~band].max()), image_bound)
+    yield Check("coverage", float(coverage[~band].max()), _IMAGE_BOUND)
     expected = reference.color_gradient(pixels, camera)
     error = float(_off(fast.color_gradient(pixels, camera), expected).norm() / expected.norm())
-    yield Check("gradient", error, gradient_bound)
+    yield Check("gradient", error, _GRADIENT_BOUND)
 
 
 def network_checks(weights: BackboneWeights, device: torch.device, sizes: CheckSizes) -> Iterator[Check]:

@@ -220,8 +220,9 @@ def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:
     import torch
 
     from sgsst_core.bench.device_checks import CheckSizes, check_device
+    from sgsst_core.rasterizer import RASTERIZERS
 
-    where = device if rasterizer in ("triton", "cuda") else torch.device("cpu")
+    where = device if RASTERIZERS[rasterizer].on_gpu else torch.device("cpu")
     sizes = CheckSizes() if where.type == "cuda" else CheckSizes(repeats=3, channels=16)
     wrong = total = 0
     for check in check_device(rasterizer, where, sizes):

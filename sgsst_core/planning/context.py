@@ -26,8 +26,7 @@ from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.choices import precision_of
 from sgsst_core.planning.facts import Machine
 from sgsst_core.planning.plan import Device
-from sgsst_core.rasterizer import Rasterizer, gpu_rasterizers, make_rasterizer, rasterizer_for
-from sgsst_core.rasterizer.trial import drawing_problem
+from sgsst_core.rasterizer import Rasterizer, drawing_problem, gpu_rasterizers, make_rasterizer, rasterizer_for
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale

@@ -10,21 +10,21 @@ from typing import Any
 
 import torch
 
-from sgsst_core.constants import NEAR
+from sgsst_core.constants import NEAR, RASTER_TILE
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import Color, Rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.cuda import CudaRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
-__all__ = ["RASTERIZERS", "Rasterizer", "gpu_rasterizers", "make_rasterizer", "rasterizer_for"]
+__all__ = ["RASTERIZERS", "Rasterizer", "drawing_problem", "gpu_rasterizers", "make_rasterizer", "rasterizer_for"]
 
 #: All rasterizers by name; those for GPUs in order of preference.
 RASTERIZERS: dict[str, type[Rasterizer]] = {
-    kind.name: kind for kind in (TritonRasterizer, CudaRasterizer, CpuRasterizer, CachedRasterizer, ReferenceRasterizer)
+    kind.name: kind for kind in (TritonRasterizer, CpuRasterizer, CachedRasterizer, ReferenceRasterizer)
 }
 
 
@@ -42,17 +42,17 @@ def make_rasterizer(
 
     Args:
         name: `cpu` computes blend weights in every call; `cached` stores them (its options are `precision`, `max_bytes`
-            and `uncached`); `triton` runs on GPUs; `cuda` uses gsplat; `reference` is slow and float64.
+            and `uncached`); `triton` runs on GPUs; `reference` is slow and float64.
         scene: Scene, whose geometry must not change during the rasterizer's lifetime.
         background: RGB color behind pixels that Gaussians leave uncovered.
         near: Near plane in world units.
-        device: Device for `cached`, `triton` and `cuda`. None selects the CPU for `cached` (or the device of its option
-            `uncached`), and the current GPU for `triton` and `cuda`.
+        device: Device for `cached` and `triton`. None selects the CPU for `cached` (or the device of its option
+            `uncached`), and the current GPU for `triton`.
         memory: Memory budget in bytes for tile intersections and cached blend weights; None for the default.
         options: Further arguments of the implementation's constructor.
 
     Raises:
-        SettingsError: If the name is unknown, the rasterizer cannot use the device, or `cuda` lacks gsplat or a GPU.
+        SettingsError: If the name is unknown, or the rasterizer cannot use the device.
 
     Example:
         >>> scene = load_scene("scene.ply").scene
@@ -83,3 +83,28 @@ def rasterizer_for(device: str, unusable: Collection[str]) -> str:
     """
     working = [name for name in gpu_rasterizers() if name not in unusable]
     return working[0] if working and torch.device(device).type != "cpu" else CpuRasterizer.name
+
+
+def drawing_problem(name: str, device: torch.device | str = "cuda") -> str | None:
+    """Return the reason why a rasterizer cannot render a single Gaussian on a device; None if it can.
+
+    Errors of kernels appear when they are first used, which would otherwise be in the middle of a job. Takes up to
+    minutes if kernels have to be compiled; they are cached.
+    """
+    gaussian = Scene(
+        torch.tensor([[0.0, 0.0, 2.0]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.zeros(1, 3),
+        torch.zeros(1),
+        torch.zeros(1, 3),
+        torch.zeros(1, 0, 3),
+    )
+    camera = Camera("trial", RASTER_TILE, RASTER_TILE, 16.0, 16.0, 8.0, 8.0, torch.eye(4, dtype=torch.float64))
+    try:
+        rasterizer = make_rasterizer(name, gaussian, device=device)
+        image = rasterizer.render(torch.ones(1, 3), camera)
+        gradient = rasterizer.color_gradient(torch.ones_like(image), camera)
+        drawn = float(image.sum()) > 0 and float(gradient.sum()) > 0
+    except Exception as error:  # whatever the exception, the rasterizer is unusable
+        return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return None if drawn else "it draws nothing"

@@ -127,7 +127,7 @@ class Rasterizer(ABC):
             SettingsError: If the rasterizer cannot run on the device.
         """
         if device is not None and torch.device(device).type != "cpu":
-            raise SettingsError(f"rasterizer {cls.name!r} runs on the CPU, not on {device}: choose 'cached' or 'cuda'")
+            raise SettingsError(f"rasterizer {cls.name!r} runs on the CPU, not on {device}: choose 'triton'")
         return torch.device("cpu")
 
     def render(self, colors: Tensor, camera: Camera) -> Tensor:

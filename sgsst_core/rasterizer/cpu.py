@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.compiled import kernel_threads
-from sgsst_core.constants import RASTER_TILE
+from sgsst_core.constants import ALPHA_MAX, RASTER_TILE
 from sgsst_core.rasterizer import kernels
 from sgsst_core.rasterizer.base import CountedWeights, Precision
 from sgsst_core.rasterizer.projection import Shapes
@@ -91,7 +91,7 @@ class CpuRasterizer(TiledRasterizer[TileIntersections]):
                 isects.starts,
                 projection.values,
                 image_gradient.numpy(),
-                self.alpha_max,
+                ALPHA_MAX,
                 slot_gradients,
             )
             kernels.add_slots(slot_gradients, isects.first_slots, projection.gaussians, gradient)
@@ -108,9 +108,7 @@ class CpuRasterizer(TiledRasterizer[TileIntersections]):
         transmittance = np.empty((camera.height, camera.width), dtype=np.float32)
         values = isects.projection.values
         with kernel_threads():
-            kernels.survey(
-                isects.ranks, isects.slots, isects.starts, values, self.alpha_max, slot_weights, transmittance
-            )
+            kernels.survey(isects.ranks, isects.slots, isects.starts, values, ALPHA_MAX, slot_weights, transmittance)
             kernels.add_slot_weights(slot_weights, isects.first_slots, isects.projection.gaussians, weights)
         return 1 - torch.from_numpy(transmittance), torch.from_numpy(weights)
 
@@ -127,7 +125,7 @@ class CpuRasterizer(TiledRasterizer[TileIntersections]):
                 isects.projection.gaussians,
                 colors,
                 self.background.numpy(),
-                self.alpha_max,
+                ALPHA_MAX,
                 image,
                 transmittance,
             )
@@ -156,7 +154,7 @@ class CountedStrips:
         tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values)
         counts = (self.items, self.pieces, self.slot_items)
         with kernel_threads():
-            kernels.count_weights(*tiles, camera.height, camera.width, rasterizer.alpha_max, *counts)
+            kernels.count_weights(*tiles, camera.height, camera.width, ALPHA_MAX, *counts)
 
     def nbytes(self, precision: Precision) -> int:
         """Return the size of the weights in bytes."""
@@ -205,7 +203,7 @@ class WeightStrips:
         self._slot_gradients = np.empty((items, 3), dtype=np.float32)
         tiles = (isects.ranks, isects.slots, isects.starts, isects.projection.values, self.gaussians)
         with kernel_threads():
-            kernels.store_weights(*tiles, rasterizer.alpha_max, slot_starts, self.strips, transmittance)
+            kernels.store_weights(*tiles, ALPHA_MAX, slot_starts, self.strips, transmittance)
 
     def render(self, colors: Tensor) -> Tensor:
         """Return the image [h, w, 3] of colors [N, 3] over the background."""

@@ -106,19 +106,15 @@ class ReferenceRasterizer(Rasterizer):
 
     Args:
         scene, background, near, device: As in `Rasterizer`.
-        alpha_max: Upper limit of alpha.
         dtype: Dtype of blending, image and gradient; the projection is always float64.
     """
 
     name = "reference"
     title = "the float64 reference"
 
-    def __init__(
-        self, scene: Scene, *, alpha_max: float = ALPHA_MAX, dtype: torch.dtype = torch.float64, **common: Any
-    ) -> None:
+    def __init__(self, scene: Scene, *, dtype: torch.dtype = torch.float64, **common: Any) -> None:
         self.dtype = dtype
-        super().__init__(scene, alpha_max=alpha_max, dtype=dtype, **common)
-        self.alpha_max = alpha_max
+        super().__init__(scene, dtype=dtype, **common)
         self._prepared: tuple[CameraKey, Splats, Tensor, Tensor] | None = None
 
     def _render(self, colors: Tensor, camera: Camera) -> Tensor:
@@ -176,7 +172,7 @@ class ReferenceRasterizer(Rasterizer):
         dy = (pixels // camera.width + 0.5).to(self.dtype)[..., None] - splats.y[:, None]
         w = dx * splats.w_scale[:, None]
         u = (dy - splats.skew[:, None] * dx) * splats.u_scale[:, None]
-        return (splats.opacity[:, None] * ((u * u + w * w) * -0.5).exp()).clamp_max(self.alpha_max)
+        return (splats.opacity[:, None] * ((u * u + w * w) * -0.5).exp()).clamp_max(ALPHA_MAX)
 
     def _batches(self, camera: Camera) -> Iterator[tuple[Tensor, Splats]]:
         """Yield the pixels [b, n] of b raster tiles with the splats [b, k] to blend, padded with empty splats."""

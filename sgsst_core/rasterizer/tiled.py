@@ -6,7 +6,6 @@ from abc import abstractmethod
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 from sgsst_core.budget import Cache
-from sgsst_core.constants import ALPHA_MAX
 from sgsst_core.rasterizer.base import CameraKey, Rasterizer, camera_key
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -34,7 +33,6 @@ class TiledRasterizer(Rasterizer, Generic[L]):
 
     Args:
         scene, background, near, device: As in `Rasterizer`.
-        alpha_max: Upper limit of alpha.
         max_intersection_bytes: Memory budget for tile intersections in bytes; None for the rasterizer's default.
 
     Attributes:
@@ -44,11 +42,8 @@ class TiledRasterizer(Rasterizer, Generic[L]):
     can_cache = True
     default_intersection_bytes: ClassVar[int]
 
-    def __init__(
-        self, scene: Scene, *, alpha_max: float = ALPHA_MAX, max_intersection_bytes: int | None = None, **common: Any
-    ) -> None:
-        super().__init__(scene, alpha_max=alpha_max, max_intersection_bytes=max_intersection_bytes, **common)
-        self.alpha_max = alpha_max
+    def __init__(self, scene: Scene, *, max_intersection_bytes: int | None = None, **common: Any) -> None:
+        super().__init__(scene, max_intersection_bytes=max_intersection_bytes, **common)
         budget = self.default_intersection_bytes if max_intersection_bytes is None else max_intersection_bytes
         self._intersections: Cache[CameraKey, L] = cache_of_intersections(budget)
 

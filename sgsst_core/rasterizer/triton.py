@@ -21,12 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import (
-    ALPHA_MIN,
-    LOG2_ALPHA_MIN,
-    TO_POWER_OF_TWO,
-    TRANSMITTANCE_MIN,
-)
+from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, LOG2_ALPHA_MIN, TO_POWER_OF_TWO, TRANSMITTANCE_MIN
 from sgsst_core.devices import on_device
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import CountedWeights, Precision
@@ -191,7 +186,7 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
 
     def cuts(self, warps: int) -> dict[str, float | int]:
         """Return the compile-time constants of a compositing kernel with this number of warps per program."""
-        return {"ALPHA_MAX": self.alpha_max, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN, "num_warps": warps}
+        return {"ALPHA_MAX": ALPHA_MAX, "ALPHA_MIN": ALPHA_MIN, "STOP": TRANSMITTANCE_MIN, "num_warps": warps}
 
     def _build(self, camera: Camera) -> DeviceIntersections:
         """Project and sort the Gaussians and compute tile intersections; synchronizes with the device once."""

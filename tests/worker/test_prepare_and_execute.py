@@ -17,7 +17,7 @@ from sgsst_core.errors import CheckpointError
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.progress import Progress
-from sgsst_core.rasterizer.trial import drawing_problem
+from sgsst_core.rasterizer import drawing_problem
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint
 from tests.sgsst_core.stylizing.test_refining import large_wall
@@ -221,18 +221,18 @@ def test_damaged_checkpoint_falls_back_to_previous(request_: JobSpec) -> None:
 
 
 def test_unusable_rasterizer_in_checkpoint_is_replanned(request_: JobSpec) -> None:
-    """The checkpoint is that of a machine with another GPU, or with a compiler."""
-    if drawing_problem("cuda") is None:
+    """The checkpoint is that of a machine with a GPU."""
+    if drawing_problem("triton", "cuda") is None:
         pytest.skip("it works")
     job = prepare(request_)
     run_job(job, steps=3)
     path = request_.out.with_name("s.checkpoint.safetensors")
     saved = load_checkpoint(path, job.fingerprint)
-    unusable = replace(saved.plan, rasterizer="cuda", uncached="cuda")
+    unusable = replace(saved.plan, rasterizer="triton", uncached="triton")
     Checkpoints(path).save(replace(saved, plan=unusable), job.fingerprint)
     again = prepare(request_, resume=Resume(True))
     assert again.resumed is not None
-    assert again.resumed.plan.rasterizer == "cuda"
+    assert again.resumed.plan.rasterizer == "triton"
     assert again.stylizer.job.plan.rasterizer == saved.plan.rasterizer
     assert run_job(again).stopped == "finished"
 

@@ -314,17 +314,6 @@ def test_scene_far_from_origin_renders_alike() -> None:
     assert_close_outside_band(CpuRasterizer(moved).render(colors_of(scene), elsewhere), image, band, tolerance=1e-4)
 
 
-def test_limit_of_alpha_applies_to_all_rasterizers() -> None:
-    scene, view = replace(cloud(seed=17), opacities=torch.full((400,), 9.0)), camera()
-    colors = colors_of(scene)
-    reference = ReferenceRasterizer(scene, alpha_max=0.999)
-    band = reference.near_cutoff(view, CLOSE)
-    for rasterizer in (CpuRasterizer(scene, alpha_max=0.999), CachedRasterizer(scene, alpha_max=0.999)):
-        image = rasterizer.render(colors, view)
-        assert_close_outside_band(image, reference.render(colors, view), band, tolerance=1e-4)
-        assert float((image - CpuRasterizer(scene).render(colors, view)).abs().max()) > 1e-3
-
-
 def test_cached_weights_equal_recomputed_ones() -> None:
     scene, view = cloud(1500, seed=18), camera(130, 70)
     colors, pixels = colors_of(scene), pixels_like(view)

@@ -21,11 +21,10 @@ import torch
 
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
-from sgsst_core.rasterizer.trial import drawing_problem
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
