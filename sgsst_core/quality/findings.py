@@ -109,21 +109,6 @@ def findings_of(
     return [*findings, *(finding for image in images for finding in style_findings(image, cameras))]
 
 
-def scene_findings(file: SceneFile) -> list[Finding]:
-    """Return the findings about a scene read with `drop_invalid`; indices are rows of the file."""
-    scene = _Scene(file)
-    return [
-        *scene.notes(),
-        *scene.invalid(),
-        *scene.infinite_opacities(),
-        *scene.rotations(),
-        *scene.sizes(),
-        *scene.opacities(),
-        *scene.harmonics(),
-        *scene.distance(),
-    ]
-
-
 #: Function that checks a slice of n Gaussians. For each question, it returns a mask [n] bool of extreme Gaussians and
 #: the checked values [n] of all Gaussians.
 _Check = Callable[[slice], Sequence[tuple[Tensor, Tensor]]]
@@ -138,145 +123,133 @@ class _Question:
     largest: bool = True
 
 
-class _Scene:
-    """Scene with its extent, checked slice by slice to avoid a float64 copy of the whole scene."""
-
-    def __init__(self, file: SceneFile) -> None:
-        self.file, self.scene = file, file.scene
-        self.center, self.extent = scene_extent(file.scene)
-
-    def ask(self, check: _Check, *questions: _Question, subject: Subject = "scene") -> list[Finding]:
-        """Check the scene slice by slice; return one finding per question with at least one extreme Gaussian."""
-        counts = [0] * len(questions)
-        worst = [(-math.inf, -1, math.nan)] * len(questions)  # (value to compare, Gaussian, value)
-        for part in _parts(len(self.scene)):
-            for number, (extreme, value) in enumerate(check(part)):
-                count = int(extreme.sum())
-                if count:
-                    counts[number] += count
-                    order = value.double() if questions[number].largest else -value.double()
-                    index = int(torch.where(extreme, order, -math.inf).argmax())
-                    extreme_value = (float(order[index]), part.start + index, float(value[index]))
-                    if worst[number][1] < 0 or extreme_value[0] > worst[number][0]:
-                        worst[number] = extreme_value
-        return [
-            Finding(subject, ask.what, count, len(self.scene), f"Gaussian {self._row(at)}: {value:.3g}", ask.done)
-            for ask, count, (_, at, value) in zip(questions, counts, worst, strict=True)
-            if count
-        ]
-
-    def _row(self, index: int) -> int:
-        """Return the row of a Gaussian in the file."""
-        return index if self.file.retained is None else int(np.flatnonzero(self.file.retained)[index])
-
-    def invalid(self) -> list[Finding]:
-        retained = self.file.retained
-        if retained is None:
-            return []
-        first = int(np.flatnonzero(~retained)[0])
+def scene_findings(file: SceneFile) -> list[Finding]:
+    """Return the findings about a scene read with `drop_invalid`; indices are rows of the file."""
+    scene, total = file.scene, len(file.scene)
+    center, extent = scene_extent(scene)
+    findings = [Finding("scene", note, total, total, "", "") for note in file.notes]
+    if file.retained is not None:
+        what, first = "NaN or infinite values, or no rotation", int(np.flatnonzero(~file.retained)[0])
         done = "stylize rejects the scene; --drop-invalid drops these Gaussians, from the result too"
+        findings.append(Finding("scene", what, file.dropped, len(file.retained), f"first: Gaussian {first}", done))
+    if file.clamped:
+        done = "read as almost 0 or 1, as in compressed formats; the stylized PLY keeps them"
+        findings.append(Finding("scene", "infinite opacity", file.clamped, total, "", done))
+    for check, questions in (_rotations(scene), _sizes(scene, extent), _opacities(scene)):
+        findings += _asked("scene", file, check, questions)
+    done = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
+    reached = "; --target-loss may be reached at once, because they raise the initial loss"
+    for name, values, what_else in (("DC", scene.sh_dc, reached), ("higher", scene.sh_rest, "")):
+        if values.shape[1]:
+            question = _Question(f"{name} SH coefficients above {LARGE_COEFFICIENT:g}", done + what_else)
+            findings += _asked("scene", file, _large_coefficients(values), [question])
+    return findings + _far_from_origin(file, center, extent)
+
+
+def _asked(subject: Subject, file: SceneFile, check: _Check, questions: Sequence[_Question]) -> list[Finding]:
+    """Check the scene slice by slice; return one finding per question with at least one extreme Gaussian.
+
+    Slices avoid a float64 copy of the whole scene.
+    """
+    total, retained = len(file.scene), file.retained
+    counts = [0] * len(questions)
+    worst = [(-math.inf, -1, math.nan)] * len(questions)  # (value to compare, Gaussian, value)
+    for part in _parts(total):
+        for number, (extreme, value) in enumerate(check(part)):
+            count = int(extreme.sum())
+            if count:
+                counts[number] += count
+                order = value.double() if questions[number].largest else -value.double()
+                index = int(torch.where(extreme, order, -math.inf).argmax())
+                extreme_value = (float(order[index]), part.start + index, float(value[index]))
+                if worst[number][1] < 0 or extreme_value[0] > worst[number][0]:
+                    worst[number] = extreme_value
+    rows = [at if retained is None or at < 0 else int(np.flatnonzero(retained)[at]) for _, at, _ in worst]
+    return [
+        Finding(subject, ask.what, count, total, f"Gaussian {row}: {value:.3g}", ask.done)
+        for ask, count, row, (_, _, value) in zip(questions, counts, rows, worst, strict=True)
+        if count
+    ]
+
+
+def _rotations(scene: Scene) -> tuple[_Check, list[_Question]]:
+    low, high = QUATERNION_LENGTHS
+
+    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
+        length = scene.quats[part].double().norm(dim=1)
+        return [(length < low, length), (length > high, length)]
+
+    normalized = "normalized in float64, like all quaternions"
+    return check, [
+        _Question(f"quaternion shorter than {low:g}", normalized, largest=False),
+        _Question(f"quaternion longer than {high:g}", normalized),
+    ]
+
+
+def _sizes(scene: Scene, extent: float) -> tuple[_Check, list[_Question]]:
+    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
+        logarithms = scene.scales[part].double().sort(dim=1).values
+        longest, middle = logarithms[:, 2], logarithms[:, 1]
+        drawn = longest <= OVERFLOW_SCALE
+        relative = (longest - math.log(extent)).clamp(-700, 700).exp()
+        slender = (longest - middle).clamp_max(700).exp()
         return [
-            Finding(
-                "scene",
-                "NaN or infinite values, or no rotation",
-                self.file.dropped,
-                len(retained),
-                f"first: Gaussian {first}",
-                done,
-            )
+            (~drawn, longest),
+            ((relative > LARGE_SCALE) & drawn, relative),
+            (relative < SMALL_SCALE, relative),
+            ((slender > NEEDLE) & drawn, slender),
         ]
 
-    def notes(self) -> list[Finding]:
-        return [Finding("scene", note, len(self.scene), len(self.scene), "", "") for note in self.file.notes]
+    covers = "drawn; each may cover all raster tiles of all views, which costs time and memory"
+    small = f"smaller than {SMALL_SCALE:g} of the scene's extent (value: fraction)"
+    needles = f"needles more than {NEEDLE:g} times as long as thick (value: ratio)"
+    exact = "drawn exactly: the determinant is a sum of positive terms, so nothing cancels"
+    return check, [
+        _Question("size that overflows (value: its logarithm)", "never drawn"),
+        _Question("longer than the scene's extent (value: ratio)", covers),
+        _Question(small, "drawn as a point, blurred over one pixel", largest=False),
+        _Question(needles, exact),
+    ]
 
-    def infinite_opacities(self) -> list[Finding]:
-        if not self.file.clamped:
-            return []
-        done = "read as almost 0 or 1, as in compressed formats; the stylized PLY keeps them"
-        return [Finding("scene", "infinite opacity", self.file.clamped, len(self.scene), "", done)]
 
-    def rotations(self) -> list[Finding]:
-        low, high = QUATERNION_LENGTHS
+def _opacities(scene: Scene) -> tuple[_Check, list[_Question]]:
+    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
+        opacity = scene.opacities[part].double().sigmoid()
+        return [(opacity < ALPHA_MIN, opacity), (opacity > ALPHA_MAX, opacity)]
 
-        def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-            length = self.scene.quats[part].double().norm(dim=1)
-            return [(length < low, length), (length > high, length)]
+    return check, [
+        _Question("opacity below 1/255", "neither drawn nor optimized", largest=False),
+        _Question(f"opacity above {ALPHA_MAX:g}", f"drawn with opacity {ALPHA_MAX:g}, as in training"),
+    ]
 
-        normalized = "normalized in float64, like all quaternions"
-        return self.ask(
-            check,
-            _Question(f"quaternion shorter than {low:g}", normalized, largest=False),
-            _Question(f"quaternion longer than {high:g}", normalized),
-        )
 
-    def sizes(self) -> list[Finding]:
-        def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-            logarithms = self.scene.scales[part].double().sort(dim=1).values
-            longest, middle = logarithms[:, 2], logarithms[:, 1]
-            drawn = longest <= OVERFLOW_SCALE
-            relative = (longest - math.log(self.extent)).clamp(-700, 700).exp()
-            slender = (longest - middle).clamp_max(700).exp()
-            return [
-                (~drawn, longest),
-                ((relative > LARGE_SCALE) & drawn, relative),
-                (relative < SMALL_SCALE, relative),
-                ((slender > NEEDLE) & drawn, slender),
-            ]
+def _large_coefficients(values: Tensor | StoredHarmonics) -> _Check:
+    """Return a check for large SH coefficients in values [N, K, 3]."""
+    if isinstance(values, StoredHarmonics):
+        sizes = values.largest()
+        return lambda part: [(sizes[part] > LARGE_COEFFICIENT, sizes[part])]
+    held = values
 
-        return self.ask(
-            check,
-            _Question("size that overflows (value: its logarithm)", "never drawn"),
-            _Question(
-                "longer than the scene's extent (value: ratio)",
-                "drawn; each may cover all raster tiles of all views, which costs time and memory",
-            ),
-            _Question(
-                f"smaller than {SMALL_SCALE:g} of the scene's extent (value: fraction)",
-                "drawn as a point, blurred over one pixel",
-                largest=False,
-            ),
-            _Question(
-                f"needles more than {NEEDLE:g} times as long as thick (value: ratio)",
-                "drawn exactly: the determinant is a sum of positive terms, so nothing cancels",
-            ),
-        )
+    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
+        size = held[part].flatten(1).abs().amax(dim=1)
+        return [(size > LARGE_COEFFICIENT, size)]
 
-    def opacities(self) -> list[Finding]:
-        def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-            opacity = self.scene.opacities[part].double().sigmoid()
-            return [(opacity < ALPHA_MIN, opacity), (opacity > ALPHA_MAX, opacity)]
+    return check
 
-        return self.ask(
-            check,
-            _Question("opacity below 1/255", "neither drawn nor optimized", largest=False),
-            _Question(f"opacity above {ALPHA_MAX:g}", f"drawn with opacity {ALPHA_MAX:g}, as in training"),
-        )
 
-    def harmonics(self) -> list[Finding]:
-        findings = []
-        for name, values in (("DC", self.scene.sh_dc), ("higher", self.scene.sh_rest)):
-            if values.shape[1]:
-                done = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
-                if name == "DC":
-                    done += "; --target-loss may be reached at once, because they raise the initial loss"
-                question = _Question(f"{name} SH coefficients above {LARGE_COEFFICIENT:g}", done)
-                findings += self.ask(_large_coefficients(values), question)
-        return findings
-
-    def distance(self) -> list[Finding]:
-        far = float(self.center.norm()) / self.extent
-        if far < FAR_WORLD:
-            return []
-        step = float(np.spacing(np.float32(self.center.abs().max())))
-        double = self.file.header is not None and self.file.header.has_double_positions
+def _far_from_origin(file: SceneFile, center: Tensor, extent: float) -> list[Finding]:
+    far, total = float(center.norm()) / extent, len(file.scene)
+    if far < FAR_WORLD:
+        return []
+    step = float(np.spacing(np.float32(center.abs().max())))
+    if file.header is not None and file.header.has_double_positions:
         done = (
             "positions become float32, which is too coarse here; subtract an offset from those of Gaussians and cameras"
-            if double
-            else "the file's float32 positions are too coarse here; move the scene to the origin before training. The "
-            "CPU subtracts positions in float64, gsplat on a GPU loses more precision"
         )
-        worst = f"center {far:.3g} extents away; positions are {step:.3g} apart, {step / self.extent:.1e} of the extent"
-        return [Finding("scene", "scene far from its origin", len(self.scene), len(self.scene), worst, done)]
+    else:
+        done = "the file's float32 positions are too coarse here; move the scene to the origin before training"
+    worst = f"center {far:.3g} extents away; positions are {step:.3g} apart, {step / extent:.1e} of the extent"
+    return [Finding("scene", "scene far from its origin", total, total, worst, done)]
 
 
 def scene_extent(scene: Scene) -> tuple[Tensor, float]:
@@ -303,11 +276,11 @@ def view_findings(
         shown = [*_uncovered(survey.uncovered, cameras), *_seldom_seen(file, survey.total_blend_weights)]
     else:
         shown = _shown(file, cameras, rasterizer)
-    return [*_lenses(cameras), *_near(file.scene, cameras, near), *shown]
+    return [*_placed(file.scene, cameras, near), *shown]
 
 
 def _of_views(
-    what: str, values: list[float], extreme: list[bool], cameras: Sequence[Camera], done: str
+    what: str, values: list[float], extreme: list[bool], done: str, cameras: Sequence[Camera]
 ) -> list[Finding]:
     """Return a finding that names the extreme view with the largest value; empty if no view is extreme."""
     if not any(extreme):
@@ -317,57 +290,32 @@ def _of_views(
     return [Finding("views", what, sum(extreme), len(cameras), worst, done)]
 
 
-def _lenses(cameras: Sequence[Camera]) -> list[Finding]:
+def _placed(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]:
+    """Report lenses and sizes of views, and cameras with Gaussians closer than the near plane."""
     angles = [
         max(math.degrees(2 * math.atan(side / 2 / focal)) for side, focal in ((c.width, c.fx), (c.height, c.fy)))
         for c in cameras
     ]
     off = [max(abs(c.cx / c.width - 0.5), abs(c.cy / c.height - 0.5)) for c in cameras]
     small = [float(min(c.width, c.height)) for c in cameras]
-    return [
-        *_of_views(
-            f"field of view above {WIDE:g} degrees",
-            angles,
-            [angle > WIDE for angle in angles],
-            cameras,
-            f"drawn; the perspective is linearized at each Gaussian's center, or at most {FRUSTUM_MARGIN:.0%} of "
-            "half the view's width outside the view",
-        ),
-        *_of_views(
-            f"field of view below {NARROW:g} degree",
-            angles,
-            [angle < NARROW for angle in angles],
-            cameras,
-            "drawn like any other view",
-        ),
-        *_of_views(
-            "principal point outside the image (value: widths from its center)",
-            off,
-            [value > 0.5 for value in off],
-            cameras,
-            "drawn like any other view; check that this is intended",
-        ),
-        *_of_views(
-            f"fewer than {ALIGNMENT} pixels on a side",
-            small,
-            [value < ALIGNMENT for value in small],
-            cameras,
-            "feature layers without a cell are skipped in its loss",
-        ),
-    ]
-
-
-def _near(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Finding]:
-    """Report cameras with Gaussians closer than the near plane."""
     centers = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *(camera.center[None].double() for camera in cameras)])
     close = [float(count) for count in closer(scene.means, centers, near)]
-    return _of_views(
-        f"camera inside the scene: Gaussians within {near:g} of it (value: count)",
-        close,
-        [count > 0 for count in close],
-        cameras,
-        "not drawn if they are in front of the near plane; use --near to move it",
+    linearized = (
+        f"drawn; the perspective is linearized at each Gaussian's center, or at most {FRUSTUM_MARGIN:.0%} of half the "
+        "view's width outside the view"
     )
+    drawn, skipped = "drawn like any other view", "feature layers without a cell are skipped in its loss"
+    behind = "not drawn if they are in front of the near plane; use --near to move it"
+    outside = "principal point outside the image (value: widths from its center)"
+    inside = f"camera inside the scene: Gaussians within {near:g} of it (value: count)"
+    rows = [
+        (f"field of view above {WIDE:g} degrees", angles, [angle > WIDE for angle in angles], linearized),
+        (f"field of view below {NARROW:g} degree", angles, [angle < NARROW for angle in angles], drawn),
+        (outside, off, [value > 0.5 for value in off], f"{drawn}; check that this is intended"),
+        (f"fewer than {ALIGNMENT} pixels on a side", small, [value < ALIGNMENT for value in small], skipped),
+        (inside, close, [count > 0 for count in close], behind),
+    ]
+    return [finding for row in rows for finding in _of_views(*row, cameras)]
 
 
 def closer(means: Tensor, centers: Tensor, distance: float) -> list[int]:
@@ -402,32 +350,21 @@ def _shown(file: SceneFile, cameras: Sequence[Camera], rasterizer: Rasterizer) -
         seen = sees_something(coverage)
         uncovered.append(float((1 - coverage).mean(dtype=torch.float64)) if seen else 1.0)
         blend_weights += weights.cpu()
-    findings = (
-        [Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops the job")]
-        if refused
-        else []
-    )
-    findings += _uncovered(uncovered, cameras)
-    return findings if refused else [*findings, *_seldom_seen(file, blend_weights)]
+    if not refused:
+        return [*_uncovered(uncovered, cameras), *_seldom_seen(file, blend_weights)]
+    stopped = Finding("views", "cannot be rendered", len(refused), len(cameras), refused[0], "stops the job")
+    return [stopped, *_uncovered(uncovered, cameras)]
 
 
 def _uncovered(fractions: list[float], cameras: Sequence[Camera]) -> list[Finding]:
     """Report views that see nothing or leave pixels uncovered, given each view's fraction of uncovered pixels."""
+    blind, partly = [fraction == 1 for fraction in fractions], [UNCOVERED < fraction < 1 for fraction in fractions]
+    skipped = "skipped; a job needs at least one view that sees a Gaussian"
+    what = f"more than {UNCOVERED:.0%} uncovered (value: fraction)"
+    done = "statistics are weighted by coverage if the mean over all views exceeds 1 % (--position-weights auto)"
     return [
-        *_of_views(
-            "see no Gaussian",
-            fractions,
-            [fraction == 1 for fraction in fractions],
-            cameras,
-            "skipped; a job needs at least one view that sees a Gaussian",
-        ),
-        *_of_views(
-            f"more than {UNCOVERED:.0%} uncovered (value: fraction)",
-            fractions,
-            [UNCOVERED < fraction < 1 for fraction in fractions],
-            cameras,
-            "statistics are weighted by coverage if the mean over all views exceeds 1 % (--position-weights auto)",
-        ),
+        *_of_views("see no Gaussian", fractions, blind, skipped, cameras),
+        *_of_views(what, fractions, partly, done, cameras),
     ]
 
 
@@ -438,19 +375,11 @@ def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
         weights = blend_weights[part]
         return [(weights == 0, weights), ((weights > 0) & (weights < HARDLY_SEEN), weights)]
 
-    return _Scene(file).ask(
-        check,
-        _Question(
-            "in no view",
-            "neither drawn nor optimized; their colors follow their neighbors' at the end (preset paper: unchanged)",
-        ),
-        _Question(
-            "hardly seen: blend weights of all pixels sum to less than 1/255 (value: sum)",
-            "optimized at the same rate as all others; their colors may be extreme from other viewpoints",
-            largest=False,
-        ),
-        subject="views",
-    )
+    unseen = "neither drawn nor optimized; their colors follow their neighbors' at the end (preset paper: unchanged)"
+    what = "hardly seen: blend weights of all pixels sum to less than 1/255 (value: sum)"
+    done = "optimized at the same rate as all others; their colors may be extreme from other viewpoints"
+    questions = [_Question("in no view", unseen), _Question(what, done, largest=False)]
+    return _asked("views", file, check, questions)
 
 
 def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
@@ -474,21 +403,6 @@ def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:
             Finding("style", "too small for deep layers", 1, 1, f"used at {smallest[1]} x {smallest[0]}", done)
         )
     return findings
-
-
-def _large_coefficients(values: Tensor | StoredHarmonics) -> _Check:
-    """Return a check for large SH coefficients in values [N, K, 3]."""
-    if isinstance(values, StoredHarmonics):
-        sizes = values.largest()
-        return lambda part: [(sizes[part] > LARGE_COEFFICIENT, sizes[part])]
-    held = values
-
-    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-        lowest, highest = held[part].flatten(1).aminmax(dim=1)
-        size = torch.maximum(-lowest, highest)
-        return [(size > LARGE_COEFFICIENT, size)]
-
-    return check
 
 
 def _parts(count: int) -> list[slice]:
