@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 
-from benchmarks.protocol import STYLIZED, UNSTYLIZED, measured, scene_in
+from benchmarks.protocol import STYLIZED, UNSTYLIZED, measured
 from sgsst_core.quality.consistency import Warp, consistency, expected_depth, find_warp, shown, view_pairs
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer.cpu import CpuRasterizer
@@ -15,17 +13,6 @@ from sgsst_core.scene.spherical_harmonics import view_colors
 from tests.small_scenes import ball, cameras
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def test_last_iteration_is_measured(tmp_path: Path) -> None:
-    for iteration in (7000, 30000):
-        path = tmp_path / f"point_cloud/iteration_{iteration}/point_cloud.ply"
-        path.parent.mkdir(parents=True)
-        path.touch()
-    (tmp_path / "input.ply").touch()
-    assert scene_in(tmp_path) == path
-    with pytest.raises(SystemExit, match="Name the folder of a trained scene"):
-        scene_in(tmp_path / "point_cloud")
 
 
 def test_figures_are_those_of_novel_views(vgg16_weights: object) -> None:

@@ -27,6 +27,7 @@ def test_search_counts_outcomes() -> None:
     assert not failures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "how"),
     [

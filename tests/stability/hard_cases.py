@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
 from benchmarks.stability import Case, measure
 
 #: Maximum growth of memory. No case needs more than a few hundred megabytes; an allocation error takes many gigabytes.
 LARGEST_GROWTH = 1 << 30
+
+
+def parameters(cases: Sequence[Case | str]) -> list[Any]:
+    """Return all cases as parameters of a test; three of four are for the slow tests."""
+    return [case if place % 4 == 0 else pytest.param(case, marks=pytest.mark.slow) for place, case in enumerate(cases)]
 
 
 def check(case: Case) -> None:

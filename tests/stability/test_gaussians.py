@@ -10,12 +10,12 @@ from benchmarks.stability import gaussian_cases as gaussians
 from benchmarks.stability.case import camera
 from sgsst_core.rasterizer.projection import Outcome, project
 from sgsst_core.rasterizer.reference import splat
-from tests.stability.hard_cases import check
+from tests.stability.hard_cases import check, parameters
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.mark.parametrize("case", gaussians.cases(), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(gaussians.cases()), ids=lambda case: case.name)
 def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 

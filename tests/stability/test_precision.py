@@ -12,12 +12,12 @@ import pytest
 from benchmarks.stability import Case, CaseResult, Group, all_cases
 from benchmarks.stability import precision_cases as precision
 from benchmarks.stability.__main__ import main
-from tests.stability.hard_cases import check
+from tests.stability.hard_cases import check, parameters
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
 
 
-@pytest.mark.parametrize("case", precision.cases(), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(precision.cases()), ids=lambda case: case.name)
 def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 

@@ -6,12 +6,12 @@ import pytest
 
 from benchmarks.stability import Case
 from benchmarks.stability import image_cases as images
-from tests.stability.hard_cases import check
+from tests.stability.hard_cases import check, parameters
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
 
 
-@pytest.mark.parametrize("case", images.cases(), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(images.cases()), ids=lambda case: case.name)
 def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 

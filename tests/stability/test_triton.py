@@ -19,7 +19,7 @@ from benchmarks.stability import gaussian_cases as gaussians
 from benchmarks.stability import view_cases as views
 from benchmarks.stability.case import among_ordinary, camera, compare_rasterizers, repeated
 from sgsst_core.scene.gaussians import Scene
-from tests.stability.hard_cases import check
+from tests.stability.hard_cases import check, parameters
 
 pytest.importorskip("triton")
 pytestmark = [
@@ -74,18 +74,18 @@ def triton_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(case, "fast_rasterizers", lambda: ("triton",))
 
 
-@pytest.mark.parametrize("hard_case", other_cases(), ids=lambda hard_case: hard_case.name)
+@pytest.mark.parametrize("hard_case", parameters(other_cases()), ids=lambda hard_case: hard_case.name)
 def test_stays_within_its_bound(hard_case: Case) -> None:
     check(hard_case)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", parameters(list(SCENES)))
 def test_scene_stays_within_its_bound(name: str) -> None:
     result = compare_rasterizers(among_ordinary(SCENES[name](), count=ORDINARY), camera())
     assert result.passed, f"{result.error:.3g}, bound {result.bound:.3g}. {result.note}"
 
 
-@pytest.mark.parametrize("name", [name for name in views._VIEWS if is_small(name)])
+@pytest.mark.parametrize("name", parameters([name for name in views._VIEWS if is_small(name)]))
 def test_view_stays_within_its_bound(name: str) -> None:
     scene, view = views._VIEWS[name]()
     result = compare_rasterizers(scene.subset(torch.arange(min(len(scene), MOST))), view)

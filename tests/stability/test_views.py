@@ -6,12 +6,12 @@ import pytest
 
 from benchmarks.stability import Case
 from benchmarks.stability import view_cases as views
-from tests.stability.hard_cases import check
+from tests.stability.hard_cases import check, parameters
 
 pytestmark = pytest.mark.usefixtures("one_thread", "vgg16_weights")
 
 
-@pytest.mark.parametrize("case", views.cases(), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", parameters(views.cases()), ids=lambda case: case.name)
 def test_stays_within_its_bound(case: Case) -> None:
     check(case)
 

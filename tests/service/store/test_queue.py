@@ -20,11 +20,11 @@ def sorted_queue(jobs: list[JobRow], served: dict[str, int], now: float) -> JobR
     return min(ready, key=lambda job: (-job.priority, served.get(job.owner, 0), job.queued_at, job.id), default=None)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_queue_order_equals_a_plain_sort(store: Store, clock: Clock, seed: int) -> None:
     chance = random.Random(seed)
     served: dict[str, int] = {}
-    for turn in range(1, 60):
+    for turn in range(1, 40):
         clock.now += chance.choice([0, 1, LEASE / 4])
         for _ in range(chance.randrange(4)):
             queue(store, chance.choice("abcdef"), chance.choice([0, 0, 0, 1]))

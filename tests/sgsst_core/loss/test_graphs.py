@@ -100,7 +100,7 @@ def test_graph_is_bit_identical_to_eager_mode_for_every_view(
 
 
 @pytest.mark.usefixtures("without_triton")
-@pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
+@pytest.mark.parametrize("style_loss", ["mixed"])
 def test_graphs_include_feature_matching(
     counts: Counts, tiny_weights: BackboneWeights, style_loss: StyleLossName
 ) -> None:

@@ -42,17 +42,15 @@ def evaluate(network, case, tile_size, **options):
 @pytest.mark.parametrize(
     ("size", "tile_sizes", "covered"),
     [
-        ((160, 233), [None, 64, 96], False),
-        ((129, 350), [64, 160], True),
-        ((200, 333), [128], False),
+        ((160, 233), [None, 64], False),
+        ((129, 250), [64, 160], True),
     ],
 )
 def test_float64_agrees_with_untiled_autograd(tiny_weights, size, tile_sizes, covered):
     check_against_untiled_autograd(tiny_weights, size, tile_sizes, covered, 100)
 
 
-@pytest.mark.parametrize("gray", [False, True])
-@pytest.mark.parametrize("covered", [False, True])
+@pytest.mark.parametrize(("gray", "covered"), [(False, True), (True, False)])
 def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, gray):
     weights = replace(comparing_pixels(tiny_weights), gray=gray)
     check_against_untiled_autograd(weights, (129, 190), [None, 64], covered, 100)
@@ -102,10 +100,8 @@ def check_against_untiled_autograd(weights, size, tile_sizes, covered, coarsest)
     ("size", "tile_sizes", "covered"),
     [
         ((160, 233), [64], False),
-        ((500, 730), [304], False),
         ((333, 517), [128], True),
         ((256, 1031), [512], False),
-        ((520, 600), [272], True),
     ],
 )
 def test_float32_does_not_depend_on_the_partition(tiny_weights, size, tile_sizes, covered):

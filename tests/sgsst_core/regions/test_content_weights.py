@@ -194,12 +194,12 @@ def test_content_weight_of_the_job_in_a_region_changes_nothing(tiny_weights: Bac
     assert [record.loss for record in actual.history] == [record.loss for record in wanted.history]
 
 
-@pytest.mark.parametrize("treatment", [{}, {"style": Style.of(style().flip(0, 2) ** 2)}])
+@pytest.mark.parametrize("treatment", [{"style": Style.of(style().flip(0, 2) ** 2)}])
 def test_only_the_protected_region_stays_near_its_content(
     tiny_weights: BackboneWeights, treatment: dict[str, Any]
 ) -> None:
     scene = wall()
-    options: dict[str, Any] = {"steps_sos": 40, "learning_rate_end": 0.02, "warm_start": False, "early_stop": False}
+    options: dict[str, Any] = {"steps_sos": 25, "learning_rate_end": 0.02, "warm_start": False, "early_stop": False}
     plain, own = (make(tiny_weights, protected(weight, **treatment), **options) for weight in (1.0, 1e8))
     changes = []
     for stylizer in (plain, own):

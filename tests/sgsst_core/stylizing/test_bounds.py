@@ -45,17 +45,15 @@ def bright_wall() -> Scene:
 
 
 @pytest.mark.parametrize(
-    "values",
+    ("make_scene", "values"),
     [
-        {},
-        {"clamp_aware_gradient": False},
-        {"unseen": "freeze"},
-        {"training_background": "palette", "warm_start": True},
-        {"views_per_step": 2},
+        (bright_wall, {"clamp_aware_gradient": False}),
+        (ball, {"unseen": "freeze"}),
+        (ball, {"training_background": "palette", "warm_start": True}),
+        (bright_wall, {"views_per_step": 2}),
     ],
     ids=str,
 )
-@pytest.mark.parametrize("make_scene", [bright_wall, ball])
 def test_changed_colors_stay_in_the_range_of_screens(
     tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any]
 ) -> None:
@@ -99,8 +97,11 @@ def distance_from(style_image: Tensor, sh_dc: Tensor, axes: int) -> float:
     return float(((0.5 + SH_C0 * sh_dc.double() - pixels.mean(dim=0)) @ others.T).norm(dim=1).max())
 
 
-@pytest.mark.parametrize("values", [{}, {"warm_start": False}, {"style_loss": "nnfm"}, {"views_per_step": 2}], ids=str)
-@pytest.mark.parametrize("make_scene", [bright_wall, ball])
+@pytest.mark.parametrize(
+    ("make_scene", "values"),
+    [(bright_wall, {"warm_start": False}), (ball, {"style_loss": "nnfm"})],
+    ids=str,
+)
 @pytest.mark.parametrize(("of", "axes", "form"), [(gray, 1, "a line"), (few_hues, 2, "a plane")])
 def test_colors_stay_in_the_subspace(
     tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any], of: Any, axes: int, form: str

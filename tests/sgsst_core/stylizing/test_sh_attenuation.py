@@ -53,8 +53,7 @@ def test_job_is_bit_identical_to_that_of_an_attenuated_scene(tiny_weights: Backb
         assert exact[scale].total == pytest.approx(terms.total, rel=1e-6)
 
 
-@pytest.mark.parametrize("held_bytes", [0, None])
-@pytest.mark.parametrize("attenuation", [0.4, 1.0])
+@pytest.mark.parametrize(("held_bytes", "attenuation"), [(0, 0.4), (None, 1.0)])
 def test_written_result_renders_as_optimized(
     tiny_weights: BackboneWeights, tmp_path: Path, held_bytes: int | None, attenuation: float
 ) -> None:

@@ -80,7 +80,7 @@ def test_result_has_the_form_of_the_scene_and_new_colors(
         assert all(result[key] is given[key] for key in given if key != "sh0" and form != "parameters")
 
 
-@pytest.mark.parametrize("form", ["ply", "spz", "scene", "numpy", "activated", "nerfstudio"])
+@pytest.mark.parametrize("form", ["spz", "scene", "activated"])
 def test_split_and_attenuated_results_have_the_form_of_the_scene(
     tiny_weights: BackboneWeights, tmp_path: Path, form: str
 ) -> None:

@@ -21,9 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("scene", "values"),
     [
-        pytest.param(wall(sh_degree=1), {"preserve_colors": "luminance"}, id="luminance"),
         pytest.param(wall(sh_degree=2), {"sh_attenuation": 0.3}, id="attenuation"),
-        pytest.param(wall(), {"scales": (1.0, 0.5)}, id="scales"),
         pytest.param(wall(), {"scales": (0.0, 1.0), "style_loss": "mixed"}, id="one-scale"),
         pytest.param(
             ball(), {"preserve_colors": "luminance", "training_background": "palette"}, id="luminance-of-a-scan"
@@ -33,12 +31,11 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_several_ranks_match_one_rank(scene: Scene, values: dict[str, Any]) -> None:
     values = {"steps_coarse": 2, "steps_sos": 4, "learning_rate": 0.01} | values
     expected = stylize(ALONE, scene, 3, values)
-    for ranks in (2, 3):
-        actual = on_ranks(ranks, stylize, scene, 3, values)
-        for result in actual:
-            assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
-            assert relative_error(result["colors"], expected["colors"]) < 1e-3
-            assert torch.equal(result["colors"], actual[0]["colors"])
+    actual = on_ranks(3, stylize, scene, 3, values)
+    for result in actual:
+        assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
+        assert relative_error(result["colors"], expected["colors"]) < 1e-3
+        assert torch.equal(result["colors"], actual[0]["colors"])
 
 
 def test_ranks_stay_in_the_same_color_subspace() -> None:
