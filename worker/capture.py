@@ -141,7 +141,7 @@ def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAx
         return requested, []
     try:
         header = read_scene_header(source.scene)
-        if not isinstance(header, SpzHeader) or header.extended or header.stated_axes is not None:
+        if not isinstance(header, SpzHeader) or header.may_state_axes:
             return requested, []
         cameras = None
         if source.cameras is not None:

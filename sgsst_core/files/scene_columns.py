@@ -77,7 +77,7 @@ class SceneColumns:
 
     def __init__(self, header: SceneHeader, stored: RowLayout | None) -> None:
         ply = header if isinstance(header, PlySceneHeader) else None
-        names = {prop.name for prop in ply.ply.vertex.properties} if ply else set()
+        names = set(ply.ply.vertex.kinds) if ply else set()
         count, coefficients = header.count, 0 if stored else header.coefficients
         self._stored = stored
         self._sources = ply.sources if ply else {}
@@ -143,7 +143,7 @@ class SceneColumns:
                 counts[name] = nans, int((~good).sum()) - nans
         return _Flaws(start, valid, counts, unrotated)
 
-    def valid_rows(self, path: Path, drop_invalid: bool, surplus: str = "") -> NDArray[np.bool_] | None:
+    def valid_rows(self, path: Path, drop_invalid: bool, surplus: tuple[str, ...]) -> NDArray[np.bool_] | None:
         """Return the mask [count] bool of valid rows; None if all are valid.
 
         Args:
@@ -180,7 +180,7 @@ class SceneColumns:
             ]
         summary = f"{path}: {bad} of {len(retained)} Gaussians {', or '.join(flawed)}"
         if surplus:
-            raise SceneError(f"{summary}. Its rows are not as the header declares: {surplus}.")
+            raise SceneError(f"{summary}. Its rows are not as the header declares: {surplus[0]}.")
         if bad == len(retained):
             raise SceneError(f"{summary}. No valid Gaussians remain. Train or export the scene again.")
         if not drop_invalid:

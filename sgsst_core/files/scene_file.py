@@ -47,16 +47,8 @@ READ_BYTES = 1 << 20
 #: Maximum bytes of SH coefficients above degree 0 in memory: those of 1.4 million Gaussians of degree 3.
 HELD_BYTES = 1 << 28
 
-#: Standard 3DGS properties by their names in PLY files: field of `Scene`, and column of its tensor (None for a 1D
-#: tensor).
-_STANDARD = {
-    **{name: ("means", column) for column, name in enumerate("xyz")},
-    **{f"scale_{column}": ("scales", column) for column in range(3)},
-    **{f"rot_{column}": ("quats", column) for column in range(4)},
-    **{f"f_dc_{column}": ("sh_dc", column) for column in range(3)},
-    "opacity": ("opacities", None),
-}
-
+#: Standard 3DGS properties by their names in PLY files: field of `Scene`, and column of its tensor.
+_STANDARD = {name: (field, column) for field, names in PROPERTIES.items() for column, name in enumerate(names)}
 #: Properties that differ between the pieces of a split Gaussian.
 _SHAPE = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"], FILTER_3D)
 
@@ -101,14 +93,13 @@ class SceneFile:
             return self
         if self.copies is not None:
             raise SceneError(f"{self.path}: its Gaussians are split already. Save the result, and load it again.")
-        if self.header is not None:
-            kinds = {prop.name: prop.kind for prop in self.header.vertex.properties}
-            integers = [name for name in _SHAPE if kinds.get(name, "f")[0] != "f"]
-            if integers:
-                raise SceneError(
-                    f"{self.path}: {', '.join(integers)} are stored as integers; smaller Gaussians need float or "
-                    "double. Convert the scene first, or leave --refine out."
-                )
+        kinds = self.header.vertex.kinds if self.header is not None else {}
+        integers = [name for name in _SHAPE if kinds.get(name, "f")[0] != "f"]
+        if integers:
+            raise SceneError(
+                f"{self.path}: {', '.join(integers)} are stored as integers; smaller Gaussians need float or double. "
+                "Convert the scene first, or leave --refine out."
+            )
         return replace(self, scene=refinement.of(self.scene), copies=piece_counts(refinement.pieces).numpy())
 
     def stylized(self, scene: Scene, refinement: Refinement | None, sh_attenuation: float) -> SceneFile:
@@ -160,9 +151,13 @@ def read_scene(
     offset = element_offsets(path, ply).get("vertex", 0) if ply else 0
     file = RowFile(path)
     stamp = file.stamp
-    stored = _row_layout(path, ply, stamp, offset) if ply and stays_in_file(header, held_bytes) else None
+    stored = None
+    if isinstance(header, PlySceneHeader) and stays_in_file(header, held_bytes):
+        row = header.ply.vertex.dtype
+        column = row.fields["f_rest_0"][1] if row.fields else 0
+        stored = RowLayout(path, stamp, offset, header.count, row.itemsize, column, header.stored_coefficients)
     columns, notes = SceneColumns(header, stored), header.notes
-    about_rest = surplus(path, ply) if ply else ""
+    about_rest = surplus(path, ply) if ply else ()
     if header.format.read is not None:
         notes += header.format.read(file, header, columns.arrays) or ()
         for block in blocks(header.count):
@@ -175,7 +170,7 @@ def read_scene(
         _read_binary(file, ply, offset, columns)
     file.check_unchanged(stamp)
     retained = columns.valid_rows(path, drop_invalid, about_rest)
-    notes += (about_rest,) if about_rest else ()
+    notes += about_rest
     notes += check_units(path, columns.arrays, FLAT, logits_stored=header.format is PLY)
     if ply is not None and ply.has_double_positions:
         notes += about_rounded_positions(columns.arrays["means"], columns.arrays["scales"])
@@ -200,11 +195,11 @@ def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
     if not isinstance(declared, PlySceneHeader) or not declared.coefficients or declared.sources:
         return False
     header = declared.ply
-    names = [prop.name for prop in header.vertex.properties]
-    if header.text or header.byte_order != "<" or "f_rest_0" not in names:
+    names = [*header.vertex.kinds]
+    if header.byte_order != "<" or "f_rest_0" not in names:
         return False
     limit = HELD_BYTES if held_bytes is None else held_bytes
-    dtype = header.vertex.dtype("<")
+    dtype = header.vertex.dtype
     count = sum(name.startswith("f_rest_") for name in names)
     first = names.index("f_rest_0")
     plain = names[first : first + count] == [f"f_rest_{i}" for i in range(count)]
@@ -266,21 +261,12 @@ def arrays_of(scene: Scene) -> Arrays:
     return {name: held(getattr(scene, name)).detach().cpu().float().numpy() for name in TENSORS}
 
 
-def _row_layout(path: Path, header: PlyHeader, stamp: tuple[int, int], offset: int) -> RowLayout:
-    """Return the layout of the SH coefficients in a file for which `stays_in_file` is True."""
-    fields = header.vertex.dtype(header.byte_order).fields
-    assert fields is not None
-    count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in fields)
-    size = header.vertex.dtype(header.byte_order).itemsize
-    return RowLayout(path, stamp, offset, header.vertex.count, size, fields["f_rest_0"][1], count // 3)
-
-
 def _read_binary(file: RowFile, header: PlyHeader, offset: int, into: SceneColumns) -> None:
     """Read the vertex element in blocks. Large files are read with as many threads as PyTorch uses.
 
     plyfile would map the file, which takes as long, but kills the process if another program truncates the file.
     """
-    dtype, count = header.vertex.dtype(header.byte_order), header.vertex.count
+    dtype, count = header.vertex.dtype, header.vertex.count
     step = max(1, READ_BYTES // dtype.itemsize)
 
     def read(starts: range) -> None:
@@ -348,21 +334,21 @@ def read_property(file: SceneFile, name: str) -> Tensor:
     Raises:
         SceneError: If the file has no such numeric property, or has changed since it was read.
     """
+    if name == "opacity":
+        return file.scene.opacities
     if name in _STANDARD:
         field, column = _STANDARD[name]
         values: Tensor = getattr(file.scene, field)
-        return values if column is None else values[:, column]
+        return values[:, column]
     header = file.header
-    others = [] if header is None else [prop.name for prop in header.vertex.properties]
-    if header is None or name not in others:
-        known = sorted({*_STANDARD, *others})
+    if header is None or name not in header.vertex.kinds:
+        known = sorted({*_STANDARD, "opacity", *(header.vertex.kinds if header else ())})
         raise SceneError(f"{file.path}: its Gaussians have no property {name!r}. There are {', '.join(known)}.")
     if header.text:
         rows = text_vertices(file.path, header)[name]
     else:
         offset = element_offsets(file.path, header)["vertex"]
-        table = np.memmap(file.path, header.vertex.dtype(header.byte_order), "r", offset, (header.vertex.count,))
-        rows = np.array(table[name])
+        rows = np.array(np.memmap(file.path, header.vertex.dtype, "r", offset, (header.vertex.count,))[name])
     if file_stamp(file.path) != file.stamp:
         raise changed(file.path)
     if file.retained is not None:

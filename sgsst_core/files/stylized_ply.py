@@ -88,7 +88,7 @@ def encode_stylized(
         return
     check_sh_attenuation(source, sh_attenuation)
     columns, factor = _new_columns(source, source.header, colors), attenuation_factor(sh_attenuation)
-    rest = [] if factor == 1 else [prop.name for prop in source.header.vertex.properties if _REST.fullmatch(prop.name)]
+    rest = [] if factor == 1 else [name for name in source.header.vertex.kinds if _REST.fullmatch(name)]
     with source.path.open("rb") as file:
         output.write(_header_for(source, source.header))
         write = _write_text if source.header.text else _write_binary
@@ -103,7 +103,7 @@ def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
     """
     if source.header is None or not attenuation:
         return
-    kinds = {prop.name: prop.kind for prop in source.header.vertex.properties}
+    kinds = source.header.vertex.kinds
     integers = [name for name, kind in kinds.items() if _REST.fullmatch(name) and kind[0] != "f"]
     if integers:
         raise SceneError(
@@ -134,8 +134,7 @@ def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> _NewCo
 
     Colors that the file also has with 8 bits are among them.
     """
-    columns = dict(zip(PROPERTIES["sh_dc"], colors.numpy().T, strict=True))
-    kinds = {prop.name: prop.kind for prop in source.header.vertex.properties} if source.header else {}
+    columns, kinds = dict(zip(PROPERTIES["sh_dc"], colors.numpy().T, strict=True)), header.vertex.kinds
     if all(kinds.get(name) == "u1" for name in RGB):
         shown = (255 * (COLOR_OFFSET + SH_C0 * colors.double()).clamp(0, 1)).round().float()
         columns |= dict(zip(RGB, shown.numpy().T, strict=True))
@@ -144,8 +143,7 @@ def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> _NewCo
         for names, values in ((PROPERTIES["means"], source.scene.means), (PROPERTIES["scales"], source.scene.scales)):
             columns |= dict(zip(names, values.numpy().T, strict=True))
         columns[FILTER_3D] = np.zeros(len(source.scene), np.float32)  # the shapes are those after the filter
-    present = {prop.name for prop in header.vertex.properties}
-    return {name: values for name, values in columns.items() if name in present}
+    return {name: values for name, values in columns.items() if name in kinds}
 
 
 def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int64], slice]]:
@@ -174,7 +172,7 @@ def _write_binary(
     file: io.BufferedReader,
     output: BinaryIO,
 ) -> None:
-    dtype = header.vertex.dtype(header.byte_order)
+    dtype = header.vertex.dtype
     before = element_offsets(source.path, header)["vertex"] - len(header.raw)
     file.seek(len(header.raw))
     _copy(file, output, before)
@@ -219,9 +217,8 @@ def _write_text(
 ) -> None:
     vertex = header.vertex
     before = header.elements[: header.elements.index(vertex)]
-    order = [prop.name for prop in vertex.properties]
-    names = (*columns, *rest)
-    slots = [(order.index(name), vertex.properties[order.index(name)].kind) for name in names]
+    order = [*vertex.kinds]
+    slots = [(order.index(name), vertex.kinds[name]) for name in (*columns, *rest)]
     file.seek(len(header.raw))
     # latin-1 preserves every byte, and newline="" every line end
     lines = io.TextIOWrapper(file, "latin-1", newline="")

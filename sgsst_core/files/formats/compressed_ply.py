@@ -56,12 +56,11 @@ def bounds(prefix: str, axes: str) -> tuple[str, ...]:
     return tuple(f"{side}_{prefix}{axis}" for side in ("min", "max") for axis in axes)
 
 
+_ELEMENTS = ("vertex", "chunk", "sh")
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = (*bounds("", "xyz"), *bounds("scale_", "xyz"), *bounds("", "rgb"))
 #: Maximum absolute log scale; other writers of the format clamp to it too.
 _LARGEST_SCALE = 20.0
-
-
 #: SH coefficient for each byte: the center of its quantization step, or an end of the range for 0 and 255.
 _HARMONICS = (8 * (np.array([0, *(np.arange(1, 255) + 0.5) / 256, 1]) - 0.5)).astype(np.float32)
 
@@ -80,18 +79,17 @@ def _matches(start: FileStart) -> bool:
 def _read_header(start: FileStart) -> CompressedPlyHeader:
     path = start.path
     header = read_header(start)
-    if "vertex" not in header.names:
+    vertex, chunk, harmonics = ({each.name: each for each in header.elements}.get(name) for name in _ELEMENTS)
+    if vertex is None:
         raise SceneError(f"{path}: is a compressed PLY without element 'vertex'. Export it again.")
     if header.text:
         raise SceneError(f"{path}: is a compressed PLY as text, which no program writes. Export it again as binary.")
-    vertex = header.vertex
     _check_kinds(path, vertex, "u4", _PACKED)
-    refuse_changed_meaning(path, (prop.name for prop in vertex.properties))
-    chunk = header.elements[header.names.index("chunk")] if "chunk" in header.names else None
+    refuse_changed_meaning(path, vertex.kinds)
     if chunk is None:
         raise SceneError(f"{path}: is a compressed PLY without element 'chunk', its bounds. Export it again.")
     _check_kinds(path, chunk, "f4", (*bounds("", "xyz"), *bounds("scale_", "xyz")))
-    if "min_r" in {prop.name for prop in chunk.properties}:
+    if "min_r" in chunk.kinds:
         _check_kinds(path, chunk, "f4", bounds("", "rgb"))
     if not vertex.count:
         raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
@@ -101,42 +99,33 @@ def _read_header(start: FileStart) -> CompressedPlyHeader:
             f"{path}: the header declares {chunk.count} chunks, but {vertex.count} Gaussians make {expected}: it is "
             "wrong. Export the scene again."
         )
-    coefficients = _sh_coefficients(path, header, vertex.count)
+    number = len(harmonics.kinds) if harmonics else 0
+    if harmonics:
+        if number not in (9, 24, 45) or harmonics.count != vertex.count:
+            raise SceneError(
+                f"{path}: element 'sh' has {harmonics.count} rows of {number} properties; there should be "
+                f"{vertex.count} of 9, 24 or 45. Export the scene again."
+            )
+        _check_kinds(path, harmonics, "u1", tuple(f"f_rest_{i}" for i in range(number)))
     element_offsets(path, header)
-    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, coefficients, header, tag=ply_tag(header))
+    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, number // 3, header, tag=ply_tag(header))
 
 
 def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:
-    kinds = {prop.name: prop.kind for prop in element.properties if not prop.length_kind}
-    wrong = [name for name in names if kinds.get(name) != kind]
-    if wrong or element.has_lists:
+    wrong = [name for name in names if element.kinds.get(name) != kind or name in element.lists]
+    if wrong or element.lists:
         what = f"{', '.join(wrong)} missing or of another type" if wrong else "a list"
         raise SceneError(
             f"{path}: is not a readable compressed PLY: element {element.name!r} has {what}. Export it again."
         )
 
 
-def _sh_coefficients(path: Path, header: PlyHeader, count: int) -> int:
-    """Return the SH coefficients per color channel above degree 0, which follow from the element `sh`."""
-    if "sh" not in header.names:
-        return 0
-    element = header.elements[header.names.index("sh")]
-    coefficients = len(element.properties) // 3
-    if len(element.properties) not in (9, 24, 45) or element.count != count:
-        raise SceneError(
-            f"{path}: element 'sh' has {element.count} rows of {len(element.properties)} properties; there should be "
-            f"{count} of 9, 24 or 45. Export the scene again."
-        )
-    _check_kinds(path, element, "u1", tuple(f"f_rest_{i}" for i in range(len(element.properties))))
-    return coefficients
-
-
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
     """Fill the arrays of a scene, and return the note on bytes after the last element."""
     assert isinstance(header, CompressedPlyHeader)
-    note = surplus(file.path, header.ply)
+    notes = surplus(file.path, header.ply)
     starts = element_offsets(file.path, header.ply)
-    kinds = {element.name: element.dtype(header.ply.byte_order) for element in header.ply.elements}
+    kinds = {element.name: element.dtype for element in header.ply.elements}
 
     def rows(name: str, first: int, count: int) -> NDArray[Any]:
         return read_rows(file, kinds[name], starts[name] + first * kinds[name].itemsize, count)
@@ -146,8 +135,11 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
         chunks = rows("chunk", start // CHUNK_ROWS, -(-count // CHUNK_ROWS))
         _unpack(rows("vertex", start, count), chunks, {name: array[block] for name, array in into.items()})
         if header.coefficients:
-            _unpack_harmonics(rows("sh", start, count), into["sh_rest"][block])
-    return (note,) if note else ()
+            harmonics = rows("sh", start, count)
+            for i in range(3 * header.coefficients):
+                channel, index = divmod(i, header.coefficients)
+                into["sh_rest"][block, index, channel] = _HARMONICS[harmonics[f"f_rest_{i}"]]
+    return notes
 
 
 def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
@@ -177,12 +169,6 @@ def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
 def _three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Unpack 11, 10 and 11 bits to values in 0..1, [n, 3]."""
     return np.stack([(packed >> 21) / 2047, ((packed >> 11) & 1023) / 1023, (packed & 2047) / 2047], axis=1)
-
-
-def _unpack_harmonics(rows: NDArray[Any], into: NDArray[np.float32]) -> None:
-    coefficients = into.shape[1]
-    for i in range(3 * coefficients):
-        into[:, i % coefficients, i // coefficients] = _HARMONICS[rows[f"f_rest_{i}"]]
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
@@ -260,13 +246,4 @@ def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[Any]:
     return packed
 
 
-COMPRESSED_PLY = SceneFormat(
-    name="compressed.ply",
-    title="compressed PLY",
-    matches=_matches,
-    read_header=_read_header,
-    bytes_per_gaussian=61,
-    read=_read,
-    write=_write,
-    shown=True,
-)
+COMPRESSED_PLY = SceneFormat("compressed.ply", "compressed PLY", 61, _matches, _read_header, _read, _write, shown=True)

@@ -38,12 +38,13 @@ from sgsst_core.files.formats.scene_format import (
     RenderTag,
     SceneFormat,
     SceneHeader,
+    about_part,
     blocks,
     extras_of,
     extras_tag,
     json_numbers,
+    read_bytes,
     read_rows,
-    surplus_note,
 )
 from sgsst_core.files.formats.units import logarithms, logits
 from sgsst_core.scene.rendering import Rendering
@@ -147,7 +148,7 @@ class GlbHeader(SceneHeader):
 
 def _read_header(start: FileStart) -> GlbHeader:
     path = start.path
-    text, data_offset, data_bytes = _chunks(start)
+    text, data = _chunks(start)
     try:
         document = json.loads(text)
         shown, hidden = _shown_splats(path, document)
@@ -159,17 +160,23 @@ def _read_header(start: FileStart) -> GlbHeader:
                 f"{path}: its Gaussians need the glTF extension {', '.join(sorted(required))[:80]}, which cannot be "
                 "read. Export the GLB without compression."
             )
-        parts = [_part(path, document, *each, data_offset, data_bytes) for each in shown]
+        parts = [_part(path, document, *each, data) for each in shown]
         notes = [f"{hidden} sets of Gaussians that no node shows are left out"] if hidden else []
         notes += ["animations are left out"] if document.get("animations") else []
-        notes += _about_rest(path, document, parts, (data_offset, data_offset + data_bytes))
-        return _joined(path, parts, data_bytes, tuple(notes))
+        notes += _about_rest(path, document, parts, data)
     except _WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
+    count = sum(part.count for part in parts)
+    if count > len(data):
+        raise SceneError(f"{path}: its nodes show {count} Gaussians, more than its {len(data)} bytes can hold.")
+    if len({part.tag.rendering for part in parts}) > 1:
+        raise SceneError(f"{path}: its {len(parts)} sets of Gaussians have different render modes. Export them apart.")
+    coefficients = max(len(part.harmonics) for part in parts)
+    return GlbHeader(GLB, count, coefficients, parts, notes=tuple(notes), tag=parts[0].tag)
 
 
-def _chunks(start: FileStart) -> tuple[bytes, int, int]:
-    """Return the JSON document, and the offset and size in bytes of the binary data."""
+def _chunks(start: FileStart) -> tuple[bytes, range]:
+    """Return the JSON document, and the byte offsets of the binary data."""
     path, truncated = start.path, "the file is truncated or its header is wrong. Copy or export it again."
     head = start.head.ljust(_HEADER.size + _CHUNK.size, b"\0")
     (_, version, length), (json_bytes, kind) = _HEADER.unpack_from(head), _CHUNK.unpack_from(head, _HEADER.size)
@@ -185,12 +192,12 @@ def _chunks(start: FileStart) -> tuple[bytes, int, int]:
             f"{path}: has {json_bytes} bytes of JSON; at most {_MAX_JSON_BYTES} can be read. Export the Gaussians "
             "without the other objects of the file."
         )
-    text, chunk = start.read(first, json_bytes), start.read(first + json_bytes, _CHUNK.size)
     offset = first + json_bytes + _CHUNK.size
+    text, chunk = read_bytes(path, first, first + json_bytes), read_bytes(path, first + json_bytes, offset)
     size, kind = _CHUNK.unpack(chunk) if len(chunk) == _CHUNK.size else (0, b"BIN\0")
     if kind != b"BIN\0" or offset + size > max(start.size, offset):
         raise SceneError(f"{path}: the GLB declares {size} bytes of data after its JSON: {truncated}")
-    return text, offset, size
+    return text, range(offset, offset + size)
 
 
 def _shown_splats(path: Path, document: dict[str, Any]) -> tuple[list[tuple[dict[str, Any], NDArray[np.float64]]], int]:
@@ -222,12 +229,7 @@ def _shown_splats(path: Path, document: dict[str, Any]) -> tuple[list[tuple[dict
 
 @np.errstate(over="ignore", invalid="ignore")  # the transformation is checked
 def _part(
-    path: Path,
-    document: dict[str, Any],
-    primitive: dict[str, Any],
-    matrix: NDArray[np.float64],
-    data_offset: int,
-    data_bytes: int,
+    path: Path, document: dict[str, Any], primitive: dict[str, Any], matrix: NDArray[np.float64], data: range
 ) -> GlbPart:
     """Parse a primitive of Gaussians. Errors of `_WRONG_JSON` mean that a value is missing or wrong."""
     declared = primitive["extensions"][_EXTENSION]
@@ -246,7 +248,7 @@ def _part(
     def accessor(name: str, kind: str) -> Accessor:
         if name not in attributes:
             raise SceneError(f"{path}: its Gaussians have no attribute {name}. Export it again.")
-        return _accessor(document, attributes[name], kind, count, data_offset, data_bytes)
+        return _accessor(document, attributes[name], kind, count, data)
 
     present = sum(name in attributes for name in _HARMONICS)
     coefficients = min(number for number in COEFFICIENTS.values() if number >= present)
@@ -263,30 +265,12 @@ def _part(
     )
 
 
-def _joined(path: Path, parts: list[GlbPart], data_bytes: int, notes: tuple[str, ...]) -> GlbHeader:
-    """Return the header of a scene of all parts, which must have the same render mode."""
-    count = sum(part.count for part in parts)
-    if count > data_bytes:
-        raise SceneError(f"{path}: its nodes show {count} Gaussians, more than its {data_bytes} bytes can hold.")
-    if len({part.tag.rendering for part in parts}) > 1:
-        raise SceneError(f"{path}: its {len(parts)} sets of Gaussians have different render modes. Export them apart.")
-    coefficients = max(len(part.harmonics) for part in parts)
-    return GlbHeader(GLB, count, coefficients, parts, notes=notes, tag=parts[0].tag)
-
-
-def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data: tuple[int, int]) -> list[str]:
-    """Return notes on bytes after the binary data, and on rows of buffer views that only Gaussians are read from.
-
-    Args:
-        path: Path of the file.
-        document: glTF document.
-        parts: Sets of Gaussians.
-        data: Byte offsets of the binary data and of their end.
-    """
-    declared = document["buffers"][0].get("byteLength", data[1] - data[0])
+def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data: range) -> list[str]:
+    """Return notes on bytes after the binary data, and on rows of buffer views that only Gaussians are read from."""
+    declared = document["buffers"][0].get("byteLength", len(data))
     if type(declared) is not int or declared < 0:
         raise ValueError(f"byteLength: {declared}")
-    spans = [(data[0] + declared, data[1]), (data[1], path.stat().st_size)]
+    spans = [(data.start + declared, data.stop), (data.stop, path.stat().st_size)]
     ends = {
         accessor: accessor.offset + (part.count - 1) * accessor.stride + accessor.value_bytes
         for part in parts
@@ -299,12 +283,10 @@ def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data
         if len(read) == readers[view] and first.view_end - max(read) >= first.stride:
             spans.append((max(read), first.view_end))
             break  # other attributes have as many rows
-    return [note for span in dict.fromkeys(spans) if (note := surplus_note(path, *span))]
+    return [note for span in dict.fromkeys(spans) for note in about_part(path, *span)]
 
 
-def _accessor(
-    document: dict[str, Any], index: int, kind: str, count: int, data_offset: int, data_bytes: int
-) -> Accessor:
+def _accessor(document: dict[str, Any], index: int, kind: str, count: int, data: range) -> Accessor:
     """Check that the values of an accessor lie in the binary data."""
     entry = document["accessors"][index]
     if entry["type"] != kind or entry["count"] != count or "sparse" in entry:
@@ -318,11 +300,11 @@ def _accessor(
     first, start, size = entry.get("byteOffset", 0), view.get("byteOffset", 0), view["byteLength"]
     if any(type(number) is not int or number < 0 for number in (stride, first, start, size)):
         raise ValueError(f"accessor {index}: {entry}, {view}")
-    inside = start + size <= data_bytes and first + (count - 1) * stride + value_bytes <= size
+    inside = start + size <= len(data) and first + (count - 1) * stride + value_bytes <= size
     if not inside or not value_bytes <= stride <= _MAX_STRIDE:
         raise ValueError(f"accessor {index}: {count} values are more than its {size} bytes can hold")
     normalized = bool(entry.get("normalized", False)) and code in _LARGEST
-    offset, end = data_offset + start + first, data_offset + start + size
+    offset, end = data.start + start + first, data.start + start + size
     return Accessor(offset, stride, _COMPONENTS[kind], code, normalized, entry["bufferView"], end)
 
 
@@ -360,15 +342,6 @@ def _local_matrix(node: dict[str, Any]) -> NDArray[np.float64]:
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene. Opacities of 0 and 1 and standard deviations of 0 become infinite."""
     assert isinstance(header, GlbHeader)
-    first = 0
-    for part in header.parts:
-        rows = slice(first, first + part.count)
-        _read_part(file, part, {name: array[rows] for name, array in into.items()})
-        first += part.count
-
-
-def _read_part(file: OpenScene, part: GlbPart, into: Arrays) -> None:
-    """Fill the arrays of a set of Gaussians."""
     converters: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
         "means": np.asarray,
         "quats": lambda values: np.roll(values, 1, axis=1),
@@ -376,15 +349,19 @@ def _read_part(file: OpenScene, part: GlbPart, into: Arrays) -> None:
         "opacities": lambda values: logits(file.path, values)[:, 0],
         "sh_dc": np.asarray,
     }
-    with np.errstate(over="ignore", invalid="ignore"):  # invalid values are reported later
-        for name, convert in converters.items():
-            for block, values in _values(file, part.accessors[name], part.count):
-                into[name][block] = convert(values)
-        for index, accessor in enumerate(part.harmonics):
-            for block, values in _values(file, accessor, part.count):
-                into["sh_rest"][block, index] = values
-        into["sh_rest"][:, len(part.harmonics) :] = 0
-        part.frame.apply(into)
+    first = 0
+    for part in header.parts:
+        arrays = {name: array[first : first + part.count] for name, array in into.items()}
+        first += part.count
+        with np.errstate(over="ignore", invalid="ignore"):  # invalid values are reported later
+            for name, convert in converters.items():
+                for block, values in _values(file, part.accessors[name], part.count):
+                    arrays[name][block] = convert(values)
+            for index, accessor in enumerate(part.harmonics):
+                for block, values in _values(file, accessor, part.count):
+                    arrays["sh_rest"][block, index] = values
+            arrays["sh_rest"][:, len(part.harmonics) :] = 0
+            part.frame.apply(arrays)
 
 
 def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:
@@ -475,14 +452,8 @@ def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int, extras: 
     }
 
 
-GLB = SceneFormat(
-    name="glb",
-    title="GLB",
-    matches=lambda start: start.head.startswith(_MAGIC),
-    read_header=_read_header,
-    bytes_per_gaussian=240,
-    read=_read,
-    write=_write,
-    shown=True,
-    media_type="model/gltf-binary",
-)
+def _matches(start: FileStart) -> bool:
+    return start.head.startswith(_MAGIC)
+
+
+GLB = SceneFormat("glb", "GLB", 240, _matches, _read_header, _read, _write, shown=True, media_type="model/gltf-binary")

@@ -25,9 +25,10 @@ from sgsst_core.files.formats.scene_format import (
     OpenScene,
     SceneFormat,
     SceneHeader,
-    blocks,
+    about_part,
+    read_bytes,
     read_rows,
-    surplus_note,
+    row_blocks,
 )
 from sgsst_core.files.formats.units import logarithms
 
@@ -108,7 +109,7 @@ def _read_header(start: FileStart) -> KsplatHeader:
             f"{path}: the .ksplat header declares {sections} sections in {start.size} bytes; at most {_MAX_SECTIONS} "
             "can be read. The file is truncated or its header is wrong. Copy or export it again."
         )
-    table = start.read(_HEADER_BYTES, _SECTION_BYTES * sections)
+    table = read_bytes(path, _HEADER_BYTES, table_end)
     read, position = [], table_end
     for index in range(sections):
         section, position = _section(table[index * _SECTION_BYTES :][:_SECTION_BYTES], level, position)
@@ -124,8 +125,7 @@ def _read_header(start: FileStart) -> KsplatHeader:
             f"{sum(section.count for section in read)}: it was not written completely. Export it again."
         )
     coefficients = COEFFICIENTS[max(section.degree for section in read)]
-    note = surplus_note(path, position, start.size)
-    notes = (note,) if note else ()
+    notes = about_part(path, position, start.size)
     return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read, notes=notes)
 
 
@@ -163,8 +163,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     for section in header.sections:
         buckets = _buckets(file, section) if header.level and section.count else None
         kind = _row(header.level, section.degree)
-        for part in blocks(section.count):
-            rows = read_rows(file, kind, section.data_offset + part.start * kind.itemsize, part.stop - part.start)
+        for part, rows in row_blocks(file, kind, section.data_offset, section.count):
             block = slice(first + part.start, first + part.stop)
             positions = rows["position"].astype(np.float64)
             if buckets is not None:
@@ -208,12 +207,4 @@ def _harmonics(values: NDArray[np.generic], header: KsplatHeader, section: Kspla
     return np.concatenate(bands, axis=1)
 
 
-KSPLAT = SceneFormat(
-    name="ksplat",
-    title=".ksplat",
-    matches=_matches,
-    read_header=_read_header,
-    bytes_per_gaussian=44,
-    read=_read,
-    magic=_MAGIC,
-)
+KSPLAT = SceneFormat("ksplat", ".ksplat", 44, _matches, _read_header, _read, magic=_MAGIC)

@@ -61,18 +61,12 @@ def _read_header(start: FileStart) -> PlySceneHeader:
     stored, sources = _check_properties(start.path, header)
     check_length(start.path, header)
     coefficients = min(stored, COEFFICIENTS[3])
-    notes = _notes(coefficients < stored, sources)
-    return PlySceneHeader(
-        PLY, header.vertex.count, coefficients, header, stored, sources, notes=notes, tag=ply_tag(header)
-    )
-
-
-def _notes(above: bool, sources: dict[str, str]) -> tuple[str, ...]:
-    """Return notes on SH bands above degree 3 and on the properties of PLY variants."""
-    notes = ["SH bands above degree 3 are not drawn; only a stylized PLY keeps them"] if above else []
+    notes = ["SH bands above degree 3 are not drawn; only a stylized PLY keeps them"] if coefficients < stored else []
     if sources:
         notes.append(f"{', '.join(dict.fromkeys(sources.values()))} become the usual properties of a stylized PLY")
-    return tuple(notes)
+    return PlySceneHeader(
+        PLY, header.vertex.count, coefficients, header, stored, sources, notes=tuple(notes), tag=ply_tag(header)
+    )
 
 
 def _sources(kinds: dict[str, str]) -> dict[str, str]:
@@ -93,7 +87,7 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
         Stored SH coefficients per channel, and `PlySceneHeader.sources`.
     """
     vertex = header.vertex if "vertex" in header.names else None
-    kinds = {prop.name: prop.kind for prop in vertex.properties if not prop.length_kind} if vertex else {}
+    kinds = {name: kind for name, kind in vertex.kinds.items() if name not in vertex.lists} if vertex else {}
     refuse_changed_meaning(path, kinds)
     sources = _sources(kinds)
     known = {*kinds, *sources, *(["scale_2"] if is_flat(kinds) else [])}
@@ -102,8 +96,7 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
         raise SceneError(f"{path}: is not a 3DGS scene but {_likely_content(header)}; missing: {', '.join(missing)}.")
     if vertex.count == 0:
         raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
-    if vertex.has_lists:
-        name = next(prop.name for prop in vertex.properties if prop.length_kind)
+    for name in vertex.lists:
         raise SceneError(
             f"{path}: vertex property {name!r} is a list, which 3DGS scenes do not have. Export without it."
         )
@@ -128,7 +121,7 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
 def _likely_content(header: PlyHeader) -> str:
     """Guess what a PLY without Gaussians contains, for the error message."""
     vertex = header.vertex if "vertex" in header.names else None
-    names = {prop.name for prop in vertex.properties} if vertex else set()
+    names = set(vertex.kinds) if vertex else set()
     if "face" in header.names:
         return "a mesh (it has faces)"
     if {"x", "y", "z"} <= names and not names & {"opacity", "scale_0", "rot_0", "f_dc_0"}:
@@ -156,12 +149,8 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
         output.write(rows.data)
 
 
-PLY = SceneFormat(
-    name="ply",
-    title="PLY",
-    matches=lambda start: start.head.startswith(b"ply") and not COMPRESSED_PLY.matches(start),
-    read_header=_read_header,
-    bytes_per_gaussian=248,
-    write=_write,
-    shown=True,
-)
+def _matches(start: FileStart) -> bool:
+    return start.head.startswith(b"ply") and not COMPRESSED_PLY.matches(start)
+
+
+PLY = SceneFormat("ply", "PLY", 248, _matches, _read_header, write=_write, shown=True)

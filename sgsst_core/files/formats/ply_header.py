@@ -14,7 +14,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +24,11 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.scene_format import (
     FileStart,
     RenderTag,
+    about_part,
     about_surplus,
-    number_of,
+    read_bytes,
     refuse_text_transfer,
     stated,
-    surplus_note,
     usable_eps2d,
 )
 from sgsst_core.scene.rendering import Rendering
@@ -42,6 +42,8 @@ _TYPES = {
     **{"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float32": "f4", "float64": "f8"},
 }
+#: Words before the type of a property: none, or those of a list.
+_LENGTHS = [[], *(["list", name] for name, kind in _TYPES.items() if kind[0] != "f")]
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 #: Property of Mip-Splatting: deviation of the 3D filter of each Gaussian, in world units.
 FILTER_3D = "filter_3D"
@@ -56,37 +58,29 @@ _UNSCENTED = re.compile(r"\b3dgr?ut\b|\b3dgrt\b|\bunscented", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class PlyProperty:
-    """Property of an element; `kind` and `length_kind` (for lists only) are NumPy type codes such as f4."""
-
-    name: str
-    kind: str
-    length_kind: str | None = None
-
-
-@dataclass(frozen=True)
 class PlyElement:
-    """Element with its properties; `count_span` is the (start, end) of its count in the bytes of the header."""
+    """Element of a PLY.
+
+    Attributes:
+        name: Name.
+        count: Number of rows.
+        count_span: Start and end of the count in the bytes of the header.
+        byte_order: That of the header.
+        kinds: NumPy type codes such as f4, by property; those of the items of a list.
+        lists: NumPy type codes of the lengths of lists, by property. Rows with lists differ in length.
+    """
 
     name: str
     count: int
     count_span: tuple[int, int]
-    properties: tuple[PlyProperty, ...] = ()
+    byte_order: str
+    kinds: dict[str, str] = field(default_factory=dict)
+    lists: dict[str, str] = field(default_factory=dict)
 
     @property
-    def has_lists(self) -> bool:
-        """Return whether the element has list properties, so that its rows differ in length."""
-        return any(prop.length_kind for prop in self.properties)
-
-    def dtype(self, byte_order: str) -> np.dtype:
+    def dtype(self) -> np.dtype:
         """Return the dtype of a row in a binary file; only for elements without lists."""
-        return np.dtype([(prop.name, byte_order + prop.kind) for prop in self.properties])
-
-    def min_row_bytes(self, text: bool) -> int:
-        """Return the minimum bytes of a row. Text values have at least a digit and a separator; lists may be empty."""
-        if text:
-            return 2 * len(self.properties)
-        return sum(np.dtype(prop.length_kind or prop.kind).itemsize for prop in self.properties)
+        return np.dtype([(name, self.byte_order + kind) for name, kind in self.kinds.items()])
 
 
 @dataclass(frozen=True)
@@ -126,7 +120,7 @@ class PlyHeader:
     @property
     def has_double_positions(self) -> bool:
         """Return whether positions are stored in double precision."""
-        return any((prop.name, prop.kind) == ("x", "f8") for prop in self.vertex.properties)
+        return self.vertex.kinds.get("x") == "f8"
 
     @property
     def vertex(self) -> PlyElement:
@@ -146,7 +140,7 @@ def read_header(file: FileStart) -> PlyHeader:
     Raises:
         SceneError: If the file cannot be read, has no PLY header, or its header has an invalid line.
     """
-    path, start = file.path, file.read(0, MAX_HEADER_BYTES)
+    path, start = file.path, read_bytes(file.path, 0, MAX_HEADER_BYTES)
     opening = re.match(rb"ply(\r\n|\n|\r)", start)
     if not opening:
         raise SceneError(f"{path}: has no PLY header (it does not start with 'ply'). Give a 3DGS scene as .ply file.")
@@ -160,7 +154,7 @@ def read_header(file: FileStart) -> PlyHeader:
 
 def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
     byte_order: str | None = None
-    elements: list[tuple[str, int, tuple[int, int], dict[str, PlyProperty]]] = []
+    elements: list[PlyElement] = []
     position = 0
     for number, line in enumerate(raw.split(newline), start=1):
         words = [word.decode("latin-1") for word in line.split()]
@@ -174,37 +168,29 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
             # 18 digits are more than any file needs, and stay below the limit of int() on long strings
             case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count) and byte_order is not None:
                 stop = position + len(line.rstrip())
-                elements.append((name, int(count), (stop - len(count), stop), {}))
-            case ["property", *definition] if elements and (prop := _property(definition)):
-                element, _, _, properties = elements[-1]
-                if prop.name in properties:
+                elements.append(PlyElement(name, int(count), (stop - len(count), stop), byte_order))
+            case ["property", *lengths, kind, name] if elements and kind in _TYPES and lengths in _LENGTHS:
+                last = elements[-1]
+                if name in last.kinds:
                     raise SceneError(
-                        f"{path}: the PLY header declares {element}.{prop.name} twice. Export the scene again."
+                        f"{path}: the PLY header declares {last.name}.{name} twice. Export the scene again."
                     )
-                properties[prop.name] = prop
+                last.kinds[name] = _TYPES[kind]
+                if lengths:
+                    last.lists[name] = _TYPES[lengths[1]]
             case _:
                 shown = line[:80].decode("latin-1")
                 raise SceneError(f"{path}: line {number} of the PLY header is invalid: {shown!r}. Export it again.")
         position += len(line) + len(newline)
     if byte_order is None:
         raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")
-    parsed = tuple(PlyElement(name, count, span, tuple(props.values())) for name, count, span, props in elements)
-    uses = Counter(each.name for each in parsed)
-    for each in parsed:
+    uses = Counter(each.name for each in elements)
+    for each in elements:
         if uses[each.name] > 1:
             raise SceneError(f"{path}: the PLY header declares element {each.name!r} twice. Export the scene again.")
-        if each.count and not each.properties:
+        if each.count and not each.kinds:
             raise SceneError(f"{path}: element {each.name!r} of the PLY header has no property. Export it again.")
-    return PlyHeader(byte_order, raw, parsed)
-
-
-def _property(definition: list[str]) -> PlyProperty | None:
-    match definition:
-        case ["list", length, kind, name] if length in _TYPES and kind in _TYPES and _TYPES[length][0] != "f":
-            return PlyProperty(name, _TYPES[kind], _TYPES[length])
-        case [kind, name] if kind in _TYPES:
-            return PlyProperty(name, _TYPES[kind])
-    return None
+    return PlyHeader(byte_order, raw, tuple(elements))
 
 
 def check_length(path: Path, header: PlyHeader) -> None:
@@ -213,7 +199,10 @@ def check_length(path: Path, header: PlyHeader) -> None:
     Raises:
         SceneError: If the file is shorter than declared.
     """
-    least = sum(element.count * element.min_row_bytes(header.text) for element in header.elements)
+    least = 0
+    for element in header.elements:  # text values have at least a digit and a separator; lists may be empty
+        sizes = [np.dtype(kind).itemsize for kind in {**element.kinds, **element.lists}.values()]
+        least += element.count * (2 * len(sizes) if header.text else sum(sizes))
     data = path.stat().st_size - len(header.raw)
     if least - (1 if header.text else 0) > data:  # the last line may lack its line end
         declared = ", ".join(f"{element.count} {element.name}" for element in header.elements)
@@ -235,8 +224,8 @@ def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
     return {} if header.text else dict(zip(header.names, _bounds(path, header), strict=False))
 
 
-def surplus(path: Path, header: PlyHeader) -> str:
-    """Return the note on what follows the last element of a file; empty if nothing does but padding.
+def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
+    """Return the note on what follows the last element of a file; nothing if only padding does.
 
     Raises:
         SceneError: If the file was probably transferred as text, or is shorter than declared.
@@ -246,11 +235,11 @@ def surplus(path: Path, header: PlyHeader) -> str:
             lines.seek(len(header.raw))
             rows = sum(1 for line in lines if line.strip(" \t\r\n\x1a"))
         rows -= sum(element.count for element in header.elements)
-        return about_surplus(number_of(rows, "row")) if rows > 0 else ""
+        return about_surplus(max(0, rows), "row")
     end, size = _bounds(path, header)[-1], path.stat().st_size
     refuse_text_transfer(path, len(header.raw), header.newline, end, size)
     last = header.elements[-1]
-    return surplus_note(path, end, size, None if last.has_lists else last.dtype(header.byte_order).itemsize)
+    return about_part(path, end, size, None if last.lists else last.dtype.itemsize)
 
 
 def _bounds(path: Path, header: PlyHeader) -> list[int]:
@@ -258,28 +247,28 @@ def _bounds(path: Path, header: PlyHeader) -> list[int]:
     size, position = path.stat().st_size, len(header.raw)
     bounds = [position]
     for element in header.elements:
-        if element.has_lists and element.count:
-            position = _end_of_lists(path, element, header.byte_order, position)
+        if element.lists and element.count:
+            position = _end_of_lists(path, element, position)
         elif element.count:
-            position += element.count * element.dtype(header.byte_order).itemsize
+            position += element.count * element.dtype.itemsize
         if position > size:
             raise _truncated(path, element)
         bounds.append(position)
     return bounds
 
 
-def _end_of_lists(path: Path, element: PlyElement, byte_order: str, position: int) -> int:
+def _end_of_lists(path: Path, element: PlyElement, position: int) -> int:
     """Return the byte offset at which an element with lists ends.
 
     The length of each list is read, and checked against the size of the file.
     """
     steps = [
-        (struct.Struct(byte_order + np.dtype(prop.length_kind).char) if prop.length_kind else None, np.dtype(prop.kind))
-        for prop in element.properties
+        (struct.Struct(element.byte_order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
+        for kind, length in ((kind, element.lists.get(name)) for name, kind in element.kinds.items())
     ]
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         for _ in range(element.count):
-            for length, kind in steps:
+            for length, item_bytes in steps:
                 items = 1
                 if length is not None:
                     if position + length.size > len(data):
@@ -288,7 +277,7 @@ def _end_of_lists(path: Path, element: PlyElement, byte_order: str, position: in
                     if items < 0:
                         raise SceneError(f"{path}: element {element.name!r} holds a list of length {items}: corrupt.")
                     position += length.size
-                position += items * kind.itemsize
+                position += items * item_bytes
         return position
 
 
@@ -301,7 +290,7 @@ def _truncated(path: Path, element: PlyElement) -> SceneError:
 
 def ply_tag(header: PlyHeader) -> RenderTag:
     """Return the render mode that the comments and properties of a PLY state; the last comment counts."""
-    names = {prop.name for prop in header.vertex.properties}
+    names = header.vertex.kinds
     mode, eps2d, reasons, warnings = None, None, [], []
     for comment in header.comments:
         if match := _MODE.fullmatch(comment):

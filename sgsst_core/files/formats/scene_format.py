@@ -61,7 +61,6 @@ class FileStart:
     """Beginning of a file.
 
     Attributes:
-        path: Path of the file.
         head: First bytes, at most `HEAD_BYTES`.
         size: Size of the file in bytes.
     """
@@ -69,19 +68,6 @@ class FileStart:
     path: Path
     head: bytes
     size: int
-
-    def read(self, offset: int, count: int) -> bytes:
-        """Return `count` bytes from `offset` on, or those that are left.
-
-        Raises:
-            SceneError: If the file cannot be read.
-        """
-        try:
-            with self.path.open("rb") as file:
-                file.seek(offset)
-                return file.read(count)
-        except OSError as error:
-            raise SceneError(f"{self.path}: cannot be read: {error.strerror}. Check the path.") from error
 
 
 class OpenScene(Protocol):
@@ -122,11 +108,11 @@ class SceneFormat:
     Attributes:
         name: File name suffix without its first dot. It is also the name in options, reports and the REST API.
         title: Name of the format in messages.
+        bytes_per_gaussian: Typical size of a Gaussian of SH degree 3 in a file.
         matches: Check whether the content of a file has this format.
         read_header: Header check: reads the header without allocating memory for the data, and compares it with the
             size of the file. Raises a SceneError if the header is wrong or the file is truncated. It runs in the API
             process.
-        bytes_per_gaussian: Typical size of a Gaussian of SH degree 3 in a file.
         read: Reader. It fills arrays that were allocated by the header, and may return further notes. It need not check
             for non-finite values. None for PLY, which `scene_file` reads, because its other data is written back.
         write: Writer of a scene's arrays and its render mode, if the format can state one. It raises an OutputError
@@ -138,9 +124,9 @@ class SceneFormat:
 
     name: str
     title: str
+    bytes_per_gaussian: int
     matches: Callable[[FileStart], bool]
     read_header: Callable[[FileStart], SceneHeader]
-    bytes_per_gaussian: int
     read: Callable[[OpenScene, SceneHeader, Arrays], tuple[str, ...] | None] | None = None
     write: Callable[[BinaryIO, Arrays, Rendering], None] | None = None
     shown: bool = False
@@ -227,9 +213,24 @@ def read_rows(file: OpenScene, kind: np.dtype, offset: int, count: int) -> NDArr
     return data.view(kind)
 
 
-def is_padding(data: bytes) -> bool:
-    """Return whether bytes after the data of a scene mean nothing."""
-    return len(data) <= _MAX_PADDING and not data.strip(_PADDING)
+def row_blocks(file: OpenScene, kind: np.dtype, offset: int, count: int) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """Yield `count` rows of a dtype from a byte offset on, block by block, with the slice of their Gaussians."""
+    for block in blocks(count):
+        yield block, read_rows(file, kind, offset + block.start * kind.itemsize, block.stop - block.start)
+
+
+def read_bytes(path: Path, start: int, end: int) -> bytes:
+    """Return the bytes of a part of a file, or those that are left.
+
+    Raises:
+        SceneError: If the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            file.seek(start)
+            return file.read(end - start)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
 
 
 def number_of(count: int, unit: str) -> str:
@@ -237,13 +238,20 @@ def number_of(count: int, unit: str) -> str:
     return f"{count} {unit}" + "s" * (count != 1)
 
 
-def about_surplus(surplus: str) -> str:
-    """Return the note on content that a header does not declare, such as "12 bytes"."""
-    return f"the file has {surplus} more than its header declares, which are not read; copy or export it again"
+def about_surplus(count: int, unit: str, also: str = "") -> tuple[str, ...]:
+    """Return the note on content that a header does not declare, such as 12 bytes; nothing if there is none."""
+    surplus = f"{number_of(count, unit)}{also}"
+    note = f"the file has {surplus} more than its header declares, which are not read; copy or export it again"
+    return (note,) if count else ()
 
 
-def surplus_note(path: Path, start: int, end: int, row_bytes: int | None = None) -> str:
-    """Return the note on a part of a file that its header does not declare; empty if there is only padding.
+def without_padding(data: bytes) -> bytes:
+    """Return bytes after the data of a scene; nothing if they mean nothing."""
+    return data if len(data) > _MAX_PADDING or data.strip(_PADDING) else b""
+
+
+def about_part(path: Path, start: int, end: int, row_bytes: int | None = None) -> tuple[str, ...]:
+    """Return the note on a part of a file that its header does not declare; nothing if there is only padding.
 
     Args:
         path: Path of the file.
@@ -251,12 +259,10 @@ def surplus_note(path: Path, start: int, end: int, row_bytes: int | None = None)
         end: Byte offset of its end.
         row_bytes: Size of a row before the part; None if rows differ in size.
     """
-    if start >= end or is_padding(_bytes(path, start, min(end, start + _MAX_PADDING + 1))):
-        return ""
-    surplus = number_of(end - start, "byte")
-    if row_bytes and (end - start) % row_bytes == 0:
-        surplus += f" ({number_of((end - start) // row_bytes, 'row')})"
-    return about_surplus(surplus)
+    if start >= end or not without_padding(read_bytes(path, start, min(end, start + _MAX_PADDING + 1))):
+        return ()
+    rows = row_bytes and (end - start) % row_bytes == 0
+    return about_surplus(end - start, "byte", f" ({number_of((end - start) // row_bytes, 'row')})" if rows else "")
 
 
 def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: int, end: int) -> None:
@@ -271,10 +277,10 @@ def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: i
     """
     if start >= end:
         return
-    data = _bytes(path, header_bytes, min(start, header_bytes + _SAMPLE_BYTES))
+    data = read_bytes(path, header_bytes, min(start, header_bytes + _SAMPLE_BYTES))
     line_ends = data.count(b"\n")
     changed = newline == b"\r\n" or (line_ends == data.count(b"\r\n") and line_ends >= _MIN_LINE_ENDS)
-    blank = not _bytes(path, start, min(end, start + _MAX_PADDING)).strip(_BLANKS)
+    blank = not read_bytes(path, start, min(end, start + _MAX_PADDING)).strip(_BLANKS)
     if (changed and not blank) or _is_utf8(data):
         surplus = number_of(end - start, "byte")
         raise SceneError(
@@ -289,10 +295,3 @@ def _is_utf8(data: bytes) -> bool:
         return not codecs.getincrementaldecoder("utf-8")().decode(data).isascii()
     except UnicodeDecodeError:
         return False
-
-
-def _bytes(path: Path, start: int, end: int) -> bytes:
-    """Return the bytes of a part of a file."""
-    with path.open("rb") as file:
-        file.seek(start)
-        return file.read(end - start)

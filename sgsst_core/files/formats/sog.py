@@ -19,7 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
@@ -49,9 +49,9 @@ from sgsst_core.files.formats.scene_format import (
     blocks,
     extras_of,
     extras_tag,
-    is_padding,
     json_numbers,
-    number_of,
+    read_bytes,
+    without_padding,
 )
 from sgsst_core.scene.rendering import Rendering
 
@@ -118,19 +118,26 @@ class SogHeader(SceneHeader):
 
 
 class _Files:
-    """Files of a SOG scene: those of an archive, or those beside meta.json."""
+    """Files of a SOG scene: those of an archive, or those beside meta.json.
+
+    Attributes:
+        path: Path of the archive or of meta.json.
+        surplus: Note on bytes before or after the archive.
+    """
 
     def __init__(self, path: Path) -> None:
-        with path.open("rb") as file:
-            self._archived = file.read(4) == _ZIP_MAGIC
-        self._path = path
-        self.meta = META_NAME if self._archived else path.name
-        self.surplus = _check_end(path) if self._archived else ""
+        self._archived = read_bytes(path, 0, 4) == _ZIP_MAGIC
+        self.path = path
+        self.surplus = _check_end(path) if self._archived else ()
+
+    def meta(self) -> bytes:
+        """Return the content of meta.json."""
+        return self.load(META_NAME if self._archived else self.path.name, _MAX_META_BYTES)
 
     def size(self, name: str) -> int:
         """Return an upper bound for the bytes of a file: its size, or that of the archive, whose list may be wrong."""
         try:
-            return (self._path if self._archived else self._path.with_name(name)).stat().st_size
+            return (self.path if self._archived else self.path.with_name(name)).stat().st_size
         except OSError as error:
             raise self._unreadable(name, error) from error
 
@@ -141,40 +148,74 @@ class _Files:
                 data = file.read(limit + whole)
         except KeyError as error:
             raise SceneError(
-                f"{self._path}: is a ZIP archive without {name}, so no SOG scene. Unpack it, and give the scene in it."
+                f"{self.path}: is a ZIP archive without {name}, so no SOG scene. Unpack it, and give the scene in it."
             ) from error
         except OSError as error:
             raise self._unreadable(name, error) from error
         except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, struct.error) as error:
-            raise SceneError(f"{self._path}: {name} is damaged: {error}. Copy or export the scene again.") from error
+            raise SceneError(f"{self.path}: {name} is damaged: {error}. Copy or export the scene again.") from error
         if len(data) > limit:
             raise SceneError(
-                f"{self._path}: {name} has more than {limit} bytes, too many for this scene. Export it again."
+                f"{self.path}: {name} has more than {limit} bytes, too many for this scene. Export it again."
             )
         return data
 
     def _unreadable(self, name: str, error: OSError) -> SceneError:
-        return SceneError(f"{self._path}: {name} cannot be read: {error.strerror}. Give the whole folder, or a .sog.")
+        return SceneError(f"{self.path}: {name} cannot be read: {error.strerror}. Give the whole folder, or a .sog.")
 
     @contextmanager
     def _open(self, name: str) -> Iterator[IO[bytes]]:
         if not self._archived:
-            with self._path.with_name(name).open("rb") as file:
+            with self.path.with_name(name).open("rb") as file:
                 yield file
             return
-        with zipfile.ZipFile(self._path) as archive:
+        with zipfile.ZipFile(self.path) as archive:
             if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise zipfile.BadZipFile("its compression is not supported")
             with archive.open(name) as member:
                 yield member
 
+    def dimensions(self, name: str, least: int, most: int | None = None) -> tuple[int, int]:
+        """Return width and height of a WebP image, from its first bytes alone.
 
-def _check_end(path: Path) -> str:
-    """Check the end of an archive, before its list of files is read into memory.
+        Args:
+            name: Name of the image.
+            least: Minimum number of pixels.
+            most: Maximum number of pixels; None for the largest image that a writer would create for `least` Gaussians.
+        """
+        head = self.load(name, 30, whole=False).ljust(30, b"\0")
+        kind, size = head[12:16], None
+        if kind == b"VP8L":
+            bits = int.from_bytes(head[21:25], "little")
+            size = (bits & 16383) + 1, (bits >> 14 & 16383) + 1
+        elif kind == b"VP8X":
+            size = int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
+        if size is None or head[:4] != b"RIFF" or head[8:12] != b"WEBP":
+            raise SceneError(f"{self.path}: {name} is not a lossless WebP image. Export the scene again.")
+        if not least <= size[0] * size[1] <= (_PIXELS_PER_GAUSSIAN * least + _MORE_PIXELS if most is None else most):
+            raise SceneError(
+                f"{self.path}: {name} has {size[0]} x {size[1]} pixels, which do not fit {least} Gaussians: meta.json "
+                "or the image is wrong. Export the scene again."
+            )
+        return size
 
-    Returns:
-        The note on bytes before or after the archive; empty if there are none.
-    """
+    def pixels(self, name: str, least: int, most: int | None = None) -> NDArray[np.uint8]:
+        """Return an image [height, width, 4] uint8. Arguments are those of `dimensions`."""
+        size = self.dimensions(name, least, most)
+        data = self.load(name, 4 * size[0] * size[1] + _IMAGE_OVERHEAD)
+        try:
+            with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+                if image.size != size or getattr(image, "n_frames", 1) != 1:
+                    raise ValueError("it is animated, or its sizes differ")
+                return np.asarray(image.convert("RGBA"))
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            raise SceneError(
+                f"{self.path}: {name} is not a readable WebP image: {error}. Export the scene again."
+            ) from error
+
+
+def _check_end(path: Path) -> tuple[str, ...]:
+    """Check the end of an archive before its list of files is read, and return the note on bytes around the archive."""
     with path.open("rb") as file:
         size = file.seek(0, io.SEEK_END)
         file.seek(max(0, size - _LOCATOR_BYTES - _END.size - _MAX_COMMENT_BYTES))
@@ -190,9 +231,8 @@ def _check_end(path: Path) -> str:
     ):
         raise SceneError(f"{path}: is a ZIP archive of {entries} files, so no SOG scene. Unpack it first.")
     before = size - len(tail) + position - list_bytes - list_offset
-    after = tail[position + _END.size + comment_bytes :]
-    surplus = max(0, before) + (0 if is_padding(after) else len(after))
-    return about_surplus(number_of(surplus, "byte")) if surplus else ""
+    after = without_padding(tail[position + _END.size + comment_bytes :])
+    return about_surplus(max(0, before) + len(after), "byte")
 
 
 def _matches(start: FileStart) -> bool:
@@ -203,29 +243,29 @@ def _matches(start: FileStart) -> bool:
 
 def _read_header(start: FileStart) -> SogHeader:
     files = _Files(start.path)
-    text = files.load(files.meta, _MAX_META_BYTES)
+    text = files.meta()
     try:
-        header = _parsed(start.path, files, json.loads(text))
+        header = _parsed(files, json.loads(text))
     except _WRONG_META as error:
         raise SceneError(
             f"{start.path}: meta.json is not that of a SOG scene ({repr(error)[:200]}). Export the scene again."
         ) from error
     name = header.names["means"][0]
-    _dimensions(start.path, files, name, header.count)
+    files.dimensions(name, header.count)
     if header.count > _GAUSSIANS_PER_BYTE * files.size(name):
         raise SceneError(
             f"{start.path}: meta.json declares {header.count} Gaussians, more than {files.size(name)} bytes can hold: "
             "the file is truncated or meta.json is wrong. Copy or export the scene again."
         )
-    return replace(header, notes=(*header.notes, files.surplus)) if files.surplus else header
+    return header
 
 
-def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
+def _parsed(files: _Files, meta: dict[str, Any]) -> SogHeader:
     """Parse meta.json. Errors of `_WRONG_META` mean that a value is missing or wrong."""
     version = meta.get("version", 1)
     if version not in (1, 2):
         raise SceneError(
-            f"{path}: is SOG of version {str(version)[:20]}, which cannot be read. {converted('scene.sog')}"
+            f"{files.path}: is SOG of version {str(version)[:20]}, which cannot be read. {converted('scene.sog')}"
         )
     names = {name: meta[name]["files"] for name in _IMAGES if name in meta or name != "shN"}
     for name, own in names.items():
@@ -240,7 +280,7 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
     opacities = OPACITY_LOGITS if version == 2 else colors[3]
     coefficients, harmonics = 0, None
     if "shN" in names:
-        width, _ = _dimensions(path, files, names["shN"][0], 1, _PALETTE_PIXELS)
+        width, _ = files.dimensions(names["shN"][0], 1, _PALETTE_PIXELS)
         if width not in _COEFFICIENTS_BY_WIDTH:
             raise ValueError(f"width of {names['shN'][0]}: {width}")
         coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"], 1)[0]
@@ -248,7 +288,8 @@ def _parsed(path: Path, files: _Files, meta: dict[str, Any]) -> SogHeader:
             raise ValueError(f"bands: {meta['shN']['bands']} with {coefficients} coefficients")
     extras = meta["extras"] if isinstance(meta.get("extras"), dict) else {}
     tag = extras_tag({**extras, "model": meta.get("model", "default")}, "meta.json")
-    return SogHeader(SOG, count, coefficients, names, bounds, scales[:3], colors[:3], opacities, harmonics, tag=tag)
+    bytes_of = (scales[:3], colors[:3], opacities, harmonics)
+    return SogHeader(SOG, count, coefficients, names, bounds, *bytes_of, notes=files.surplus, tag=tag)
 
 
 def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
@@ -274,53 +315,13 @@ def _steps(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
         return low + (high - low) * (np.arange(VALUES) / 255)
 
 
-def _dimensions(path: Path, files: _Files, name: str, least: int, most: int | None = None) -> tuple[int, int]:
-    """Return width and height of a WebP image, from its first bytes alone.
-
-    Args:
-        path: Path of the scene, for messages.
-        files: Files of the scene.
-        name: Name of the image.
-        least: Minimum number of pixels.
-        most: Maximum number of pixels; None for the largest image that a writer would create for `least` Gaussians.
-    """
-    head = files.load(name, 30, whole=False).ljust(30, b"\0")
-    kind, size = head[12:16], None
-    if kind == b"VP8L":
-        bits = int.from_bytes(head[21:25], "little")
-        size = (bits & 16383) + 1, (bits >> 14 & 16383) + 1
-    elif kind == b"VP8X":
-        size = int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
-    if size is None or head[:4] != b"RIFF" or head[8:12] != b"WEBP":
-        raise SceneError(f"{path}: {name} is not a lossless WebP image. Export the scene again.")
-    if not least <= size[0] * size[1] <= (_PIXELS_PER_GAUSSIAN * least + _MORE_PIXELS if most is None else most):
-        raise SceneError(
-            f"{path}: {name} has {size[0]} x {size[1]} pixels, which do not fit {least} Gaussians: meta.json or the "
-            "image is wrong. Export the scene again."
-        )
-    return size
-
-
-def _pixels(path: Path, files: _Files, name: str, least: int, most: int | None = None) -> NDArray[np.uint8]:
-    """Return an image [height, width, 4] uint8. Arguments are those of `_dimensions`."""
-    size = _dimensions(path, files, name, least, most)
-    data = files.load(name, 4 * size[0] * size[1] + _IMAGE_OVERHEAD)
-    try:
-        with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-            if image.size != size or getattr(image, "n_frames", 1) != 1:
-                raise ValueError("it is animated, or its sizes differ")
-            return np.asarray(image.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise SceneError(f"{path}: {name} is not a readable WebP image: {error}. Export the scene again.") from error
-
-
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
     """Fill the arrays of a scene, and return the note on pixels after the last Gaussian that are no padding."""
     assert isinstance(header, SogHeader)
     path, files = file.path, _Files(file.path)
 
     def whole(name: str, index: int = 0) -> NDArray[np.uint8]:
-        return _pixels(path, files, header.names[name][index], header.count).reshape(-1, 4)
+        return files.pixels(header.names[name][index], header.count).reshape(-1, 4)
 
     def image(name: str, index: int = 0) -> NDArray[np.uint8]:
         return whole(name, index)[: header.count]
@@ -346,7 +347,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
             into["sh_dc"][:, axis] = header.colors[axis].astype(np.float32)[colors[:, axis]]
         into["opacities"][:] = header.opacities.astype(np.float32)[colors[:, 3]]
         if header.harmonics is not None:
-            vectors = _pixels(path, files, header.names["shN"][0], 1, _PALETTE_PIXELS)[..., :3]
+            vectors = files.pixels(header.names["shN"][0], 1, _PALETTE_PIXELS)[..., :3]
             colors_of = header.harmonics.astype(np.float32)[vectors.reshape(-1, header.coefficients, 3)]
             labels = image("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
             if labels.max() >= len(colors_of):
@@ -355,7 +356,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
                     "scene again."
                 )
             into["sh_rest"][:] = colors_of[labels]
-    return (about_surplus(number_of(surplus, "Gaussian")),) if surplus else ()
+    return about_surplus(surplus, "Gaussian")
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
@@ -434,13 +435,4 @@ def _webp(pixels: NDArray[np.uint8], width: int) -> bytes:
     return file.getvalue()
 
 
-SOG = SceneFormat(
-    name="sog",
-    title="SOG",
-    matches=_matches,
-    read_header=_read_header,
-    bytes_per_gaussian=14,
-    read=_read,
-    write=_write,
-    magic=_ZIP_MAGIC,
-)
+SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write, magic=_ZIP_MAGIC)

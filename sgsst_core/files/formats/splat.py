@@ -16,8 +16,7 @@ from sgsst_core.files.formats.scene_format import (
     OpenScene,
     SceneFormat,
     SceneHeader,
-    blocks,
-    read_rows,
+    row_blocks,
 )
 from sgsst_core.files.formats.units import logarithms
 
@@ -50,8 +49,7 @@ def _read_header(start: FileStart) -> SceneHeader:
 
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     """Fill the arrays of a scene. A standard deviation of 0 becomes a log scale of minus infinity."""
-    for block in blocks(header.count):
-        rows = read_rows(file, ROW, block.start * ROW.itemsize, block.stop - block.start)
+    for block, rows in row_blocks(file, ROW, 0, header.count):
         into["means"][block] = rows["position"]
         into["scales"][block] = logarithms(file.path, rows["scale"].astype(np.float64))
         into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
@@ -59,12 +57,4 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
         into["quats"][block] = (rows["rotation"].astype(np.float64) - 128) / 128
 
 
-SPLAT = SceneFormat(
-    name="splat",
-    title=".splat",
-    matches=_matches,
-    read_header=_read_header,
-    bytes_per_gaussian=32,
-    read=_read,
-    shown=True,
-)
+SPLAT = SceneFormat("splat", ".splat", 32, _matches, _read_header, _read, shown=True)

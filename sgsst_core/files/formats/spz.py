@@ -17,10 +17,11 @@ extension records, so the flag counts only in other files.
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -42,13 +43,14 @@ from sgsst_core.files.formats.scene_format import (
     RenderTag,
     SceneFormat,
     SceneHeader,
+    about_part,
     about_surplus,
     blocks,
-    is_padding,
     number_of,
+    read_bytes,
     read_rows,
     stated,
-    surplus_note,
+    without_padding,
 )
 from sgsst_core.scene.rendering import Rendering
 
@@ -120,7 +122,7 @@ class SpzHeader(SceneHeader):
         streams: Byte offsets and sizes of the streams of version 4, one per section that is not empty. Empty for other
             versions, which have one stream.
         zipped: Whether the stream of version 1 to 3 is compressed by gzip.
-        extended: Whether extension records follow the Gaussians of version 1 to 3.
+        extended: Whether there are extension records; they follow the Gaussians of version 1 to 3.
         stated_axes: Axes that a file of version 4 states; None if it does not, and for other versions.
         axes: Requested axes.
     """
@@ -136,6 +138,11 @@ class SpzHeader(SceneHeader):
     stated_axes: Axes | None = None
     axes: SpzAxes = "auto"
 
+    @property
+    def may_state_axes(self) -> bool:
+        """Return whether the file states its axes, or may state them after the Gaussians."""
+        return self.stated_axes is not None or (self.extended and not self.streams)
+
 
 def _is_version_4(start: FileStart) -> bool:
     """Return whether a file is SPZ of version 4, or of one that cannot be read."""
@@ -149,7 +156,7 @@ def _is_old_version(start: FileStart) -> bool:
 
 def _old_header(file_start: FileStart) -> SpzHeader:
     """Read the header of version 1 to 3, which stores header and sections in one stream."""
-    path, head, size = file_start.path, file_start.head, file_start.size
+    path, head = file_start.path, file_start.head
     zipped = head.startswith(_GZIP_MAGIC)
     try:
         start = zlib.decompressobj(31).decompress(head, 16) if zipped else head[:16]
@@ -157,75 +164,45 @@ def _old_header(file_start: FileStart) -> SpzHeader:
         raise SceneError(f"{path}: is a damaged gzip file: {error}. Copy or export it again.") from error
     if not start.startswith(_MAGIC):
         raise SceneError(f"{path}: is a gzip file, but no SPZ scene. Unpack it first (gunzip), and give what is in it.")
-    version, count, degree, fractional_bits, sections = _shared_fields(path, start, (1, 2, 3))
-    needed = 16 + sum(sections)
-    if needed > (_DEFLATE_RATIO if zipped else 1) * size:
+    header = _shared_fields(file_start, start, (1, 2, 3))
+    needed = 16 + sum(header.sections)
+    if needed > (_DEFLATE_RATIO if zipped else 1) * header.size:
         raise SceneError(
-            f"{path}: the header declares {count} Gaussians, which take {needed} bytes, more than the file's {size} "
-            "bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
+            f"{path}: the header declares {header.count} Gaussians, which take {needed} bytes, more than the file's "
+            f"{header.size} bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
         )
-    extended = bool(start[14] & _HAS_EXTENSIONS)
-    drawn = COEFFICIENTS[min(degree, 3)]
-    return SpzHeader(
-        SPZ_3,
-        count,
-        drawn,
-        size,
-        version,
-        degree,
-        fractional_bits,
-        sections,
-        zipped=zipped,
-        extended=extended,
-        tag=_tag(start[14], believed=extended),
-    )
+    return replace(header, format=SPZ_3, zipped=zipped, tag=_tag(start[14], believed=header.extended))
 
 
 def _zstd_header(file_start: FileStart) -> SpzHeader:
     """Read the header of version 4, which is uncompressed and followed by one zstd stream per section."""
     path, head, size = file_start.path, file_start.head, file_start.size
-    version, count, degree, fractional_bits, sections = _shared_fields(path, head, (4,))
+    header = _shared_fields(file_start, head, (4,))
     if len(head) < 32:
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
     number, table = head[15], int.from_bytes(head[16:20], "little")
-    expected = [section for section in sections if section]
+    expected = [section for section in header.sections if section]
     if number != len(expected) or table < 32 or table + 16 * number > size:
         raise SceneError(
             f"{path}: the SPZ header declares {number} streams with their table at byte {table}; expected "
             f"{len(expected)} streams in {size} bytes. The file is truncated or its header is wrong. Copy it again."
         )
-    with path.open("rb") as file:
-        file.seek(32)
-        gap = file.read(min(table - 32, _EXTENSION_BYTES))
-        records = gap if head[14] & _HAS_EXTENSIONS else b""
-        axes = _stated_axes(path, records)
-        file.seek(table)
-        listed = list(struct.iter_unpack("<QQ", file.read(16 * number)))
-    streams, position = [], table + 16 * number
+    extensions = _Extensions.of(read_bytes(path, 32, min(table, 32 + _EXTENSION_BYTES)), header)
+    axes = extensions.axes(path)
+    position = table + 16 * number
+    streams, listed = [], list(struct.iter_unpack("<QQ", read_bytes(path, table, position)))
     for (compressed, decompressed), wanted in zip(listed, expected, strict=True):
         if decompressed != wanted or position + compressed > size or wanted > _ZSTD_RATIO * compressed:
             raise SceneError(
                 f"{path}: the SPZ header declares a stream of {compressed} bytes that become {decompressed}; {wanted} "
-                f"belong to {count} Gaussians, and {size - position} bytes are left. The file is truncated or its "
-                "header is wrong. Copy or export it again."
+                f"belong to {header.count} Gaussians, and {size - position} bytes are left. The file is truncated or "
+                "its header is wrong. Copy or export it again."
             )
         streams.append((position, compressed))
         position += compressed
-    surplus = (_about_rest(gap, records), surplus_note(path, position, size))
-    return SpzHeader(
-        SPZ,
-        count,
-        COEFFICIENTS[min(degree, 3)],
-        size,
-        version,
-        degree,
-        fractional_bits,
-        sections,
-        tuple(streams),
-        stated_axes=axes,
-        notes=(*_notes(degree, records), *filter(None, surplus)),
-        tag=_tag(head[14], believed=True),
-    )
+    notes = (*extensions.notes(header.degree), *about_part(path, position, size))
+    tag = _tag(head[14], believed=True)
+    return replace(header, streams=tuple(streams), stated_axes=axes, notes=notes, tag=tag)
 
 
 def _tag(flags: int, *, believed: bool) -> RenderTag:
@@ -241,54 +218,55 @@ def _tag(flags: int, *, believed: bool) -> RenderTag:
     return RenderTag(warnings=(("classic", reason),))
 
 
-def _extension_records(data: bytes) -> list[tuple[int, bytes]]:
-    """Return type and content of each complete extension record.
+@dataclass(frozen=True)
+class _Extensions:
+    """Extension records of a file.
 
-    A record is its type (uint32), its length in bytes (uint32) and its content.
+    Attributes:
+        records: Type and content of each complete record.
+        rest: Bytes in place of records, or after them; empty if there is only padding.
     """
-    records, position = [], 0
-    while position + 8 <= len(data):
-        kind, length = struct.unpack_from("<II", data, position)
-        position += 8 + length
-        if position <= len(data):
+
+    records: list[tuple[int, bytes]]
+    rest: bytes
+
+    @staticmethod
+    def of(data: bytes, spz: SpzHeader) -> _Extensions:
+        """Parse records: type (uint32), length in bytes (uint32) and content."""
+        records, position = [], 0
+        while spz.extended and position + 8 <= len(data):
+            kind, length = struct.unpack_from("<II", data, position)
+            if position + 8 + length > len(data):
+                break
+            position += 8 + length
             records.append((kind, data[position - length : position]))
-    return records
+        return _Extensions(records, without_padding(data[position:]))
+
+    def axes(self, path: Path) -> Axes | None:
+        """Return the stated axes; None if there are none."""
+        for kind, content in self.records:
+            if kind == _AXES_EXTENSION and len(content) >= 4:
+                number = int.from_bytes(content[:4], "little")
+                if number not in _AXES_NUMBERS:
+                    raise SceneError(
+                        f"{path}: has the axes of SPZ's coordinate system {number}; RUB (4) and RDF (6) can be read. "
+                        "Export it with one of these."
+                    )
+                return _AXES_NUMBERS[number]
+        return None
+
+    def notes(self, degree: int) -> tuple[str, ...]:
+        """Return notes on SH bands, extensions and bytes that are not read."""
+        notes = ["SH bands above degree 3 are left out"] if degree > 3 else []
+        unknown = sorted({kind for kind, _ in self.records} - {_AXES_EXTENSION})[:_NOTED_EXTENSIONS]
+        if unknown:
+            notes.append(f"SPZ extensions {', '.join(f'{kind:#x}' for kind in unknown)} are unknown and left out")
+        return (*notes, *about_surplus(len(self.rest), "byte"))
 
 
-def _about_rest(data: bytes, records: bytes) -> str:
-    """Return the note on bytes in place of extension records, or after them; empty if there is only padding."""
-    rest = data[sum(8 + len(content) for _, content in _extension_records(records)) :]
-    return "" if is_padding(rest) else about_surplus(number_of(len(rest), "byte"))
-
-
-def _stated_axes(path: Path, data: bytes) -> Axes | None:
-    """Return the axes that extension records state; None if they do not."""
-    for kind, content in _extension_records(data):
-        if kind == _AXES_EXTENSION and len(content) >= 4:
-            number = int.from_bytes(content[:4], "little")
-            if number not in _AXES_NUMBERS:
-                raise SceneError(
-                    f"{path}: has the axes of SPZ's coordinate system {number}; RUB (4) and RDF (6) can be read. "
-                    "Export it with one of these."
-                )
-            return _AXES_NUMBERS[number]
-    return None
-
-
-def _notes(degree: int, data: bytes) -> tuple[str, ...]:
-    """Return notes on SH bands and extensions that are not read."""
-    notes = ["SH bands above degree 3 are left out"] if degree > 3 else []
-    unknown = sorted({kind for kind, _ in _extension_records(data)} - {_AXES_EXTENSION})[:_NOTED_EXTENSIONS]
-    if unknown:
-        notes.append(f"SPZ extensions {', '.join(f'{kind:#x}' for kind in unknown)} are unknown and left out")
-    return tuple(notes)
-
-
-def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[int, int, int, int, tuple[int, ...]]:
-    """Parse the header fields that all versions share.
-
-    Returns version, number of Gaussians, SH degree, fractional bits, and the decompressed size of each section.
-    """
+def _shared_fields(start: FileStart, head: bytes, versions: tuple[int, ...]) -> SpzHeader:
+    """Parse the header fields that all versions share."""
+    path = start.path
     if len(head) < 16:
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
     version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
@@ -310,7 +288,8 @@ def _shared_fields(path: Path, head: bytes, versions: tuple[int, ...]) -> tuple[
         (3 if version < 3 else 4) * count,
         3 * STORED_COEFFICIENTS[degree] * count,
     )
-    return version, count, degree, fractional_bits, sections
+    drawn, extended = COEFFICIENTS[min(degree, 3)], bool(head[14] & _HAS_EXTENSIONS)
+    return SpzHeader(SPZ, count, drawn, start.size, version, degree, fractional_bits, sections, extended=extended)
 
 
 def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
@@ -333,7 +312,10 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
         ),
     ]
     stream = _Stream(file, spz)
-    takes = _sections_of_streams(path, file, spz) if spz.streams else _sections_of_stream(path, stream, spz)
+    takes: Iterator[Take] = _sections_of_streams(path, file, spz)
+    if not spz.streams:
+        takes = itertools.repeat(partial(_taken, path, stream.read))
+        _taken(path, stream.read, 16)
     for (array, decode), size in zip(decoders, spz.sections, strict=True):
         if not size:
             continue
@@ -342,21 +324,16 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
         for block in blocks(spz.count):
             array[block] = decode(np.frombuffer(take((block.stop - block.start) * row_bytes), np.uint8))
     next(takes, None)  # reach the end of the last stream, where its checksum is verified
-    content, end = (b"", spz.size) if spz.streams else _extensions(path, stream, spz)
-    extensions = content if spz.extended else b""
-    axes = (spz.stated_axes or _stated_axes(path, extensions)) if spz.axes == "auto" else spz.axes
+    axes, notes = spz.stated_axes if spz.axes == "auto" else spz.axes, list[str]()
+    if not spz.streams:
+        extensions, end = _extensions(path, stream, spz)
+        axes = extensions.axes(path) if spz.axes == "auto" else axes
+        notes += [*extensions.notes(spz.degree), *about_part(path, end, spz.size)]
     if axes == "rub":
-        _rotate(into)
-    notes = () if spz.streams else _notes(spz.degree, extensions)
-    surplus = (_about_rest(content, extensions), surplus_note(path, end, spz.size))
-    return (*notes, *filter(None, surplus), *(() if axes else (_ASSUMED_AXES,)))
-
-
-def _rotate(arrays: Arrays) -> None:
-    """Rotate a scene by 180 degrees about x, in place."""
-    arrays["means"] *= _FLIP
-    arrays["quats"] *= _FLIP_QUATS
-    arrays["sh_rest"] *= _FLIP_HARMONICS[: arrays["sh_rest"].shape[1], None]
+        into["means"] *= _FLIP
+        into["quats"] *= _FLIP_QUATS
+        into["sh_rest"] *= _FLIP_HARMONICS[: spz.coefficients, None]
+    return (*notes, *(() if axes else (_ASSUMED_AXES,)))
 
 
 class _Part:
@@ -402,14 +379,7 @@ class _Stream:
         return bytes(content)
 
 
-def _sections_of_stream(path: Path, stream: _Stream, spz: SpzHeader) -> Iterator[Take]:
-    """Yield, for each section of version 1 to 3, a function that reads its bytes."""
-    _taken(path, stream.read, 16)
-    for _ in filter(None, spz.sections):
-        yield partial(_taken, path, stream.read)
-
-
-def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[bytes, int]:
+def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[_Extensions, int]:
     """Return what follows the sections of version 1 to 3, and the byte offset of the end of the stream.
 
     Raises:
@@ -420,10 +390,10 @@ def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[bytes, int
         raise _too_much(path)
     if stream.inflate and not stream.inflate.eof:
         raise _ends_early(path)
-    rest = content[sum(8 + len(each) for _, each in _extension_records(content)) * spz.extended :]
-    if len(rest) >= sum(spz.sections) // spz.count and not is_padding(rest):
-        raise _too_much(path, f" by {number_of(len(rest), 'byte')}")
-    return content, stream.source.position - len(stream.inflate.unused_data if stream.inflate else b"")
+    extensions = _Extensions.of(content, spz)
+    if len(extensions.rest) >= sum(spz.sections) // spz.count:
+        raise _too_much(path, f" by {number_of(len(extensions.rest), 'byte')}")
+    return extensions, stream.source.position - len(stream.inflate.unused_data if stream.inflate else b"")
 
 
 def _sections_of_streams(path: Path, file: OpenScene, spz: SpzHeader) -> Iterator[Take]:
@@ -581,23 +551,5 @@ def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-SPZ = SceneFormat(
-    name="spz",
-    title="SPZ",
-    matches=_is_version_4,
-    read_header=_zstd_header,
-    bytes_per_gaussian=25,
-    read=_read,
-    write=_write,
-    shown=True,
-)
-SPZ_3 = SceneFormat(
-    name="v3.spz",
-    title="SPZ 3",
-    matches=_is_old_version,
-    read_header=_old_header,
-    bytes_per_gaussian=25,
-    read=_read,
-    write=_write_version_3,
-    shown=True,
-)
+SPZ = SceneFormat("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write, shown=True)
+SPZ_3 = SceneFormat("v3.spz", "SPZ 3", 25, _is_old_version, _old_header, _read, _write_version_3, shown=True)
