@@ -68,15 +68,19 @@ class Capture:
             CameraError: If photos of a camera cannot be undistorted.
         """
         if folder is None:
-            return replace(self, decisions=(*self.decisions, *_about_pinholes(self.cameras)))
+            reason = "renders have no distortion, and there are no photos to undistort"
+            about = _about_lenses(self.cameras, "only the pinhole part of the cameras is used", reason)
+            return replace(self, decisions=(*self.decisions, *about))
         matches = check_photos(folder, self.cameras)
         missing = [camera.name for camera, photo in zip(self.cameras, matches, strict=True) if photo is None]
         used = [index for index, photo in enumerate(matches) if photo is not None]
         photos = [photo for photo in matches if photo is not None]
         cameras = [undistorted(self.cameras[index]) for index in used]
         sizes = [self.photo_sizes[index] for index in used]
-        widths = [new.width / self.cameras[i].width for new, i in zip(cameras, used, strict=True)]
-        lines = [*_about_undistorted(cameras, min(widths, default=1.0)), *_about_photos(sizes, photos, missing)]
+        width = min((new.width / self.cameras[i].width for new, i in zip(cameras, used, strict=True)), default=1.0)
+        size = f"at least {width:.0%} of their width, as much as their photos fill" if width < 1 else "their size"
+        lines = _about_lenses(cameras, "the photos are undistorted", f"views keep {size}")
+        lines += _about_photos(sizes, photos, missing)
         if strangers := PhotoFolder(folder).strangers(self.names):
             reason = f"they have the name of no camera: {some_names(strangers)}"
             mostly = len(strangers) > MAX_MISSING * (len(strangers) + len(photos))
@@ -218,33 +222,12 @@ def orbit_request(source: SceneRequest) -> OrbitRequest:
     return OrbitRequest(count, up, source.elevation, source.radius, source.near)
 
 
-def _about_pinholes(cameras: Sequence[Camera]) -> list[Decision]:
-    """Return the decision about lens distortion without photos."""
-    models = _models(cameras)
-    if not models:
-        return []
-    reason = f"{models}; renders have no distortion, and there are no photos to undistort"
-    return [Decision("lenses", "only the pinhole part of the cameras is used", reason)]
-
-
-def _models(cameras: Sequence[Camera]) -> str:
-    """Return the text about the number of distorted cameras and their models; empty if there are none."""
+def _about_lenses(cameras: Sequence[Camera], decision: str, reason: str) -> list[Decision]:
+    """Return the decision about distorted cameras; nothing if there are none."""
     models = sorted({camera.lens.model for camera in cameras if camera.lens})
     count = sum(camera.lens is not None for camera in cameras)
-    return f"{count} of {len(cameras)} cameras have lens distortion ({', '.join(models)})" if models else ""
-
-
-def _about_undistorted(cameras: Sequence[Camera], width_fraction: float) -> list[Decision]:
-    """Return the decision about undistorted photos, given the least fraction of their width that views show."""
-    models = _models(cameras)
-    if not models:
-        return []
-    size = (
-        "their size"
-        if width_fraction == 1
-        else f"at least {width_fraction:.0%} of their width, as much as their photos fill"
-    )
-    return [Decision("lenses", "the photos are undistorted", f"{models}; views keep {size}")]
+    about = f"{count} of {len(cameras)} cameras have lens distortion ({', '.join(models)})"
+    return [Decision("lenses", decision, f"{about}; {reason}")] if models else []
 
 
 def _about_photos(sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]) -> list[Decision]:

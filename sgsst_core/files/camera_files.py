@@ -26,7 +26,7 @@ from sgsst_core.files.colmap_model import COMPARE, QUATERNION_TOLERANCE, ColmapC
 from sgsst_core.files.images import image_size
 from sgsst_core.files.photos import PhotoFolder
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.lens import COEFFICIENTS, Lens, formula
+from sgsst_core.scene.lens import COEFFICIENTS, FORMULAS, Lens
 from sgsst_core.scene.rotations import exact_rotation
 
 #: Largest deviation of a size from whole pixels that is attributed to rounding: 119.99999 is 120.
@@ -126,7 +126,7 @@ def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -
         model = _transforms_model(where, values)
         pinhole = _transforms_intrinsics(where, values, size)
         camera = _camera(where, name, size, pinhole, _inverse(where, pose))
-        keys = COEFFICIENTS[formula(model)]
+        keys = COEFFICIENTS[FORMULAS.get(model)]
         coefficients = [_number(where, values, key) if values.get(key) is not None else 0.0 for key in keys]
         return _with_lens(camera, Lens.of(model, coefficients, size, pinhole))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -36,15 +35,6 @@ _NEAR_MARGIN = 1.1
 _WIDEST = math.tan(math.radians(50))
 #: If the ratio of the subject's smaller to its larger horizontal spread is at least this, it has no broad side.
 _ROUND = 0.9
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """Position and target of a camera, and half the width and height at depth 1 that it must show."""
-
-    position: Tensor
-    target: Tensor
-    half: tuple[float, float]
 
 
 def orbit(
@@ -88,20 +78,22 @@ def orbit(
     directions, middle = ring_directions(subject, count, axis, elevations), middle_of(subject, axis)
     if radius is None:
         radius = _distance(subject.hull - middle, directions, axis, near)
-    frames = [_frame(subject, middle, radius * direction, axis, near) for direction in directions]
-    shapes = [width / height if width and height else _shape(frame.half) for frame in frames]
-    halves = [_widened(frame.half, shape) for frame, shape in zip(frames, shapes, strict=True)]
-    least = _SMALLEST * max(x * y for x, y in halves)
+    frames = []
+    for direction in directions:
+        target, half = _frame(subject, middle, radius * direction, axis, near)
+        shape = width / height if width and height else _shape(half)
+        frames.append((middle + radius * direction, target, shape, _widened(half, shape)))
+    least = _SMALLEST * max(x * y for *_, (x, y) in frames)
     cameras = []
-    for i, (frame, shape, (x, y)) in enumerate(zip(frames, shapes, halves, strict=True)):
+    for i, (position, target, shape, (x, y)) in enumerate(frames):
         wider = math.sqrt(max(1.0, least / (x * y)))
         pixels = _PIXELS * RESOLUTION**2
         columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
         focal = min(columns / (2 * x * wider), rows / (2 * y * wider))
         camera = look_at(
             f"orbit_{i:04d}",
-            frame.position,
-            frame.target,
+            position,
+            target,
             axis,
             width=columns,
             height=rows,
@@ -254,8 +246,14 @@ def _distance(offsets: Tensor, directions: Sequence[Tensor], up: Tensor, near: f
     return distance
 
 
-def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: float) -> _Frame:
-    """Return the frame of a camera at an offset from the center, aimed at the middle of the visible subject."""
+def _frame(
+    subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: float
+) -> tuple[Tensor, tuple[float, float]]:
+    """Return the target [3] in the middle of what a camera at an offset from the center sees of the subject.
+
+    Returns:
+        The target, and half the width and height at depth 1 that the camera must show.
+    """
     position, target = middle + offset, middle
     half = (0.0, 0.0)
     for _ in range(5):
@@ -267,7 +265,7 @@ def _frame(subject: Subject, middle: Tensor, offset: Tensor, up: Tensor, near: f
         if float(aim[:2].abs().amax()) < 1e-3 * max(half):
             break
         target = position + float(offset.norm()) * (rotation.T @ aim)
-    return _Frame(position, target, _with_margin(half, subject, float(offset.norm())))
+    return target, _with_margin(half, subject, float(offset.norm()))
 
 
 def _half_extents(subject: Subject, position: Tensor, target: Tensor, up: Tensor, near: float) -> tuple[float, float]:

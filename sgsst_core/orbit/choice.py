@@ -107,15 +107,15 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
         alone = not up.ground and subject.left_out <= _OUTSIDE
         tried += [*_ABOVE, *(_BELOW if alone else ())]
     trial = _Trial(scene, subject, up, request)
-    views = [trial.of_ring(elevation) for elevation in tried]
-    chosen, shown, left = _needed([view.areas for view in views], max(rings, 1))
+    areas, fractions = zip(*(trial.of_ring(elevation) for elevation in tried), strict=True)
+    chosen, shown, left = _needed(areas, max(rings, 1))
     elevations = tuple(tried[ring] for ring in chosen)
     count = request.count
     if count is None:
         count = sum(max(_MIN_VIEWS, round(_AROUND * math.cos(math.radians(angle)))) for angle in elevations)
     cameras = trial.cameras(count, elevations)
     radius = float((cameras[0].center - middle_of(subject, up.direction)).norm())
-    hidden = [fraction < _SHOWS for ring in chosen for fraction in views[ring].subject]
+    hidden = [fraction < _SHOWS for ring in chosen for fraction in fractions[ring]]
     return Orbit(
         cameras,
         up,
@@ -126,7 +126,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
         left,
         subject.left_out,
         sum(hidden) / len(hidden),
-        trial.hidden_fraction([view.areas for view in views]),
+        trial.hidden_fraction(areas),
     )
 
 
@@ -158,36 +158,18 @@ def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence
         covered = [1 - fraction for fraction in uncovered]
         shown = f"the scene covers {sum(covered) / len(covered):.0%} of their pixels (at least {min(covered):.0%})"
         decisions.append(Decision("frames", shapes, f"fitted to the subject's shape; {shown}"))
-    return decisions + _doubts(orbit)
-
-
-def _doubts(orbit: Orbit) -> list[Decision]:
-    """Return warnings if an orbit may be unsuitable for this scene."""
-    warnings = []
-    better = "the cameras of its capture (--cameras) would show it better"
-    if orbit.outside > _OUTSIDE:
-        decision = f"warning: {orbit.outside:.0%} of the scene lies outside the frames"
-        warnings.append(Decision("subject", decision, f"it is not a single object; {better}"))
-    if orbit.hidden:
-        decision = f"warning: in {orbit.hidden:.0%} of the views, other objects hide the subject"
-        warnings.append(Decision("subject", decision, f"the cameras stand outside of its surroundings; {better}"))
-    if orbit.inside > _INSIDE:
-        decision = f"warning: {orbit.inside:.0%} of the scene lies inside, hidden from all views around it"
-        warnings.append(Decision("subject", decision, f"it may be a room; {better}"))
-    return warnings
-
-
-@dataclass(frozen=True)
-class _Ring:
-    """Result of the trial views of a ring.
-
-    Attributes:
-        areas: [n], visible area of each Gaussian in the view that shows most of it, in squared world units.
-        subject: Fraction of the visible area that belongs to the subject, for each view that shows anything.
-    """
-
-    areas: Tensor
-    subject: list[float]
+    outside, hidden = f"{orbit.outside:.0%} of the scene lies", f"in {orbit.hidden:.0%} of the views, other objects"
+    inside = f"{orbit.inside:.0%} of the scene lies inside, hidden from all views around it"
+    doubts = (
+        (orbit.outside > _OUTSIDE, f"{outside} outside the frames", "it is not a single object"),
+        (orbit.hidden > 0, f"{hidden} hide the subject", "the cameras stand outside of its surroundings"),
+        (orbit.inside > _INSIDE, inside, "it may be a room"),
+    )
+    for doubted, text, reason in doubts:
+        if doubted:
+            better = f"{reason}; the cameras of its capture (--cameras) would show it better"
+            decisions.append(Decision("subject", f"warning: {text}", better))
+    return decisions
 
 
 class _Trial:
@@ -212,8 +194,13 @@ class _Trial:
         shown = torch.stack(list(areas)).amax(0)
         return float(surface[shown < _HARDLY * surface].sum() / surface.sum().clamp_min(1e-300))
 
-    def of_ring(self, elevation: float) -> _Ring:
-        """Render the trial views of a ring."""
+    def of_ring(self, elevation: float) -> tuple[Tensor, list[float]]:
+        """Render the trial views of a ring.
+
+        Returns:
+            Visible area of each Gaussian in the view that shows most of it, [n], in squared world units; and for each
+            view that shows anything, the fraction of the visible area that belongs to the subject.
+        """
         count = max(4, round(_TRIALS * math.cos(math.radians(elevation))))
         areas = torch.zeros(len(self._scene), dtype=torch.float64)
         subject = []
@@ -226,7 +213,7 @@ class _Trial:
             areas = torch.maximum(areas, shown)
             if float(shown.sum()) > 0:
                 subject.append(float(shown[self._framed].sum() / shown.sum()))
-        return _Ring(areas, subject or [1.0])
+        return areas, subject or [1.0]
 
 
 def _needed(areas: Sequence[Tensor], most: int) -> tuple[list[int], float, float | None]:

@@ -205,18 +205,12 @@ def _split_axis_at(number: int, ratio: float, distance: float) -> AxisSplit | No
     low, high = 0.0, 700 / squares.max()  # the variance decreases from that of equal weights
     for _ in range(100):
         middle = (low + high) / 2
-        weights = _normalized_weights(squares, middle)
+        weights = np.exp(-middle * (squares - squares.min()))
+        weights = weights / weights.sum()
         low, high = (middle, high) if weights @ squares > wanted else (low, middle)
     if abs(weights @ squares - wanted) > 1e-12:  # the solution was outside the bracket
         return None
     return AxisSplit(ratio, offsets, weights)
-
-
-def _normalized_weights(squares: NDArray[np.float64], slope: float) -> NDArray[np.float64]:
-    """Return exp(-slope * squares), normalized to a sum of 1."""
-    weights = np.exp(-slope * (squares - squares.min()))
-    normalized: NDArray[np.float64] = weights / weights.sum()
-    return normalized
 
 
 @functools.cache

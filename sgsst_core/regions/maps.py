@@ -80,7 +80,7 @@ class RegionMaps(ViewMaps):
         return self._labels == self._active[part]
 
 
-class ContentMaps(ViewMaps):
+class ContentMaps(RegionMaps):
     """Renderer of the blended content weight of each pixel, relative to the largest one of a Gaussian.
 
     Regions are rendered one by one and then weighted, because a small weight would be lost in the rounding error of a
@@ -93,13 +93,8 @@ class ContentMaps(ViewMaps):
 
     def __init__(self, weights: Tensor, rasterizer: Rasterizer) -> None:
         values, labels = weights.to(rasterizer.device).unique(return_inverse=True)
-        super().__init__(len(values), rasterizer)
-        self._labels: Tensor = labels
+        super().__init__(labels, tuple(range(len(values))), rasterizer)
         self._values: Tensor = (values / values.max()).to(rasterizer.dtype)
-
-    def fractions(self, part: int, camera: Camera) -> Tensor:  # noqa: ARG002 (base signature)
-        """Return the mask [N] bool of the Gaussians with one of the weights."""
-        return self._labels == part
 
     def render(self, camera: Camera) -> Tensor:
         """Return the weights [h, w, 1] in 0..1 of a view."""

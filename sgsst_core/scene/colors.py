@@ -28,6 +28,9 @@ WEIGHTS = (0.299, 0.587, 0.114)
 #: Standard deviation along a principal axis of a style's colors, in 0..1, up to which the axis is left out: three of
 #: 255 levels, which are hardly visible.
 NEGLIGIBLE = 3 / 255
+_NEARBY = np.float32((1 - COLOR_OFFSET) / SH_C0)
+#: DC coefficients from -LARGEST to LARGEST are colors from 0 to 1: it is the last float32 with a color of at most 1.
+LARGEST = float(_NEARBY if COLOR_OFFSET + SH_C0 * float(_NEARBY) <= 1 else np.nextafter(_NEARBY, np.float32(0)))
 
 
 def luminance(colors: Tensor) -> Tensor:
@@ -55,21 +58,6 @@ def with_chroma_of(colors: Tensor, original: Tensor) -> Tensor:
     """
     change = (colors.double() - original.double()).mean(dim=-1, keepdim=True)
     return (original.double() + change).to(colors.dtype)
-
-
-def _largest_coefficient() -> float:
-    """Return the largest float32 coefficient whose color is at most 1 in float64.
-
-    Its negative has the color 0, because coefficient 0 is mid-gray.
-    """
-    largest = np.float32((1 - COLOR_OFFSET) / SH_C0)
-    if COLOR_OFFSET + SH_C0 * float(largest) > 1:
-        largest = np.nextafter(largest, np.float32(0))
-    return float(largest)
-
-
-#: DC coefficients from -LARGEST to LARGEST are colors from 0 to 1.
-LARGEST = _largest_coefficient()
 
 
 def on_screen(sh_dc: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SceneError
 from sgsst_core.scene.rendering import CLASSIC, Rendering
-from sgsst_core.scene.stored_harmonics import StoredHarmonics
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 
 #: Names of a scene's tensors, in the order of its constructor.
 TENSORS = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest")
@@ -65,13 +65,12 @@ class Scene:
 
     def used_degree(self, rows: Tensor | None = None) -> int:
         """Return the highest SH degree with a non-zero coefficient, among the Gaussians of a mask [N] bool, or all."""
-        if self.sh_degree == 0:
-            return 0
-        if isinstance(self.sh_rest, StoredHarmonics):
-            chosen = self.sh_rest if rows is None else self.sh_rest[rows]
-            used = chosen.used_coefficients() if isinstance(chosen, StoredHarmonics) else _used_coefficients(chosen)
-        else:
-            used = _used_coefficients(self.sh_rest, rows)
+        used, chosen = 0, torch.arange(len(self)) if rows is None else rows.nonzero()[:, 0]
+        for part in chosen.split(_CHUNK):
+            if used == self.sh_rest.shape[1]:
+                break
+            nonzero = (held(self.sh_rest[part])[:, used:] != 0).any(dim=2).any(dim=0).nonzero()
+            used += int(nonzero[-1]) + 1 if len(nonzero) else 0
         return next(degree for degree in range(4) if (degree + 1) ** 2 - 1 >= used)
 
     def attenuated(self, attenuation: float) -> Scene:
@@ -174,20 +173,3 @@ def sampled_rows(total: int, count: int) -> Tensor:
     first = torch.arange(0, total, step)
     chance = torch.randint(step, first.shape, generator=torch.Generator().manual_seed(0))
     return (first + chance).clamp_max(total - 1)
-
-
-def _used_coefficients(sh_rest: Tensor, rows: Tensor | None = None) -> int:
-    """Return the number of SH coefficients up to the last non-zero one, for the Gaussians of a mask [N] bool, or all.
-
-    Processes the Gaussians in chunks, without a copy.
-    """
-    used = 0
-    for start in range(0, len(sh_rest), _CHUNK):
-        values = sh_rest[start : start + _CHUNK, used:]
-        if rows is not None:
-            values = values[rows[start : start + _CHUNK]]
-        nonzero = (values != 0).any(dim=2).any(dim=0).nonzero()
-        used += int(nonzero[-1]) + 1 if len(nonzero) else 0
-        if used == sh_rest.shape[1]:
-            break
-    return used

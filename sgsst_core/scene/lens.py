@@ -19,7 +19,7 @@ from torch import Tensor
 #: Nodes per side of the grid on which a frame is checked for borders and folds.
 _NODES = 65
 #: Formulas of camera models of COLMAP and nerfstudio; photos of other models cannot be undistorted here.
-_FORMULAS: dict[str, Literal["radial", "fisheye"]] = {
+FORMULAS: dict[str, Literal["radial", "fisheye"]] = {
     **dict.fromkeys(("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"), "radial"),
     **dict.fromkeys(("OPENCV", "FULL_OPENCV"), "radial"),
     **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "fisheye"),
@@ -61,7 +61,7 @@ class Lens:
         model: str, values: Sequence[float], size: tuple[int, int], pinhole: tuple[float, float, float, float]
     ) -> Lens:
         """Return the lens of a camera model, with its first coefficients; others are 0."""
-        kind = formula(model)
+        kind = FORMULAS.get(model)
         count = len(COEFFICIENTS[kind])
         coefficients = (*values, *[0.0] * count)[:count]
         return Lens(model[:40] or "OPENCV", kind, coefficients, *size, *pinhole)
@@ -98,11 +98,6 @@ class Lens:
             x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x),
             y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
         )
-
-
-def formula(model: str) -> Literal["radial", "fisheye"] | None:
-    """Return the formula of a camera model; None if it is not implemented."""
-    return _FORMULAS.get(model)
 
 
 @functools.lru_cache(maxsize=1024)  # most cameras of a capture share their lens

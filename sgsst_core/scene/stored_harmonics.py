@@ -145,14 +145,9 @@ class StoredHarmonics:
         count = layout.rows if chosen is None else len(chosen)
         self.shape = torch.Size((count, layout.coefficients if coefficients is None else coefficients, 3))
 
-    @property
-    def arguments(self) -> tuple[Any, ...]:
-        """Constructor arguments with which another process opens the same coefficients."""
-        return self.layout, self._chosen, self.shape[1], None, self._factor
-
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the constructor arguments; the process that unpickles them opens the file itself."""
-        return StoredHarmonics, self.arguments
+        return StoredHarmonics, (self.layout, self._chosen, self.shape[1], None, self._factor)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -166,11 +161,7 @@ class StoredHarmonics:
             rows = rows.nonzero()[:, 0]
         if len(rows) > 1 and not bool((rows[1:] >= rows[:-1]).all()):
             ascending, inverse = rows.unique(return_inverse=True)
-            return self._select(ascending).tensor()[inverse]
-        return self._select(rows)
-
-    def _select(self, rows: Tensor) -> StoredHarmonics:
-        """Select Gaussians by ascending indices."""
+            return held(self[ascending])[inverse]
         indices = rows.to("cpu", torch.int32).numpy()
         chosen = indices if self._chosen is None else self._chosen[indices]
         return StoredHarmonics(self.layout, chosen, self.shape[1], self._file, self._factor)
@@ -206,20 +197,6 @@ class StoredHarmonics:
 
         self.for_blocks(take)
         return largest
-
-    def used_coefficients(self) -> int:
-        """Return the number of coefficients per channel up to the last one that is non-zero for any Gaussian.
-
-        Reading stops as soon as the result is known.
-        """
-        step, used = self._rows_at_a_time() * 16, 0
-        for start in range(0, len(self), step):
-            values = self._select(torch.arange(start, min(start + step, len(self)))).tensor()[:, used:]
-            nonzero = (values != 0).any(dim=2).any(dim=0).nonzero()
-            used += int(nonzero[-1]) + 1 if len(nonzero) else 0
-            if used == self.shape[1]:
-                break
-        return used
 
     def for_blocks(self, work: BlockWork, threads: int | None = None) -> None:
         """Call a function on all coefficients, block by block, on as many cores as PyTorch uses.
