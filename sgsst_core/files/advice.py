@@ -11,7 +11,6 @@ from sgsst_core.errors import CameraError, InvalidInputError, SceneError
 
 #: Bytes of a file in which its kind is looked for.
 _HEAD_BYTES = 4096
-_POINTER_START = b"version https://git-lfs"
 #: Signatures in the first bytes of a PyTorch checkpoint: the first file of its ZIP archive, and pickle.
 _CHECKPOINT, _PICKLE = b"/data.pkl", (b"\x80\x02", b"\x80\x04", b"\x80\x05")
 _OBJ_LINE = re.compile(rb"(#[^\n]*|\s*)(\r?\n|$)|(mtllib|o|g|usemtl|v|vt|vn|vp|s|f) [^\n]*(\r?\n|$)")
@@ -35,10 +34,6 @@ def is_checkpoint(head: bytes) -> bool:
 def is_usdz(head: bytes) -> bool:
     """Return whether the first bytes of a file are those of a USDZ archive, whose first file is a USD layer."""
     return head.startswith(b"PK") and b".usd" in head[:200]
-
-
-def _is_pointer(head: bytes) -> bool:
-    return head.startswith(_POINTER_START)
 
 
 def _is_html(head: bytes) -> bool:
@@ -81,7 +76,10 @@ class Kind(NamedTuple):
     within: tuple[str, ...] = ()
 
 
-POINTER = Kind("a pointer of Git LFS, not the file itself. Run `git lfs pull`.", _is_pointer)
+POINTER = Kind(
+    "a pointer of Git LFS, not the file itself. Run `git lfs pull`.",
+    lambda head: head.startswith(b"version https://git-lfs"),
+)
 
 #: Kinds of files that are no readable scenes. The first match counts.
 SCENES = (

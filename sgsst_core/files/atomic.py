@@ -41,7 +41,8 @@ def atomic_path(target: Path) -> Iterator[Path]:
             yield temporary
             if final.exists():
                 shutil.copymode(final, temporary)
-            _flush(temporary)
+            with temporary.open("r+b") as file:  # fsync requires write access on some systems
+                os.fsync(file.fileno())
             temporary.replace(final)
     except BaseException:  # includes KeyboardInterrupt: no partial file may remain
         temporary.unlink(missing_ok=True)
@@ -130,14 +131,6 @@ def _tag(final: Path) -> str:
     It is a hash of the target's name, because the name plus a suffix could exceed the maximum length of file names.
     """
     return hashlib.sha256(os.fsencode(final.name)).hexdigest()[:8]
-
-
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDWR)  # fsync requires write access on some systems
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _flush_folder(folder: Path) -> None:

@@ -10,8 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections import ChainMap
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -125,10 +124,9 @@ def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -
         pose[:3, 1:3] *= -1  # from OpenGL's axes (x right, y up, z backward) to those of `Camera`
         model = _transforms_model(where, values)
         pinhole = _transforms_intrinsics(where, values, size)
-        camera = _camera(where, name, size, pinhole, _inverse(where, pose))
         keys = COEFFICIENTS[FORMULAS.get(model)]
         coefficients = [_number(where, values, key) if values.get(key) is not None else 0.0 for key in keys]
-        return _with_lens(camera, Lens.of(model, coefficients, size, pinhole))
+        return _camera(where, name, size, pinhole, _inverse(where, pose), Lens.of(model, coefficients, size, pinhole))
 
     return _convert_entries(path, content["frames"], convert)
 
@@ -145,10 +143,6 @@ def _transforms_model(where: str, values: Mapping[str, Any]) -> str:
             "images first, for example with `ns-process-data images --camera-type equirectangular`."
         )
     return model
-
-
-def _with_lens(camera: Camera, lens: Lens) -> Camera:
-    return replace(camera, lens=lens) if lens.distorts else camera
 
 
 def _transforms_size(where: str, image: Path, values: Mapping[str, Any], files: PhotoFolder | None) -> tuple[int, int]:
@@ -246,7 +240,7 @@ def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
         matrix[:3, 3] = image.translation
         of_photos = _colmap_lens(where, lens)
         pinhole = (of_photos.fx, of_photos.fy, of_photos.cx, of_photos.cy)
-        cameras.append(_with_lens(_camera(where, image.name, (lens.width, lens.height), pinhole, matrix), of_photos))
+        cameras.append(_camera(where, image.name, (lens.width, lens.height), pinhole, matrix, of_photos))
     if not cameras:
         reasons = "".join(f" {note}." for note in notes)
         raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.{reasons}")
@@ -275,7 +269,7 @@ def _colmap_lens(where: str, camera: ColmapCamera) -> Lens:
     return Lens.of(camera.model, rest, size, pinhole)
 
 
-def _rotation_matrix(where: str, quaternion: tuple[float, float, float, float]) -> NDArray[Any]:
+def _rotation_matrix(where: str, quaternion: Sequence[float]) -> NDArray[Any]:
     """Convert a unit quaternion wxyz to a matrix [3, 3], with the same rounding as COLMAP."""
     w, x, y, z = quaternion
     if not abs(math.hypot(w, x, y, z) - 1) <= QUATERNION_TOLERANCE:  # length 0 would give the identity
@@ -296,15 +290,16 @@ def _camera(
     size: tuple[int, int],
     intrinsics: tuple[float, float, float, float],
     world_to_camera: NDArray[Any],
+    lens: Lens | None = None,
 ) -> Camera:
     """Check values as required for all formats, and return the camera."""
-    fx, fy, cx, cy = intrinsics
+    fx, fy = intrinsics[:2]
     for key, value in (("width", size[0]), ("height", size[1]), ("focal length x", fx), ("focal length y", fy)):
         _positive(where, key, value)
     if not (np.isfinite(world_to_camera).all() and np.isfinite(intrinsics).all()):
         raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
     matrix = torch.from_numpy(exact_rotation(where, world_to_camera))
-    return Camera(name, size[0], size[1], fx, fy, cx, cy, matrix)
+    return Camera(name, *size, *intrinsics, matrix, lens=lens if lens and lens.distorts else None)
 
 
 def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:

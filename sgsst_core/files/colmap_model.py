@@ -85,8 +85,8 @@ class ColmapImage:
 
     name: str
     camera: int
-    rotation: tuple[float, float, float, float]
-    translation: tuple[float, float, float]
+    rotation: Sequence[float]
+    translation: Sequence[float]
 
 
 def read_model(folder: Path, warn: Warn) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
@@ -95,7 +95,6 @@ def read_model(folder: Path, warn: Warn) -> tuple[dict[int, ColmapCamera], list[
     Binary files take precedence over text files, as in COLMAP.
 
     Args:
-        folder: Folder of the model.
         warn: Callback for files with more or less than they declare.
 
     Raises:
@@ -177,7 +176,7 @@ def _binary_image(data: mmap.mmap, position: int) -> tuple[int, ColmapImage, int
         raise EOFError
     name = label(data[position + 64 : end_of_name])
     points: int = struct.unpack_from("<Q", data, end_of_name + 1)[0]
-    return number, _image(name, camera, pose), end_of_name + 9 + 24 * points
+    return number, ColmapImage(name, camera, pose[:4], pose[4:]), end_of_name + 9 + 24 * points
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
@@ -212,7 +211,7 @@ def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
                 f"x, y and id. {_EXPORT_AGAIN}"
             )
         pose = [_number(where, word) for word in words[1:8]]
-        yield _integer(where, words[0]), _image(words[9], _integer(where, words[8]), pose)
+        yield _integer(where, words[0]), ColmapImage(words[9], _integer(where, words[8]), pose[:4], pose[4:])
         may_be_points = True
 
 
@@ -230,11 +229,6 @@ def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
             line = data.removeprefix(codecs.BOM_UTF8).strip()
             if not line.startswith(b"#"):
                 yield f"{path}: line {number}", line
-
-
-def _image(name: str, camera: int, pose: Sequence[float]) -> ColmapImage:
-    w, x, y, z, *translation = pose
-    return ColmapImage(name, camera, (w, x, y, z), (translation[0], translation[1], translation[2]))
 
 
 def _integer(where: str, word: str) -> int:

@@ -111,7 +111,7 @@ def load_image(
         >>> image.dtype, image.shape[2]
         (torch.float32, 3)
     """
-    path, warn = Path(path), warn or _issue_warning
+    path, warn = Path(path), warn or (lambda text: warnings.warn(text, ImageWarning, stacklevel=3))
     with _opened(path) as image:
         if image.format in ("JPEG", "MPO"):
             _check_scans(path)
@@ -143,10 +143,6 @@ def _reduced(image: Image.Image, factor: int) -> Image.Image:
     elif image.mode in ("1", "P"):
         image = image.convert("RGB")
     return image.reduce(factor)
-
-
-def _issue_warning(text: str) -> None:
-    warnings.warn(text, ImageWarning, stacklevel=3)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -264,17 +260,14 @@ def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> 
     data = image.info.get("icc_profile")
     if not data:
         return None
-    mode = "L" if _is_gray(image) else "CMYK" if image.mode == "CMYK" else "RGB"
+    gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
+    mode = "L" if gray else "CMYK" if image.mode == "CMYK" else "RGB"
     try:
         profile = ColorProfile(data, mode)
     except ValueError as error:
         warn(f"{path.name}: its color profile is ignored, because {error}")
         return None
     return profile if profile.changes else None
-
-
-def _is_gray(image: Image.Image) -> bool:
-    return image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
 
 
 def _to_rgb(path: Path, image: Image.Image, profile: ColorProfile | None, background: Color) -> NDArray[np.float32]:

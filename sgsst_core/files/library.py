@@ -131,14 +131,7 @@ def as_scene(scene: AnyScene) -> Scene:
 
 
 def stylized(given: AnyScene, scene: Scene, refinement: Refinement | None, sh_attenuation: float) -> AnyScene:
-    """Return a stylized scene as the type of the given one.
-
-    Args:
-        given: Unstylized scene.
-        scene: Stylized scene.
-        refinement: Refinement of the stylized scene; None if there was none.
-        sh_attenuation: SH attenuation of the stylized scene.
-    """
+    """Return a stylized scene, with its refinement and SH attenuation, as the type of the given unstylized one."""
     if isinstance(given, SceneFile | TrainerCheckpoint):
         return given.stylized(scene, refinement, sh_attenuation)
     if isinstance(given, Scene):

@@ -89,8 +89,12 @@ def encode_stylized(
     check_sh_attenuation(source, sh_attenuation)
     columns, factor = _new_columns(source, source.header, colors), attenuation_factor(sh_attenuation)
     rest = [] if factor == 1 else [name for name in source.header.vertex.kinds if _REST.fullmatch(name)]
+    raw = source.header.raw
+    if source.retained is not None or source.copies is not None:
+        start, stop = source.header.vertex.count_span
+        raw = raw[:start] + str(len(source.scene)).encode() + raw[stop:]
     with source.path.open("rb") as file:
-        output.write(_header_for(source, source.header))
+        output.write(retagged(raw, source.header, source.scene.rendering))
         write = _write_text if source.header.text else _write_binary
         write(source, source.header, columns, rest, factor, file, output)
 
@@ -115,18 +119,6 @@ def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
 def _attenuated(values: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
     """Return attenuated coefficients in float32; positive zeros if the factor is 0."""
     return values * np.float32(factor) if factor else np.zeros_like(values)
-
-
-def _header_for(source: SceneFile, header: PlyHeader) -> bytes:
-    """Return the source's header, with the new number of rows if Gaussians were dropped or split.
-
-    If another render mode was requested than the header states, it states that mode.
-    """
-    raw = header.raw
-    if source.retained is not None or source.copies is not None:
-        start, stop = header.vertex.count_span
-        raw = raw[:start] + str(len(source.scene)).encode() + raw[stop:]
-    return retagged(raw, header, source.scene.rendering)
 
 
 def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> _NewColumns:

@@ -24,18 +24,11 @@ from sgsst_core.files.formats import HEAD_BYTES
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS
 from sgsst_core.files.scene_file import SceneFile, file_stamp
 from sgsst_core.refine.split import Refinement, piece_counts
-from sgsst_core.scene.gaussians import Scene, attenuation_factor, checked_scene
+from sgsst_core.scene.gaussians import TENSORS, Scene, attenuation_factor, checked_scene
 from sgsst_core.scene.stored_harmonics import changed
 
 #: Key of each field of `Scene` in a dictionary of splats.
-SPLAT_KEYS = {
-    "means": "means",
-    "quats": "quats",
-    "scales": "scales",
-    "opacities": "opacities",
-    "sh_dc": "sh0",
-    "sh_rest": "shN",
-}
+SPLAT_KEYS = {**{name: name for name in TENSORS}, "sh_dc": "sh0", "sh_rest": "shN"}
 
 #: Tensors, parameters or NumPy arrays by key.
 Splats = Mapping[str, Any]
@@ -122,23 +115,28 @@ def stylized_splats(
 
     Pieces of a split Gaussian inherit entries that `Scene` does not have.
 
-    Args:
-        splats: Dictionary of the unstylized scene.
-        scene: Stylized scene.
-        refinement: Refinement of the stylized scene; None if there was none.
-        sh_attenuation: SH attenuation of the stylized scene.
+    Refinement and SH attenuation are those of the stylized scene.
     """
     result, changed = dict(splats), {"sh0": scene.sh_dc}
     if refinement is not None and refinement.split:
         counts = piece_counts(refinement.pieces)
-        result = {key: _repeated(value, counts) for key, value in result.items()}
+        for key, value in result.items():
+            if np.ndim(value) == 0 or len(value) != len(counts):
+                continue
+            if isinstance(value, Tensor):
+                result[key] = value.detach().repeat_interleave(counts.to(value.device), dim=0)
+            else:
+                result[key] = np.repeat(value, counts.numpy(), axis=0)
         activated = are_activated(*(_tensor(key, splats[key]) for key in ("opacities", "scales")))
         changed |= {
             "means": scene.means,
             "opacities": scene.opacities.sigmoid() if activated else scene.opacities,
             "scales": scene.scales.exp() if activated else scene.scales,
         }
-    result |= {key: _like(value, splats[key]) for key, value in changed.items()}
+    for key, value in changed.items():
+        given, shaped = splats[key], value.reshape(len(value), *splats[key].shape[1:])
+        as_array = not isinstance(given, Tensor)
+        result[key] = shaped.numpy().astype(given.dtype) if as_array else shaped.to(given.device, given.dtype)
     if sh_attenuation and "shN" in result:
         result["shN"] = result["shN"] * attenuation_factor(sh_attenuation)
     return result
@@ -149,21 +147,6 @@ def _tensor(key: str, value: Any) -> Tensor:
     if not isinstance(value, Tensor | np.ndarray):
         raise SceneError(f"The scene: `{key}` is a {type(value).__name__}. Give a tensor or NumPy array.")
     return torch.as_tensor(value).detach().cpu()
-
-
-def _repeated(value: Any, counts: Tensor) -> Any:
-    """Repeat the rows of a value of all Gaussians; return other values unchanged."""
-    if np.ndim(value) == 0 or len(value) != len(counts):
-        return value
-    if isinstance(value, Tensor):
-        return value.detach().repeat_interleave(counts.to(value.device), dim=0)
-    return np.repeat(value, counts.numpy(), axis=0)
-
-
-def _like(value: Tensor, given: Any) -> Any:
-    """Return a value with the type, dtype, device and shape of a row of the given one."""
-    value = value.reshape(len(value), *given.shape[1:])
-    return value.to(given.device, given.dtype) if isinstance(given, Tensor) else value.numpy().astype(given.dtype)
 
 
 @dataclass(frozen=True)
