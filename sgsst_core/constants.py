@@ -7,6 +7,7 @@ it was trained with. They are compiled into kernels: edit this file to change on
 from __future__ import annotations
 
 import math
+from typing import Any
 
 #: Factors of the real spherical harmonics, in the order and with the signs of 3DGS files (Sloan, "Efficient Spherical
 #: Harmonic Evaluation", JCGT 2013). Degree 0: 1 / (2 sqrt(pi)).
@@ -32,6 +33,17 @@ SH_C3 = (
     math.sqrt(105.0 / math.pi) / 4,
     -math.sqrt(17.5 / math.pi) / 4,
 )
+
+
+def spherical_harmonics(x: Any, y: Any, z: Any) -> list[Any]:
+    """Return the real spherical harmonics of degree 1 to 3 at unit vectors, given and returned as arrays or tensors."""
+    xx, yy, zz = x * x, y * y, z * z
+    polynomials = [y, z, x, x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy]
+    polynomials += [y * (3 * xx - yy), x * y * z, y * (4 * zz - xx - yy), z * (2 * zz - 3 * xx - 3 * yy)]
+    polynomials += [x * (4 * zz - xx - yy), z * (xx - yy), x * (xx - 3 * yy)]
+    factors = (-SH_C1, SH_C1, -SH_C1, *SH_C2, *SH_C3)
+    return [factor * polynomial for factor, polynomial in zip(factors, polynomials, strict=True)]
+
 
 #: Files store colors relative to mid-gray, so coefficients of zero are gray.
 COLOR_OFFSET = 0.5

@@ -109,7 +109,6 @@ def read_capture(source: SceneRequest, scene: Scene, images: Path | None = None)
     """Read or generate the requested cameras, at the requested resolution, still without photos.
 
     Args:
-        source: Requested cameras.
         scene: Scene that an orbit surrounds.
         images: Folder of photos, for cameras whose file states no sizes.
 
@@ -199,7 +198,6 @@ def about_background(scene: Path, background: Color) -> list[Decision]:
 
     Args:
         scene: File of the scene, RUN/point_cloud/iteration_N/point_cloud.ply.
-        background: Background color of the job.
     """
     arguments = scene.absolute().parent.parent.parent / "cfg_args"
     try:

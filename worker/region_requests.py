@@ -149,7 +149,6 @@ def parse_selection(text: str, where: str) -> Selection:
     """Parse a SPEC.
 
     Args:
-        text: SPEC.
         where: Option or region that the SPEC belongs to, for error messages.
 
     Raises:

@@ -251,7 +251,6 @@ def refuse_changed_meaning(path: Path, names: Iterable[str]) -> None:
     """Raise a SceneError if a file has properties that change what the usual ones of a 3DGS scene mean.
 
     Args:
-        path: Path of the file.
         names: Names of its properties, or of the attributes of a glTF primitive, which may have a prefix.
     """
     for name in names:

@@ -54,7 +54,6 @@ def read_cameras(path: Path, photos: Path | None = None, warn: Warn | None = Non
     unchanged, which is correct for scenes trained in the coordinate frame of the camera file.
 
     Args:
-        path: File or folder.
         photos: Folder of the photos, whose sizes cameras get if the file states none. None looks for them beside the
             file, at the paths that it states.
         warn: Callback for cameras that may not be all; None to issue a `CameraWarning`.

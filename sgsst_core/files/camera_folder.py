@@ -36,7 +36,6 @@ def find_cameras(path: Path, warn: Warn) -> Path:
     transforms.json, transforms_train.json, cameras.json, a model in colmap/sparse, or one other JSON file with cameras.
 
     Args:
-        path: File or folder.
         warn: Callback for a model that is smaller than one beside it.
 
     Raises:

@@ -91,7 +91,6 @@ def load_image(
     bits and CMYK are converted to RGB.
 
     Args:
-        path: Path of the file.
         background: sRGB color behind transparent parts, in 0..1; white by default.
         oriented: Whether the EXIF orientation is applied.
         color_managed: Whether the ICC profile is applied. Masks hold no colors.

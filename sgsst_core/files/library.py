@@ -42,7 +42,6 @@ def load_scene(
     The format is detected from the file's content. Checkpoints are loaded with `weights_only=True`.
 
     Args:
-        path: Path of the file.
         drop_invalid: Whether to drop invalid Gaussians of a scene file; see `read_scene`.
         spz_axes: Axes of an SPZ file; see `read_scene`.
 
@@ -84,7 +83,6 @@ def save(path: str | Path, scene: AnyScene) -> None:
     only for a scene that was read from one, and has all its other values.
 
     Args:
-        path: Path of the file to write.
         scene: Scene in any of the accepted types.
 
     Raises:

@@ -31,7 +31,6 @@ class Photo:
     """Photo of a camera.
 
     Attributes:
-        path: Path of the file.
         size: Width and height in pixels, in the orientation that is used.
         oriented: Whether the EXIF orientation is applied. COLMAP ignores it, so it is used only if the photo does not
             fit its camera otherwise.
@@ -52,7 +51,6 @@ class PhotoFolder:
     If nothing matches, upper and lower case count as the same, unless that would match several files.
 
     Args:
-        folder: Existing folder.
         masks: Whether the files are masks, which may also be named as those of COLMAP (0001.jpg.png) and RealityScan
             (0001.jpg.mask.png) if no file has a camera's name.
     """

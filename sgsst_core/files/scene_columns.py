@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,21 +25,20 @@ FLAT = -40.0
 MAX_ROUNDED = 0.1
 
 
-@dataclass(frozen=True)
-class _Flaws:
+class _Flaws(NamedTuple):
     """Invalid values in a block of rows.
 
     Attributes:
         start: First row of the block.
         valid: Mask [n] bool of rows with valid values only.
         counts: Numbers of NaN and of infinite values, for each property that has any.
-        unrotated: Mask [n] bool of rows with a quaternion of length 0, which is not a rotation.
+        unrotated: Rows with a quaternion of length 0, which is not a rotation.
     """
 
     start: int
     valid: NDArray[np.bool_]
-    counts: dict[str, tuple[int, int]]
-    unrotated: NDArray[np.bool_]
+    counts: dict[str, NDArray[np.int64]]
+    unrotated: NDArray[np.int64]
 
 
 def about_rounded_positions(means: NDArray[Any], scales: NDArray[Any]) -> tuple[str, ...]:
@@ -65,7 +63,6 @@ class SceneColumns:
     """Arrays of a scene, filled block by block from the rows of a file, and the invalid values found in them.
 
     Args:
-        header: Header of the file.
         stored: Layout of SH coefficients that stay in the file and are only checked; None if there are none.
 
     Attributes:
@@ -130,24 +127,22 @@ class SceneColumns:
             self.flaws.append(self._flaws_of(start, count, rows))
 
     def _flaws_of(self, start: int, count: int, rows: NDArray[Any] | None) -> _Flaws:
-        unrotated: NDArray[np.bool_] = (self.arrays["quats"][start : start + count] == 0).all(axis=1)
-        valid, counts = np.logical_not(unrotated), {}
+        valid, counts = (self.arrays["quats"][start : start + count] != 0).any(axis=1), {}
+        unrotated = start + np.flatnonzero(~valid)
         columns = {name: target[start : start + count] for name, target in self._targets.items()}
         if self._stored is not None and rows is not None:
             columns |= {name: rows[name] for name in map("f_rest_{}".format, range(3 * self._stored.coefficients))}
         for name, column in columns.items():
-            good = np.isfinite(column)
-            valid &= good
-            nans = int(np.isnan(column).sum())
-            if not good.all():
-                counts[name] = nans, int((~good).sum()) - nans
+            nans, infinite = np.isnan(column), np.isinf(column)
+            valid &= ~(nans | infinite)
+            if nans.any() or infinite.any():
+                counts[name] = np.array([nans.sum(), infinite.sum()])
         return _Flaws(start, valid, counts, unrotated)
 
     def valid_rows(self, path: Path, drop_invalid: bool, surplus: tuple[str, ...]) -> NDArray[np.bool_] | None:
         """Return the mask [count] bool of valid rows; None if all are valid.
 
         Args:
-            path: Path of the file, for messages.
             drop_invalid: Whether rows may be invalid.
             surplus: Note on content after the rows. With it, invalid rows mean that the header does not fit them.
 
@@ -157,14 +152,12 @@ class SceneColumns:
         if not self.flaws:
             return None
         retained = np.ones(len(self.arrays["means"]), dtype=np.bool_)
-        totals: dict[str, list[int]] = {}
-        unrotated = np.concatenate([flaw.start + np.flatnonzero(flaw.unrotated) for flaw in self.flaws])
+        totals: dict[str, NDArray[np.int64]] = {}
+        unrotated = np.concatenate([flaw.unrotated for flaw in self.flaws])
         for flaw in self.flaws:
             retained[flaw.start : flaw.start + len(flaw.valid)] = flaw.valid
-            for name, (nans, infinite) in flaw.counts.items():
-                total = totals.setdefault(name, [0, 0])
-                total[0] += nans
-                total[1] += infinite
+            for name, numbers in flaw.counts.items():
+                totals[name] = totals.get(name, 0) + numbers
         rest = sorted(
             (name for name in totals if name not in _ORDER), key=lambda name: int(name.removeprefix("f_rest_"))
         )

@@ -25,14 +25,7 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
 from sgsst_core.files.formats.ply_header import FILTER_3D, PlyHeader, element_offsets, surplus
-from sgsst_core.files.formats.scene_format import (
-    UNTAGGED,
-    Arrays,
-    RenderTag,
-    SceneFormat,
-    SceneHeader,
-    blocks,
-)
+from sgsst_core.files.formats.scene_format import UNTAGGED, Arrays, RenderTag, SceneFormat, SceneHeader, blocks
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.formats.units import check_units
@@ -58,7 +51,6 @@ class SceneFile:
     """Scene together with the information to write it back.
 
     Attributes:
-        path: Path of the file.
         scene: Gaussians of the file, without dropped ones.
         header: PLY header, whose file `write_stylized` preserves; None for other formats and variants of PLY.
         retained: Mask [rows] bool of the file's rows that the scene contains; None if it contains all.
@@ -132,7 +124,6 @@ def read_scene(
     Scenes of other formats than PLY are decompressed into memory.
 
     Args:
-        path: Path of the file.
         drop_invalid: Whether to drop Gaussians with NaN or infinite values, or with a quaternion of length 0, from the
             scene and the stylized file. If False, such a file is refused. Infinite opacities are clamped instead.
             Properties that 3DGS does not use are not checked.
@@ -239,10 +230,7 @@ def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Pa
     Formats other than PLY omit SH bands that are 0 in all Gaussians, and may change the order of the Gaussians.
 
     Args:
-        output: Stream to write to.
-        scene: Scene to write.
         format: One of `RESULT_FORMATS`.
-        target: Path of the output, for messages.
 
     Raises:
         OutputError: If the format cannot represent the scene.

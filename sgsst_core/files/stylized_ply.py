@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
@@ -31,10 +31,26 @@ from sgsst_core.scene.stored_harmonics import changed
 #: Rows per block: a megabyte of a scene of SH degree 3 stays in a core's L2 cache while its columns change.
 BLOCK_ROWS = 1 << 12
 _REST = re.compile(r"f_rest_\d+")
-#: New values of all Gaussians, by property name.
-_NewColumns = dict[str, NDArray[np.float32]]
 #: Largest finite float16 value.
 _FLOAT16_MAX = 65504.0
+
+
+class _Changes(NamedTuple):
+    """Changes of the rows of a PLY.
+
+    Attributes:
+        columns: New values of all Gaussians, by property.
+        attenuated: Properties that are attenuated.
+        factor: Factor of these.
+    """
+
+    columns: dict[str, NDArray[np.float32]]
+    attenuated: list[str]
+    factor: float
+
+    def times(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return attenuated coefficients in float32; positive zeros if the factor is 0."""
+        return values * np.float32(self.factor) if self.factor else np.zeros_like(values)
 
 
 def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
@@ -87,8 +103,9 @@ def encode_stylized(
         encode_scene(output, replace(source.scene.attenuated(sh_attenuation), sh_dc=colors), PLY, target)
         return
     check_sh_attenuation(source, sh_attenuation)
-    columns, factor = _new_columns(source, source.header, colors), attenuation_factor(sh_attenuation)
+    factor = attenuation_factor(sh_attenuation)
     rest = [] if factor == 1 else [name for name in source.header.vertex.kinds if _REST.fullmatch(name)]
+    changes = _Changes(_new_columns(source, source.header, colors), rest, factor)
     raw = source.header.raw
     if source.retained is not None or source.copies is not None:
         start, stop = source.header.vertex.count_span
@@ -96,7 +113,7 @@ def encode_stylized(
     with source.path.open("rb") as file:
         output.write(retagged(raw, source.header, source.scene.rendering))
         write = _write_text if source.header.text else _write_binary
-        write(source, source.header, columns, rest, factor, file, output)
+        write(source, source.header, changes, file, output)
 
 
 def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
@@ -116,12 +133,7 @@ def check_sh_attenuation(source: SceneFile, attenuation: float) -> None:
         )
 
 
-def _attenuated(values: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
-    """Return attenuated coefficients in float32; positive zeros if the factor is 0."""
-    return values * np.float32(factor) if factor else np.zeros_like(values)
-
-
-def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> _NewColumns:
+def _new_columns(source: SceneFile, header: PlyHeader, colors: Tensor) -> dict[str, NDArray[np.float32]]:
     """Return the columns that may differ from the file: colors and, if Gaussians were split, their shapes.
 
     Colors that the file also has with 8 bits are among them.
@@ -156,13 +168,7 @@ def _blocks(source: SceneFile, rows: int) -> Iterator[tuple[int, NDArray[np.int6
 
 
 def _write_binary(
-    source: SceneFile,
-    header: PlyHeader,
-    columns: _NewColumns,
-    rest: list[str],
-    factor: float,
-    file: io.BufferedReader,
-    output: BinaryIO,
+    source: SceneFile, header: PlyHeader, changes: _Changes, file: io.BufferedReader, output: BinaryIO
 ) -> None:
     dtype = header.vertex.dtype
     before = element_offsets(source.path, header)["vertex"] - len(header.raw)
@@ -176,12 +182,12 @@ def _write_binary(
         rows = np.frombuffer(part, dtype)
         if not (times == 1).all():
             rows = np.repeat(rows, times)
-        for name, values in columns.items():
+        for name, values in changes.columns.items():
             column = values[gaussians]
             different = rows[name].astype(np.float32) != column
             rows[name][different] = column[different]
-        for name in rest:
-            rows[name] = _attenuated(rows[name].astype(np.float32), factor)
+        for name in changes.attenuated:
+            rows[name] = changes.times(rows[name].astype(np.float32))
         output.write(rows.view(np.uint8).data)
     _copy(file, output)
     if file_stamp(source.path) != source.stamp:
@@ -199,34 +205,28 @@ def _copy(file: BinaryIO, output: BinaryIO, count: int | None = None) -> None:
 
 
 def _write_text(
-    source: SceneFile,
-    header: PlyHeader,
-    columns: _NewColumns,
-    rest: list[str],
-    factor: float,
-    file: BinaryIO,
-    output: BinaryIO,
+    source: SceneFile, header: PlyHeader, changes: _Changes, file: io.BufferedReader, output: BinaryIO
 ) -> None:
     vertex = header.vertex
     before = header.elements[: header.elements.index(vertex)]
     order = [*vertex.kinds]
-    slots = [(order.index(name), vertex.kinds[name]) for name in (*columns, *rest)]
+    slots = [(order.index(name), vertex.kinds[name]) for name in (*changes.columns, *changes.attenuated)]
     file.seek(len(header.raw))
     # latin-1 preserves every byte, and newline="" every line end
     lines = io.TextIOWrapper(file, "latin-1", newline="")
     for _ in range(sum(element.count for element in before)):
         output.write(lines.readline().encode("latin-1"))
     for _, times, gaussians in _blocks(source, vertex.count):
-        values = iter(np.stack([column[gaussians] for column in columns.values()], axis=1))
+        values = iter(np.stack([column[gaussians] for column in changes.columns.values()], axis=1))
         for copies in times:
             line = lines.readline()
             for _ in range(copies):
-                output.write(_changed_line(line, slots, next(values), factor).encode("latin-1"))
+                output.write(_changed_line(line, slots, next(values), changes).encode("latin-1"))
     for line in lines:
         output.write(line.encode("latin-1"))
 
 
-def _changed_line(line: str, slots: list[tuple[int, str]], values: NDArray[Any], factor: float) -> str:
+def _changed_line(line: str, slots: list[tuple[int, str]], values: NDArray[Any], changes: _Changes) -> str:
     """Return a row of text with new values. Tokens whose value does not change, and all spacing, are copied.
 
     Args:
@@ -234,11 +234,10 @@ def _changed_line(line: str, slots: list[tuple[int, str]], values: NDArray[Any],
         slots: Token index and NumPy type code of each value to replace: those of `values` first, then those to
             attenuate.
         values: New values of the first slots.
-        factor: Factor of the remaining slots.
     """
     tokens = list(re.finditer(r"\S+", line))
     old = np.array([tokens[slot][0] for slot, _ in slots[len(values) :]], dtype=np.float32)
-    values = np.concatenate([values, _attenuated(old, factor)])
+    values = np.concatenate([values, changes.times(old)])
     for (slot, kind), value in sorted(zip(slots, values, strict=True), key=lambda pair: -pair[0][0]):
         token = tokens[slot]
         if np.float32(token[0]) != value:
@@ -254,10 +253,6 @@ def write_colors(path: Path, sh_dc: Tensor) -> None:
     Values are rounded to the nearest float16. The relative error is at most 2^-11, or the absolute error at most 2^-25
     for values below 2^-14. For displayable colors, the error is less than 0.04 of an 8-bit level. Values beyond +-65504
     are clamped. The file is written atomically.
-
-    Args:
-        path: File to write.
-        sh_dc: Finite coefficients, [N, 3].
 
     Raises:
         OutputError: If the file cannot be written.

@@ -154,8 +154,6 @@ class TrainerCheckpoint:
     """Checkpoint of a trainer, together with the information to write it back.
 
     Attributes:
-        path: Path of the file.
-        scene: Gaussians of the checkpoint.
         splats: Tensors of the checkpoint by gsplat's keys.
         stamp: Size in bytes and modification time in ns of the file when it was read.
     """

@@ -92,7 +92,6 @@ def video_writer(
         out: Path for `check_video_path`. In a folder, or with a pattern, images are numbered from 0.
         width: Width of all frames in pixels; even for a video file.
         height: Height of all frames in pixels; even for a video file.
-        fps: Frames per second.
         alpha: Whether frames have an alpha channel.
 
     Raises:

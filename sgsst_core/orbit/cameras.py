@@ -90,17 +90,10 @@ def orbit(
         pixels = _PIXELS * RESOLUTION**2
         columns, rows = width or round(math.sqrt(pixels * shape)), height or round(math.sqrt(pixels / shape))
         focal = min(columns / (2 * x * wider), rows / (2 * y * wider))
-        camera = look_at(
-            f"orbit_{i:04d}",
-            position,
-            target,
-            axis,
-            width=columns,
-            height=rows,
-            focal=focal,
-            resolution=None if width else RESOLUTION,
+        side = None if width else RESOLUTION
+        cameras.append(
+            look_at(f"orbit_{i:04d}", position, target, axis, width=columns, height=rows, focal=focal, resolution=side)
         )
-        cameras.append(camera)
     return cameras
 
 
@@ -119,13 +112,10 @@ def turntable(
     The frame fits the subject from every camera, in the aspect ratio of `orbit`.
 
     Args:
-        subject: Subject of a scene.
         count: Number of cameras, all different: the video continues with the first one.
-        up: World direction of up.
         elevation: Elevation in degrees above the scene's horizon, between -90 and 90.
         radius: Distance of the cameras from the center in world units; None for that of `orbit`.
         side: Length in pixels of the longer side.
-        near: Near plane of the rasterizer in world units.
 
     Raises:
         SettingsError: If a value is out of range; see `orbit`.

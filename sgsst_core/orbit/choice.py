@@ -45,11 +45,9 @@ class OrbitRequest:
     """Requested properties of an orbit; None to choose a value that suits the scene.
 
     Attributes:
-        count: Number of views.
         up: [3], world direction of up.
         elevation: Elevation in degrees of the orbit's only ring; None to choose one or several rings.
         radius: Distance of the cameras from the center in world units.
-        near: Near plane in world units.
     """
 
     count: int | None = None
@@ -134,7 +132,6 @@ def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence
     """Return the decisions about an orbit.
 
     Args:
-        orbit: Chosen orbit.
         cameras: Its cameras at the sizes used for stylization.
         uncovered: Fraction of uncovered pixels of each view; None if unknown.
     """

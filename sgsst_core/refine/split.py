@@ -121,7 +121,6 @@ def split(scene: Scene, pieces: Tensor) -> Scene:
     Gaussians with one piece per axis remain bit-identical. Children inherit color, spherical harmonics and orientation.
 
     Args:
-        scene: Scene with N Gaussians.
         pieces: [N, 3] uint8, 1 or 3 to `MAX_PIECES`; more than 1 only for Gaussians with `can_be_split`.
 
     Raises:

@@ -26,7 +26,6 @@ class Region:
     """Region as requested by the user.
 
     Attributes:
-        name: Display name.
         select: Text of the selection; empty for the rest.
         style: Style of the region; None for the style of the job.
         weight: Weight of the region's style loss, above 0.
@@ -85,11 +84,7 @@ class Regions:
         return torch.tensor(indices, dtype=torch.uint8)[self.labels.long()]
 
     def content_weights(self, default: float) -> Tensor | None:
-        """Return the content weight of each Gaussian, [N] float32; None if all have the default.
-
-        Args:
-            default: Content weight of the job.
-        """
+        """Return the content weight of each Gaussian, [N] float32; None if all have the default."""
         weights = [default if region.content_weight is None else region.content_weight for region in self.every]
         by_gaussian = torch.tensor(weights)[self.labels.long()]
         return None if bool((by_gaussian == torch.tensor(default)).all()) else by_gaussian
@@ -143,11 +138,6 @@ def _style_of(region: Region) -> tuple[int, float, bool]:
 
 def check_regions(regions: Regions, sh_attenuation: float = 0.0, content_weight: float = 1.0) -> None:
     """Check that the regions leave something to stylize, without rendering any view.
-
-    Args:
-        regions: Regions of the scene.
-        sh_attenuation: SH attenuation, 0 to 1.
-        content_weight: Content weight of the job.
 
     Raises:
         SettingsError: If every Gaussian is frozen, some are frozen while SH attenuation would change all of them, or a

@@ -24,10 +24,6 @@ class ViewMaps(ABC):
 
     Blending is linear in the colors. If each Gaussian's color is its own fraction of a part, a rendering shows the
     part's fraction of each pixel; three channels give three parts per pass.
-
-    Args:
-        count: Number of parts.
-        rasterizer: Any rasterizer.
     """
 
     def __init__(self, count: int, rasterizer: Rasterizer) -> None:
@@ -68,7 +64,6 @@ class RegionMaps(ViewMaps):
     Args:
         labels: [N] uint8, region of each Gaussian of the rasterizer.
         active: Regions to render.
-        rasterizer: Any rasterizer.
     """
 
     def __init__(self, labels: Tensor, active: tuple[int, ...], rasterizer: Rasterizer) -> None:
@@ -88,7 +83,6 @@ class ContentMaps(RegionMaps):
 
     Args:
         weights: [N], content weight of each Gaussian of the rasterizer; at least one is not 0.
-        rasterizer: Any rasterizer.
     """
 
     def __init__(self, weights: Tensor, rasterizer: Rasterizer) -> None:
@@ -110,9 +104,7 @@ class DepthBands(ViewMaps):
     A Gaussian between two levels belongs to both bands in proportion, so the bands add up to the coverage.
 
     Args:
-        count: Number of bands.
         mean_level: Result of `mean_level`.
-        rasterizer: Any rasterizer.
     """
 
     def __init__(self, count: int, mean_level: float, rasterizer: Rasterizer) -> None:

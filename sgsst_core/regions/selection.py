@@ -55,8 +55,6 @@ def count_votes(
     """Return each Gaussian's blend weights summed over white mask pixels, and over all pixels: two [N] float64.
 
     Args:
-        rasterizer: Rasterizer of the scene.
-        cameras: Cameras of the masked views.
         masks: Functions that load the mask [H, W] in 0..1 of each view.
         gaussians: N, number of Gaussians of the scene.
     """
@@ -77,7 +75,6 @@ def decide_by_votes(means: Tensor, inside: Tensor, total: Tensor) -> Tensor:
     shows are then outside.
 
     Args:
-        means: [N, 3].
         inside: [N], blend weights where masks are white, from `count_votes`.
         total: [N], all blend weights in the masked views.
     """

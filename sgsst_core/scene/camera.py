@@ -68,9 +68,6 @@ class Camera:
         Args:
             viewmat: [4, 4] or [3, 4], world-to-camera transform; its 3x3 matrix must be a rotation within 1e-3.
             K: [3, 3], rows (fx, 0, cx), (0, fy, cy), (0, 0, 1), in pixels.
-            width: Width in pixels.
-            height: Height in pixels.
-            name: Name of the camera.
 
         Raises:
             CameraError: If a shape or value is wrong.
@@ -187,7 +184,6 @@ def resized(camera: Camera, side: int) -> Camera:
     by that axis's own ratio, so the image content stays in place.
 
     Args:
-        camera: Any camera.
         side: Longer side in pixels, or the new `Camera.resolution` if the camera has one; at least 1. It may be larger
             than the camera's own.
 
@@ -289,13 +285,9 @@ def look_at(
     """Return a camera at `position` that looks at `target`.
 
     Args:
-        name: Name of the camera.
-        position: [3], position of the camera.
         target: [3], point at the center of the view.
         up: [3], direction toward the upper edge; need not be a unit vector, but must not be parallel to the viewing
             direction.
-        width: Width in pixels.
-        height: Height in pixels.
         focal: Focal length in pixels for both axes; the principal point is the image center.
         resolution: See `Camera`.
 

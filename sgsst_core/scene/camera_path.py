@@ -176,7 +176,6 @@ def framed(camera: Camera, side: int | None, *, even: bool) -> Camera:
     """Return a camera of a video at another size, cropped by at most one pixel per axis to even sides.
 
     Args:
-        camera: Camera of a path.
         side: Length of the longer side in pixels; None keeps the camera's.
         even: Whether width and height must be even, as for video with chroma subsampling. Sides of one pixel stay.
     """

@@ -104,7 +104,6 @@ def checked_scene(scene: Scene, names: Mapping[str, str] | None = None) -> Scene
     NumPy arrays are accepted, and also opacities [N, 1] and sh_dc [N, 1, 3], as trainers keep them.
 
     Args:
-        scene: Scene to check.
         names: Names of its fields in messages; None for their own.
 
     Raises:

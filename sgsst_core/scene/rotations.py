@@ -20,7 +20,6 @@ def exact_rotation(where: str, matrix: NDArray[Any]) -> NDArray[Any]:
     """Return `matrix` [4, 4] with its upper left 3x3 replaced by the nearest rotation (polar decomposition).
 
     Args:
-        where: Origin of the matrix, for messages.
         matrix: Rigid transform, whose 3x3 matrix must be a rotation within `ROTATION_TOLERANCE`.
 
     Raises:

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, SH_C2, SH_C3
+from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, spherical_harmonics
 from sgsst_core.devices import on_device
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -51,28 +51,8 @@ def basis(
     """Return the real spherical harmonics of degrees 1 to `degree` (at most 3): [..., (degree + 1)^2 - 1]."""
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical harmonics of degree {degree}: 3DGS scenes have 0 to 3")
-    x, y, z = directions.unbind(-1)
-    terms: list[Tensor] = []
-    if degree >= 1:
-        terms += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
-    if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
-        polynomials = (x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy)
-        terms += [c * p for c, p in zip(SH_C2, polynomials, strict=True)]
-    if degree >= 3:
-        polynomials3 = (
-            y * (3 * xx - yy),
-            x * y * z,
-            y * (4 * zz - xx - yy),
-            z * (2 * zz - 3 * xx - 3 * yy),
-            x * (4 * zz - xx - yy),
-            z * (xx - yy),
-            x * (xx - 3 * yy),
-        )
-        terms += [c * p for c, p in zip(SH_C3, polynomials3, strict=True)]
-    if not terms:
-        return directions.new_zeros((*directions.shape[:-1], 0))
-    return torch.stack(terms, dim=-1)
+    terms = spherical_harmonics(*directions.unbind(-1))[: (degree + 1) ** 2 - 1]
+    return torch.stack(terms, dim=-1) if terms else directions.new_zeros((*directions.shape[:-1], 0))
 
 
 def rest_colors(
@@ -205,7 +185,6 @@ def harmonics_energy(scene: Scene, weights: Tensor) -> float:
     squared coefficients, up to a factor that all degrees share. All sums are float64.
 
     Args:
-        scene: Scene with N Gaussians.
         weights: [N] float64, weight of each Gaussian; at least one is positive.
     """
     weights = weights / weights.sum()

@@ -43,10 +43,8 @@ class RowLayout:
     Each row contains all float32 coefficients of red, then green, then blue.
 
     Attributes:
-        path: Path of the file.
         stamp: Size in bytes and modification time in ns.
         offset: Byte offset of the first row.
-        rows: Number of rows.
         row_bytes: Length of a row in bytes, a multiple of 4.
         column: Byte offset of the coefficients within a row, a multiple of 4.
         coefficients: Number of coefficients per color channel in a row: 3, 8 or 15.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sgsst_core.constants import SH_C1, SH_C2, SH_C3
+from sgsst_core.constants import spherical_harmonics
 from sgsst_core.files.formats.scene_format import Arrays, blocks
 
 #: Rotation by 180 degrees about z, [4, 4], which converts between a PLY and axes with y up and z forward, as of glTF.
@@ -81,20 +81,7 @@ class Frame:
         """
         directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        new, old = (basis(each)[:, :coefficients] for each in (directions, directions @ self.rotation))
+        values = (spherical_harmonics(*each.T)[:coefficients] for each in (directions, directions @ self.rotation))
+        new, old = (np.reshape(each, (coefficients, _DIRECTIONS)).T for each in values)
         matrix: NDArray[np.float64] = np.round(np.linalg.lstsq(new, old, rcond=None)[0], _DECIMALS)
         return matrix
-
-
-def basis(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the real spherical harmonics of degree 1 to 3 at unit vectors [n, 3], as [n, 15].
-
-    Those of the renderer need PyTorch, which the API process does not import.
-    """
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    polynomials = [y, z, x, x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy]
-    polynomials += [y * (3 * xx - yy), x * y * z, y * (4 * zz - xx - yy), z * (2 * zz - 3 * xx - 3 * yy)]
-    polynomials += [x * (4 * zz - xx - yy), z * (xx - yy), x * (xx - 3 * yy)]
-    values: NDArray[np.float64] = np.stack(polynomials, axis=1) * np.array([-SH_C1, SH_C1, -SH_C1, *SH_C2, *SH_C3])
-    return values

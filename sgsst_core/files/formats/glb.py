@@ -125,7 +125,6 @@ class GlbPart:
     """Set of Gaussians of a GLB scene, as a node shows it.
 
     Attributes:
-        count: Number of Gaussians.
         accessors: Accessors by the names of the scene's tensors.
         harmonics: Accessors of the SH coefficients above degree 0.
         frame: Transformation to the axes of a PLY.

@@ -50,7 +50,6 @@ class KsplatSection:
     """Section of a .ksplat file.
 
     Attributes:
-        count: Number of Gaussians.
         degree: SH degree, 0 to 2.
         lengths_offset: Byte offset of the numbers of Gaussians in buckets that are not full (uint32).
         full: Number of full buckets, which come first.

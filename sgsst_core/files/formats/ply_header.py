@@ -62,7 +62,6 @@ class PlyElement:
     """Element of a PLY.
 
     Attributes:
-        name: Name.
         count: Number of rows.
         count_span: Start and end of the count in the bytes of the header.
         byte_order: That of the header.
@@ -338,8 +337,6 @@ def retagged(raw: bytes, header: PlyHeader, rendering: Rendering) -> bytes:
 
     Args:
         raw: Bytes of the header, which may differ from those of `header` in the number of Gaussians.
-        header: Parsed header.
-        rendering: Render mode to state.
     """
     if ply_tag(header).rendering == rendering:
         return raw

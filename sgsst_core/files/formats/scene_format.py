@@ -62,7 +62,6 @@ class FileStart:
 
     Attributes:
         head: First bytes, at most `HEAD_BYTES`.
-        size: Size of the file in bytes.
     """
 
     path: Path
@@ -84,7 +83,6 @@ class SceneHeader:
     """Checked header of a scene file. Formats subclass it to add fields for their readers.
 
     Attributes:
-        format: Format of the file.
         count: Number of Gaussians.
         coefficients: SH coefficients per color channel above degree 0.
         notes: Notes on contents that are not read, or not read as stored.
@@ -162,7 +160,6 @@ def extras_tag(extras: object, where: str) -> RenderTag:
 
     Args:
         extras: Value that should be a JSON object.
-        where: Name of the document in messages.
     """
     members = extras if isinstance(extras, dict) else {}
     model, eps2d = members.get("model", "default"), members.get("eps2d")
@@ -254,7 +251,6 @@ def about_part(path: Path, start: int, end: int, row_bytes: int | None = None) -
     """Return the note on a part of a file that its header does not declare; nothing if there is only padding.
 
     Args:
-        path: Path of the file.
         start: Byte offset of the part.
         end: Byte offset of its end.
         row_bytes: Size of a row before the part; None if rows differ in size.
@@ -269,7 +265,6 @@ def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: i
     """Raise a SceneError if a binary file looks as if a transfer as text made it longer than declared.
 
     Args:
-        path: Path of the file.
         header_bytes: Size of its header.
         newline: Line end of its header.
         start: Byte offset of the end of the declared data.

@@ -10,14 +10,7 @@ import numpy as np
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS
-from sgsst_core.files.formats.scene_format import (
-    Arrays,
-    FileStart,
-    OpenScene,
-    SceneFormat,
-    SceneHeader,
-    row_blocks,
-)
+from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader, row_blocks
 from sgsst_core.files.formats.units import logarithms
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])

@@ -113,7 +113,6 @@ class SpzHeader(SceneHeader):
     """Header of an SPZ file.
 
     Attributes:
-        size: Size of the file in bytes.
         version: Version of the format, 1 to 4.
         fractional_bits: Fractional bits of the fixed-point positions; unused in version 1, which has 16-bit floats.
         degree: SH degree of the file, 0 to 4.

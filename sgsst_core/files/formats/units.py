@@ -63,7 +63,6 @@ def check_units(path: Path, arrays: Arrays, flat: float, *, logits_stored: bool)
     """Check that values are logarithms, logits and SH coefficients, and return notes on doubtful ones.
 
     Args:
-        path: Path of the file, for messages.
         arrays: Arrays of the scene, whose invalid Gaussians are ignored.
         flat: Log scale of axes that the file does not have.
         logits_stored: Whether the format stores logits. Opacities of others may be in any part of 0..1.

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from sgsst_core.files.formats.frame import Frame, basis
+from sgsst_core.files.formats.frame import Frame
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene import spherical_harmonics
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
@@ -26,11 +25,6 @@ def applied(frame: Frame, scene: Scene) -> Scene:
     arrays = {name: getattr(scene, name).numpy().copy() for name in TENSORS}
     frame.apply(arrays)
     return Scene(*(torch.from_numpy(array) for array in arrays.values()))
-
-
-def test_basis_matches_the_renderer() -> None:
-    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1)
-    torch.testing.assert_close(torch.from_numpy(basis(directions.numpy())), spherical_harmonics.basis(directions, 3))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.3])
