@@ -64,7 +64,7 @@ class PlyElement:
     Attributes:
         count: Number of rows.
         count_span: Start and end of the count in the bytes of the header.
-        byte_order: That of the header.
+        byte_order: Byte order of its numbers; "" in text files.
         kinds: NumPy type codes such as f4, by property; those of the items of a list.
         lists: NumPy type codes of the lengths of lists, by property. Rows with lists differ in length.
     """
