@@ -257,8 +257,10 @@ def about_part(path: Path, start: int, end: int, row_bytes: int | None = None) -
     """
     if start >= end or not without_padding(read_bytes(path, start, min(end, start + _MAX_PADDING + 1))):
         return ()
-    rows = row_bytes and (end - start) % row_bytes == 0
-    return about_surplus(end - start, "byte", f" ({number_of((end - start) // row_bytes, 'row')})" if rows else "")
+    rows = ""
+    if row_bytes and (end - start) % row_bytes == 0:
+        rows = f" ({number_of((end - start) // row_bytes, 'row')})"
+    return about_surplus(end - start, "byte", rows)
 
 
 def refuse_text_transfer(path: Path, header_bytes: int, newline: bytes, start: int, end: int) -> None:
