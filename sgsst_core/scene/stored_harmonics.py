@@ -143,9 +143,14 @@ class StoredHarmonics:
         count = layout.rows if chosen is None else len(chosen)
         self.shape = torch.Size((count, layout.coefficients if coefficients is None else coefficients, 3))
 
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """Constructor arguments with which another process opens the same coefficients."""
+        return self.layout, self._chosen, self.shape[1], None, self._factor
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the constructor arguments; the process that unpickles them opens the file itself."""
-        return StoredHarmonics, (self.layout, self._chosen, self.shape[1], None, self._factor)
+        return StoredHarmonics, self.arguments
 
     def __len__(self) -> int:
         return self.shape[0]
