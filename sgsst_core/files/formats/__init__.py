@@ -29,9 +29,11 @@ EXTRA_FORMATS = tuple(each for each in RESULT_FORMATS if each is not PLY)
 
 if TYPE_CHECKING:
     ResultName = str
+    ExtraName = str
 else:
-    #: Names of `RESULT_FORMATS`, as choices of options and query parameters.
+    #: Names of `RESULT_FORMATS` and `EXTRA_FORMATS`, as choices of options and query parameters.
     ResultName = Literal[tuple(each.name for each in RESULT_FORMATS)]
+    ExtraName = Literal[tuple(each.name for each in EXTRA_FORMATS)]
 
 #: Number of leading bytes that are used to detect the format.
 HEAD_BYTES = 8192
