@@ -108,11 +108,7 @@ def _image_count(model: Path) -> int:
 
 
 def _only_json(folder: Path) -> Path:
-    """Return the only JSON file in a folder that holds cameras.
-
-    Raises:
-        CameraError: If there is none, or if there are several.
-    """
+    """Return the only JSON file in a folder that holds cameras."""
     files = [path for path in sorted(folder.glob("*.json"))[:_SEARCHED_ENTRIES] if path.is_file()]
     holding = [path for path in files if _holds_cameras(path)]
     if len(holding) > 1:

@@ -137,11 +137,7 @@ def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
 
 
 def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]], warn: Warn) -> Iterator[tuple[int, T]]:
-    """Yield as many entries as the file declares.
-
-    Raises:
-        EOFError: If an entry is beyond the end of the file.
-    """
+    """Yield as many entries as the file declares."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         position, count = 8, struct.unpack_from("<Q", data)[0]
         for done in range(count):

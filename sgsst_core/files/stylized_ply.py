@@ -7,6 +7,7 @@ the job optimized with, because `Scene.attenuated` multiplies the same float32 v
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -208,7 +209,7 @@ def _write_text(
     source: SceneFile, header: PlyHeader, changes: _Changes, file: io.BufferedReader, output: BinaryIO
 ) -> None:
     vertex = header.vertex
-    before = header.elements[: header.elements.index(vertex)]
+    before = itertools.takewhile(lambda element: element is not vertex, header.elements.values())
     order = [*vertex.kinds]
     slots = [(order.index(name), vertex.kinds[name]) for name in (*changes.columns, *changes.attenuated)]
     file.seek(len(header.raw))

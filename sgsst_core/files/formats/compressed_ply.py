@@ -56,7 +56,6 @@ def bounds(prefix: str, axes: str) -> tuple[str, ...]:
     return tuple(f"{side}_{prefix}{axis}" for side in ("min", "max") for axis in axes)
 
 
-_ELEMENTS = ("vertex", "chunk", "sh")
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = (*bounds("", "xyz"), *bounds("scale_", "xyz"), *bounds("", "rgb"))
 #: Maximum absolute log scale; other writers of the format clamp to it too.
@@ -79,7 +78,7 @@ def _matches(start: FileStart) -> bool:
 def _read_header(start: FileStart) -> CompressedPlyHeader:
     path = start.path
     header = read_header(start)
-    vertex, chunk, harmonics = ({each.name: each for each in header.elements}.get(name) for name in _ELEMENTS)
+    vertex, chunk, harmonics = map(header.elements.get, ("vertex", "chunk", "sh"))
     if vertex is None:
         raise SceneError(f"{path}: is a compressed PLY without element 'vertex'. Export it again.")
     if header.text:
@@ -125,7 +124,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
     assert isinstance(header, CompressedPlyHeader)
     notes = surplus(file.path, header.ply)
     starts = element_offsets(file.path, header.ply)
-    kinds = {element.name: element.dtype for element in header.ply.elements}
+    kinds = {name: element.dtype for name, element in header.ply.elements.items()}
 
     def rows(name: str, first: int, count: int) -> NDArray[Any]:
         return read_rows(file, kinds[name], starts[name] + first * kinds[name].itemsize, count)

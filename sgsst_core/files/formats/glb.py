@@ -378,11 +378,7 @@ def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[s
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write a GLB with float32 attributes, and colors for programs that show only points.
-
-    Raises:
-        OutputError: If the file would exceed 4 GB.
-    """
+    """Write a GLB with float32 attributes, and colors for programs that show only points."""
     arrays = {name: array.copy() for name, array in arrays.items()}
     Frame.of(Y_UP).apply(arrays)
     columns = _columns(arrays)

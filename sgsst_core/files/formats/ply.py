@@ -86,7 +86,7 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
     Returns:
         Stored SH coefficients per channel, and `PlySceneHeader.sources`.
     """
-    vertex = header.vertex if "vertex" in header.names else None
+    vertex = header.elements.get("vertex")
     kinds = {name: kind for name, kind in vertex.kinds.items() if name not in vertex.lists} if vertex else {}
     refuse_changed_meaning(path, kinds)
     sources = _sources(kinds)
@@ -120,9 +120,9 @@ def _check_properties(path: Path, header: PlyHeader) -> tuple[int, dict[str, str
 
 def _likely_content(header: PlyHeader) -> str:
     """Guess what a PLY without Gaussians contains, for the error message."""
-    vertex = header.vertex if "vertex" in header.names else None
+    vertex = header.elements.get("vertex")
     names = set(vertex.kinds) if vertex else set()
-    if "face" in header.names:
+    if "face" in header.elements:
         return "a mesh (it has faces)"
     if {"x", "y", "z"} <= names and not names & {"opacity", "scale_0", "rot_0", "f_dc_0"}:
         return "a point cloud (train Gaussians on it first)"

@@ -89,12 +89,12 @@ class PlyHeader:
     Attributes:
         byte_order: "<" or ">"; "" for text files.
         raw: Bytes of the header, including the line end of `end_header`; the data starts at len(raw).
-        elements: Elements in the file's order.
+        elements: Elements by name, in the file's order.
     """
 
     byte_order: str
     raw: bytes
-    elements: tuple[PlyElement, ...]
+    elements: dict[str, PlyElement]
 
     @property
     def text(self) -> bool:
@@ -112,19 +112,14 @@ class PlyHeader:
         return [comment for line in self.raw.split(self.newline) if (comment := comment_of(line)) is not None]
 
     @property
-    def names(self) -> list[str]:
-        """Return the names of the elements in the file's order."""
-        return [element.name for element in self.elements]
-
-    @property
     def has_double_positions(self) -> bool:
         """Return whether positions are stored in double precision."""
         return self.vertex.kinds.get("x") == "f8"
 
     @property
     def vertex(self) -> PlyElement:
-        """Return the element that holds the Gaussians; raise ValueError if there is none."""
-        return self.elements[self.names.index("vertex")]
+        """Return the element that holds the Gaussians; raise KeyError if there is none."""
+        return self.elements["vertex"]
 
 
 def comment_of(line: bytes) -> str | None:
@@ -189,7 +184,7 @@ def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
             raise SceneError(f"{path}: the PLY header declares element {each.name!r} twice. Export the scene again.")
         if each.count and not each.kinds:
             raise SceneError(f"{path}: element {each.name!r} of the PLY header has no property. Export it again.")
-    return PlyHeader(byte_order, raw, tuple(elements))
+    return PlyHeader(byte_order, raw, {each.name: each for each in elements})
 
 
 def check_length(path: Path, header: PlyHeader) -> None:
@@ -199,12 +194,12 @@ def check_length(path: Path, header: PlyHeader) -> None:
         SceneError: If the file is shorter than declared.
     """
     least = 0
-    for element in header.elements:  # text values have at least a digit and a separator; lists may be empty
+    for element in header.elements.values():  # text values have at least a digit and a separator; lists may be empty
         sizes = [np.dtype(kind).itemsize for kind in {**element.kinds, **element.lists}.values()]
         least += element.count * (2 * len(sizes) if header.text else sum(sizes))
     data = path.stat().st_size - len(header.raw)
     if least - (1 if header.text else 0) > data:  # the last line may lack its line end
-        declared = ", ".join(f"{element.count} {element.name}" for element in header.elements)
+        declared = ", ".join(f"{element.count} {name}" for name, element in header.elements.items())
         raise SceneError(
             f"{path}: the header declares {declared}, which takes at least {least} bytes, but only {data} follow "
             "it: the file is truncated or its header is wrong. Copy or export it again."
@@ -220,7 +215,7 @@ def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
         SceneError: If the file is shorter than declared.
     """
     check_length(path, header)
-    return {} if header.text else dict(zip(header.names, _bounds(path, header), strict=False))
+    return {} if header.text else dict(zip(header.elements, _bounds(path, header), strict=False))
 
 
 def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
@@ -233,11 +228,11 @@ def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
         with path.open(encoding="latin-1") as lines:
             lines.seek(len(header.raw))
             rows = sum(1 for line in lines if line.strip(" \t\r\n\x1a"))
-        rows -= sum(element.count for element in header.elements)
+        rows -= sum(element.count for element in header.elements.values())
         return about_surplus(max(0, rows), "row")
     end, size = _bounds(path, header)[-1], path.stat().st_size
     refuse_text_transfer(path, len(header.raw), header.newline, end, size)
-    last = header.elements[-1]
+    last = [*header.elements.values()][-1]
     return about_part(path, end, size, None if last.lists else last.dtype.itemsize)
 
 
@@ -245,7 +240,7 @@ def _bounds(path: Path, header: PlyHeader) -> list[int]:
     """Return the byte offset of each element's rows in a binary file, and that of their end."""
     size, position = path.stat().st_size, len(header.raw)
     bounds = [position]
-    for element in header.elements:
+    for element in header.elements.values():
         if element.lists and element.count:
             position = _end_of_lists(path, element, position)
         elif element.count:

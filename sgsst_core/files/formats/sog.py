@@ -360,11 +360,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write a SOG archive. Gaussians are sorted along a space-filling curve, which compresses better.
-
-    Raises:
-        OutputError: If there are too many Gaussians for an image.
-    """
+    """Write a SOG archive. Gaussians are sorted along a space-filling curve, which compresses better."""
     count, coefficients = arrays["sh_rest"].shape[:2]
     if count > _MAX_SIDE**2:
         raise OutputError(f"SOG cannot hold {count} Gaussians. Write a PLY, or a .compressed.ply.")

@@ -292,11 +292,7 @@ def _shared_fields(start: FileStart, head: bytes, versions: tuple[int, ...]) -> 
 
 
 def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
-    """Fill the arrays of a scene, and return notes on version 1 to 3, and on axes that the file does not state.
-
-    Raises:
-        SceneError: If a stream is damaged, or not as long as the header declares.
-    """
+    """Fill the arrays of a scene, and return notes on version 1 to 3, and on axes that the file does not state."""
     assert isinstance(spz, SpzHeader)
     path = file.path
     decoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
@@ -379,11 +375,7 @@ class _Stream:
 
 
 def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[_Extensions, int]:
-    """Return what follows the sections of version 1 to 3, and the byte offset of the end of the stream.
-
-    Raises:
-        SceneError: If it is no extension, but as much as a Gaussian takes.
-    """
+    """Return what follows the sections of version 1 to 3, and the byte offset of the end of the stream."""
     content = _taken(path, stream.read, _EXTENSION_BYTES, least=0)
     if _taken(path, stream.read, 1, least=0):
         raise _too_much(path)
@@ -406,11 +398,7 @@ def _sections_of_streams(path: Path, file: OpenScene, spz: SpzHeader) -> Iterato
 
 
 def _taken(path: Path, read: Take, count: int, least: int | None = None) -> bytes:
-    """Return bytes of a stream, `count` of them, or at least `least`.
-
-    Raises:
-        SceneError: If the stream is damaged, or ends before.
-    """
+    """Return bytes of a stream, `count` of them, or at least `least`."""
     try:
         content = read(count)
     except EOFError:
@@ -459,11 +447,7 @@ def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write SPZ version 4, the newest, with all 8 bits of SH coefficients.
-
-    Raises:
-        OutputError: If a position is too far from the origin.
-    """
+    """Write SPZ version 4, the newest, with all 8 bits of SH coefficients."""
     bits = _fractional_bits(arrays["means"])
     streams = []
     for section in _encoded_sections(arrays, bits):
@@ -484,11 +468,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
 
 
 def _write_version_3(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write SPZ version 3, for programs that cannot read version 4, with all 8 bits of SH coefficients.
-
-    Raises:
-        OutputError: If a position is too far from the origin.
-    """
+    """Write SPZ version 3, for programs that cannot read version 4, with all 8 bits of SH coefficients."""
     deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
     bits = _fractional_bits(arrays["means"])
     output.write(deflate.compress(_first_fields(3, arrays, bits, rendering) + bytes(1)))
