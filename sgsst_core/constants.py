@@ -45,6 +45,9 @@ def spherical_harmonics(x: Any, y: Any, z: Any) -> list[Any]:
     return [factor * polynomial for factor, polynomial in zip(factors, polynomials, strict=True)]
 
 
+#: Degree of spherical harmonics by the number of coefficients per color channel above degree 0.
+SH_DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
+
 #: Files store colors relative to mid-gray, so coefficients of zero are gray.
 COLOR_OFFSET = 0.5
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import SceneError
 from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
@@ -57,7 +58,7 @@ class Scene:
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return {0: 0, 3: 1, 8: 2, 15: 3}[int(self.sh_rest.shape[1])]
+        return SH_DEGREES[int(self.sh_rest.shape[1])]
 
     def subset(self, rows: Tensor) -> Scene:
         """Return a scene of the selected Gaussians only, given a mask [N] bool or indices."""
@@ -116,7 +117,7 @@ def checked_scene(scene: Scene, names: Mapping[str, str] | None = None) -> Scene
         "scales": ((count, 3),),
         "opacities": ((count,), (count, 1)),
         "sh_dc": ((count, 3), (count, 1, 3)),
-        "sh_rest": tuple((count, coefficients, 3) for coefficients in (0, 3, 8, 15)),
+        "sh_rest": tuple((count, coefficients, 3) for coefficients in SH_DEGREES),
     }
     values = {name: _checked((names or {}).get(name, name), getattr(scene, name), shapes[name]) for name in shapes}
     if not count:

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, spherical_harmonics
+from sgsst_core.constants import COLOR_OFFSET, SH_C0, SH_C1, SH_DEGREES, spherical_harmonics
 from sgsst_core.devices import on_device
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -72,7 +72,7 @@ def rest_colors(
         ValueError: If K does not match a degree of 0 to 3, or `degree` exceeds that of the coefficients.
         SceneError: If the coefficients are in a file that was changed after it was first read.
     """
-    stored = {0: 0, 3: 1, 8: 2, 15: 3}.get(int(sh_rest.shape[1]))
+    stored = SH_DEGREES.get(int(sh_rest.shape[1]))
     if stored is None:
         raise ValueError(f"sh_rest must have 0, 3, 8 or 15 coefficients per Gaussian, not {sh_rest.shape[1]}")
     degree = stored if degree is None else degree

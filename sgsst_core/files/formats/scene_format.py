@@ -15,12 +15,12 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sgsst_core.constants import EPS2D
+from sgsst_core.constants import EPS2D, SH_DEGREES
 from sgsst_core.errors import SceneError
 from sgsst_core.scene.rendering import CLASSIC, MAX_EPS2D, Rendering
 
 #: SH coefficients per color channel above degree 0, by SH degree.
-COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+COEFFICIENTS = {degree: number for number, degree in SH_DEGREES.items()}
 #: The same for files, whose coefficients of degree 4 are not drawn.
 STORED_COEFFICIENTS = {**COEFFICIENTS, 4: 24}
 #: Gaussians that are converted at a time.

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import converted, is_checkpoint, is_usdz
 from sgsst_core.files.formats.codebooks import VALUES, nearest_entries, palette, value_codebook
@@ -401,7 +402,7 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
         images["shN_centroids.webp"] = nearest_entries(vectors, harmonics).reshape(-1, 3)
         meta["shN"] = {
             "count": len(vectors),
-            "bands": next(degree for degree, number in COEFFICIENTS.items() if number == coefficients),
+            "bands": SH_DEGREES[coefficients],
             "codebook": harmonics.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }

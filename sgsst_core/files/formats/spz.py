@@ -30,6 +30,7 @@ import numpy as np
 from backports import zstd
 from numpy.typing import NDArray
 
+from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import converted
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, opacity_bytes, with_largest, without_largest
@@ -482,9 +483,8 @@ def _write_version_3(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> 
 def _first_fields(version: int, arrays: Arrays, bits: int, rendering: Rendering) -> bytes:
     """Return the first 15 bytes of a header, which versions 2 to 4 share."""
     count, coefficients = arrays["sh_rest"].shape[:2]
-    degree = next(degree for degree, number in COEFFICIENTS.items() if number == coefficients)
     flags = _HAS_EXTENSIONS | (_ANTIALIASED if rendering.antialiased else 0)
-    return struct.pack("<4sIIBBB", _MAGIC, version, count, degree, bits, flags)
+    return struct.pack("<4sIIBBB", _MAGIC, version, count, SH_DEGREES[coefficients], bits, flags)
 
 
 def _encoded_sections(arrays: Arrays, bits: int) -> Iterator[Iterator[bytes]]:
