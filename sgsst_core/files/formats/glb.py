@@ -45,6 +45,7 @@ from sgsst_core.files.formats.scene_format import (
     json_numbers,
     read_bytes,
     read_rows,
+    truncated,
 )
 from sgsst_core.files.formats.units import logarithms, logits
 from sgsst_core.scene.rendering import Rendering
@@ -176,16 +177,16 @@ def _read_header(start: FileStart) -> GlbHeader:
 
 def _chunks(start: FileStart) -> tuple[bytes, range]:
     """Return the JSON document, and the byte offsets of the binary data."""
-    path, truncated = start.path, "the file is truncated or its header is wrong. Copy or export it again."
+    path = start.path
     head = start.head.ljust(_HEADER.size + _CHUNK.size, b"\0")
     (_, version, length), (json_bytes, kind) = _HEADER.unpack_from(head), _CHUNK.unpack_from(head, _HEADER.size)
     if version != 2:
         raise SceneError(f"{path}: is GLB of version {version}; version 2 can be read. Export it again.")
     if length > start.size:
-        raise SceneError(f"{path}: the GLB header declares {length} bytes of {start.size}: {truncated}")
+        raise truncated(path, f"the GLB header declares {length} bytes of {start.size}")
     first = _HEADER.size + _CHUNK.size
     if kind != b"JSON" or json_bytes > start.size - first:
-        raise SceneError(f"{path}: the GLB header declares {json_bytes} bytes of JSON: {truncated}")
+        raise truncated(path, f"the GLB header declares {json_bytes} bytes of JSON")
     if json_bytes > _MAX_JSON_BYTES:
         raise SceneError(
             f"{path}: has {json_bytes} bytes of JSON; at most {_MAX_JSON_BYTES} can be read. Export the Gaussians "
@@ -195,7 +196,7 @@ def _chunks(start: FileStart) -> tuple[bytes, range]:
     text, chunk = read_bytes(path, first, first + json_bytes), read_bytes(path, first + json_bytes, offset)
     size, kind = _CHUNK.unpack(chunk) if len(chunk) == _CHUNK.size else (0, b"BIN\0")
     if kind != b"BIN\0" or offset + size > max(start.size, offset):
-        raise SceneError(f"{path}: the GLB declares {size} bytes of data after its JSON: {truncated}")
+        raise truncated(path, f"the GLB declares {size} bytes of data after its JSON")
     return text, range(offset, offset + size)
 
 

@@ -29,6 +29,7 @@ from sgsst_core.files.formats.scene_format import (
     read_bytes,
     read_rows,
     row_blocks,
+    truncated,
 )
 from sgsst_core.files.formats.units import logarithms
 
@@ -104,19 +105,14 @@ def _read_header(start: FileStart) -> KsplatHeader:
     low, high = struct.unpack_from("<2f", head, 36)
     table_end = _HEADER_BYTES + _SECTION_BYTES * sections
     if sections > _MAX_SECTIONS or table_end > start.size:
-        raise SceneError(
-            f"{path}: the .ksplat header declares {sections} sections in {start.size} bytes; at most {_MAX_SECTIONS} "
-            "can be read. The file is truncated or its header is wrong. Copy or export it again."
-        )
+        declared = f"the .ksplat header declares {sections} sections in {start.size} bytes"
+        raise truncated(path, f"{declared}; at most {_MAX_SECTIONS} can be read")
     table = read_bytes(path, _HEADER_BYTES, table_end)
     read, position = [], table_end
     for index in range(sections):
         section, position = _section(table[index * _SECTION_BYTES :][:_SECTION_BYTES], level, position)
         if section is None or position > start.size:
-            raise SceneError(
-                f"{path}: section {index} of the .ksplat file is wrong, or ends after its {start.size} bytes: the file "
-                "is truncated or its header is wrong. Copy or export it again."
-            )
+            raise truncated(path, f"section {index} of the .ksplat file is wrong, or ends after its {start.size} bytes")
         read.append(section)
     if sum(section.count for section in read) != count:
         raise SceneError(

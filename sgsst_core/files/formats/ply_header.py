@@ -29,6 +29,7 @@ from sgsst_core.files.formats.scene_format import (
     read_bytes,
     refuse_text_transfer,
     stated,
+    truncated,
     usable_eps2d,
 )
 from sgsst_core.scene.rendering import Rendering
@@ -200,10 +201,8 @@ def check_length(path: Path, header: PlyHeader) -> None:
     data = path.stat().st_size - len(header.raw)
     if least - (1 if header.text else 0) > data:  # the last line may lack its line end
         declared = ", ".join(f"{element.count} {name}" for name, element in header.elements.items())
-        raise SceneError(
-            f"{path}: the header declares {declared}, which takes at least {least} bytes, but only {data} follow "
-            "it: the file is truncated or its header is wrong. Copy or export it again."
-        )
+        needed = f"which takes at least {least} bytes, but only {data} follow it"
+        raise truncated(path, f"the header declares {declared}, {needed}")
 
 
 def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
@@ -246,7 +245,7 @@ def _bounds(path: Path, header: PlyHeader) -> list[int]:
         elif element.count:
             position += element.count * element.dtype.itemsize
         if position > size:
-            raise _truncated(path, element)
+            raise truncated(path, f"ends within element {element.name!r}")
         bounds.append(position)
     return bounds
 
@@ -266,20 +265,13 @@ def _end_of_lists(path: Path, element: PlyElement, position: int) -> int:
                 items = 1
                 if length is not None:
                     if position + length.size > len(data):
-                        raise _truncated(path, element)
+                        raise truncated(path, f"ends within element {element.name!r}")
                     items = length.unpack_from(data, position)[0]
                     if items < 0:
                         raise SceneError(f"{path}: element {element.name!r} holds a list of length {items}: corrupt.")
                     position += length.size
                 position += items * item_bytes
         return position
-
-
-def _truncated(path: Path, element: PlyElement) -> SceneError:
-    return SceneError(
-        f"{path}: ends within element {element.name!r}: the file is truncated or its header is wrong. "
-        "Copy or export it again."
-    )
 
 
 def ply_tag(header: PlyHeader) -> RenderTag:

@@ -230,6 +230,11 @@ def read_bytes(path: Path, start: int, end: int) -> bytes:
         raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
 
 
+def truncated(path: Path, declared: str) -> SceneError:
+    """Return the error about a file that is shorter than a header declares."""
+    return SceneError(f"{path}: {declared}: the file is truncated or its header is wrong. Copy or export it again.")
+
+
 def number_of(count: int, unit: str) -> str:
     """Return a number with its unit, such as "1 byte"."""
     return f"{count} {unit}" + "s" * (count != 1)

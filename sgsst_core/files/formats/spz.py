@@ -51,6 +51,7 @@ from sgsst_core.files.formats.scene_format import (
     read_bytes,
     read_rows,
     stated,
+    truncated,
     without_padding,
 )
 from sgsst_core.scene.rendering import Rendering
@@ -80,6 +81,7 @@ _AXES_NUMBERS: dict[int, Axes] = {0: "rub", 4: "rub", 6: "rdf"}
 #: Extension record of written files, which states the axes of a PLY.
 _AXES_RECORD = struct.pack("<III", _AXES_EXTENSION, 4, 6)
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
+_ENDS_EARLY = "the data ends before all Gaussians that the header declares"
 _ASSUMED_AXES = "axes: read as rdf; the file states none. If the scene is upside down, pass --spz-axes rub"
 #: Maximum number of unknown extensions that a note names.
 _NOTED_EXTENSIONS = 8
@@ -167,10 +169,8 @@ def _old_header(file_start: FileStart) -> SpzHeader:
     header = _shared_fields(file_start, start, (1, 2, 3))
     needed = 16 + sum(header.sections)
     if needed > (_DEFLATE_RATIO if zipped else 1) * header.size:
-        raise SceneError(
-            f"{path}: the header declares {header.count} Gaussians, which take {needed} bytes, more than the file's "
-            f"{header.size} bytes can hold: the file is truncated or its header is wrong. Copy or export it again."
-        )
+        declared = f"the header declares {header.count} Gaussians, which take {needed} bytes"
+        raise truncated(path, f"{declared}, more than the file's {header.size} bytes can hold")
     return replace(header, format=SPZ_3, zipped=zipped, tag=_tag(start[14], believed=header.extended))
 
 
@@ -183,21 +183,17 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
     number, table = head[15], int.from_bytes(head[16:20], "little")
     expected = [section for section in header.sections if section]
     if number != len(expected) or table < 32 or table + 16 * number > size:
-        raise SceneError(
-            f"{path}: the SPZ header declares {number} streams with their table at byte {table}; expected "
-            f"{len(expected)} streams in {size} bytes. The file is truncated or its header is wrong. Copy it again."
-        )
+        declared = f"the SPZ header declares {number} streams with their table at byte {table}"
+        raise truncated(path, f"{declared}; expected {len(expected)} streams in {size} bytes")
     extensions = _Extensions.of(read_bytes(path, 32, min(table, 32 + _EXTENSION_BYTES)), header)
     axes = extensions.axes(path)
     position = table + 16 * number
     streams, listed = [], list(struct.iter_unpack("<QQ", read_bytes(path, table, position)))
     for (compressed, decompressed), wanted in zip(listed, expected, strict=True):
         if decompressed != wanted or position + compressed > size or wanted > _ZSTD_RATIO * compressed:
-            raise SceneError(
-                f"{path}: the SPZ header declares a stream of {compressed} bytes that become {decompressed}; {wanted} "
-                f"belong to {header.count} Gaussians, and {size - position} bytes are left. The file is truncated or "
-                "its header is wrong. Copy or export it again."
-            )
+            declared = f"the SPZ header declares a stream of {compressed} bytes that become {decompressed}"
+            needed = f"{wanted} belong to {header.count} Gaussians, and {size - position} bytes are left"
+            raise truncated(path, f"{declared}; {needed}")
         streams.append((position, compressed))
         position += compressed
     notes = (*extensions.notes(header.degree), *about_part(path, position, size))
@@ -381,7 +377,7 @@ def _extensions(path: Path, stream: _Stream, spz: SpzHeader) -> tuple[_Extension
     if _taken(path, stream.read, 1, least=0):
         raise _too_much(path)
     if stream.inflate and not stream.inflate.eof:
-        raise _ends_early(path)
+        raise truncated(path, _ENDS_EARLY)
     extensions = _Extensions.of(content, spz)
     if len(extensions.rest) >= sum(spz.sections) // spz.count:
         raise _too_much(path, f" by {number_of(len(extensions.rest), 'byte')}")
@@ -407,15 +403,8 @@ def _taken(path: Path, read: Take, count: int, least: int | None = None) -> byte
     except (zlib.error, zstd.ZstdError) as error:
         raise SceneError(f"{path}: the compressed data is damaged: {error}. Copy or export it again.") from error
     if len(content) < (count if least is None else least):
-        raise _ends_early(path)
+        raise truncated(path, _ENDS_EARLY)
     return content
-
-
-def _ends_early(path: Path) -> SceneError:
-    return SceneError(
-        f"{path}: the data ends before all Gaussians that the header declares: the file is truncated or its "
-        "header is wrong. Copy or export it again."
-    )
 
 
 def _too_much(path: Path, surplus: str = "") -> SceneError:
