@@ -118,7 +118,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "system_seconds_by_rank": [statistics.median(seconds) for seconds in kernel],
         "peak_gb_by_rank": peak,
         "bytes_sent": sent,
-        "shown": together.job.plan.survey.shown,
+        "shown": int((alone.job.views.rasterizer.survey(camera)[1] > 0).sum()),
         "steps": steps,
         "pieces": [[piece.scale, *piece.size] for piece in pieces],
         "halo": halo,

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 #: Subject of the decision about views that see nothing.
 VIEWS = "views"
+#: Cost in accuracy of a decision that changes what is minimized.
+ANOTHER_LOSS = "differs from the paper's loss"
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,10 @@ def execute(
         if preview and not _has_rows_of_file(job):
             preview.live.share_scene(stylizer.job.scene)
     stopped = run(stylizer, callbacks)
+    if first and stopped in ("on-request", "max-seconds", "target-loss", "converged"):
+        expected = stylizer.job.plan.prediction
+        left = measure.seconds_left(stylizer.step, ends=True) + (expected.ending if expected else 0.0)
+        reported.end_early(left)
     if stopped == "interrupted":
         if checkpoint.error is not None:
             raise checkpoint.error
@@ -126,6 +130,11 @@ class _ReportedSteps:
         """Report a step."""
         self._latest, self._at = now, time.monotonic()
         self._report(now)
+
+    def end_early(self, seconds: float) -> None:
+        """Report the remaining seconds of a job without its remaining steps; ignored before the first step."""
+        if self._latest is not None:
+            self(self._latest.model_copy(update={"stage": "measuring", "eta_s": seconds}))
 
     def show_views(self, done: int, total: int) -> None:
         """Report the views of a quality check; ignored before the first step."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -22,9 +23,10 @@ from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.refine.split import Refinement
 from sgsst_core.report.document import Sources
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint
-from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -102,41 +104,16 @@ def prepare(
         with timer("refining"):
             refinement = refinement if resumed else _refine(inputs, settings, weights, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
-    regions = inputs.regions and inputs.regions.refined(refinement)
-    plan, planned_ranks = _usable_plan(resumed, collectives), collectives.size
-    photos = inputs.photo_loader(settings.background)
-    if plan is not None and resumed is not None:
-        planned_ranks = resumed.ranks
-        with timer("preparing"):
-            stylization = prepare_job(
-                plan,
-                scene_file.scene,
-                inputs.cameras,
-                inputs.style,
-                settings,
-                weights=weights,
-                photos=photos,
-                collectives=collectives,
-                regions=regions,
-            )
-    else:
-        stylization = plan_job(
-            scene_file.scene,
-            inputs.cameras,
-            inputs.style,
-            settings,
-            weights=weights,
-            photos=photos,
-            collectives=collectives,
-            survey=resumed.plan.survey if resumed else None,
-            measured=True,
-            show=show_planning,
-            timer=timer,
-            orbit=inputs.orbit,
-            about_inputs=inputs.decisions,
-            regions=regions,
-            refinement=refinement,
-        )
+    plan = _usable_plan(resumed, collectives)
+    planned_ranks = resumed.ranks if resumed and plan else collectives.size
+    stylization = _planner(inputs, settings, weights, scene_file.scene, refinement)(
+        plan=plan,
+        photos=inputs.photo_loader(settings.background),
+        collectives=collectives,
+        survey=resumed.plan.survey if resumed else None,
+        show=show_planning,
+        timer=timer,
+    )
     with timer("preparing"):
         stylizer = Stylizer(stylization)
     stylizer.seconds_by_part.update(timer.seconds)
@@ -160,19 +137,27 @@ def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None) 
     """
     settings, weights = request.settings, load_network_weights(request.backbone)
     refinement = _refine(inputs, settings, weights, ALONE, show)
-    return plan_job(
-        refined(inputs.scene_file.scene, refinement),
+    scene = refined(inputs.scene_file.scene, refinement)
+    return _planner(inputs, settings, weights, scene, refinement)(show=show).plan
+
+
+def _planner(
+    inputs: Inputs, settings: Settings, weights: BackboneWeights, scene: Scene, refinement: Refinement | None
+) -> partial[StylizationJob]:
+    """Return `plan_job` for the job of some inputs, given their refined scene."""
+    return partial(
+        plan_job,
+        scene,
         inputs.cameras,
         inputs.style,
         settings,
         weights=weights,
         measured=True,
-        show=show,
         orbit=inputs.orbit,
         about_inputs=inputs.decisions,
         regions=inputs.regions and inputs.regions.refined(refinement),
         refinement=refinement,
-    ).plan
+    )
 
 
 def _refine(

@@ -541,7 +541,8 @@ def _job_fields(shown: ShownJob) -> dict[str, Any]:
         "attempt": job.attempt,
         "queue_position": shown.position,
         "preview": shown.preview,
-        "progress": job.progress or None,
+        # The remaining time is that of the last report, and a job that has ended has none.
+        "progress": {**job.progress, **({} if job.status in UNFINISHED else {"eta_s": None})} if job.progress else None,
         "result": job.result,
         "error": job.error or None,
         "parameters": JobParameters().model_dump(mode="json") | job.parameters,

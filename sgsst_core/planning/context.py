@@ -1,16 +1,18 @@
-"""Objects that are created to measure a job before its first step, and that the job continues to use."""
+"""Facts about machine, scene, views and network that a plan depends on, and the objects created to measure them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from sgsst_core.budget import default_memory_limit, memory_for
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.partition import computed_twice, scaled_region
 from sgsst_core.features.vgg import (
     FeatureNetwork,
     convolutions,
@@ -20,31 +22,242 @@ from sgsst_core.features.vgg import (
     use_whole_float32,
 )
 from sgsst_core.loss.gradient_error import Difference
+from sgsst_core.loss.graphs import FIRST_VISITS
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
+from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.planning.choices import precision_of
-from sgsst_core.planning.facts import Machine
-from sgsst_core.planning.plan import Device
+from sgsst_core.parallel.division import Size
+from sgsst_core.planning.plan import Device, Plan
+from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import Rasterizer, drawing_problem, gpu_rasterizers, make_rasterizer, rasterizer_for
-from sgsst_core.scene.camera import Camera
+from sgsst_core.rasterizer.base import Precision as WeightPrecision
+from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Precision, Settings
 from sgsst_core.style import Style
-from sgsst_core.timing import Timer
+from sgsst_core.timing import Timer, wait_for
 
 DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16}
 #: Channels and side of the timed convolution: about a millisecond of work on a CPU core, and enough to fill a GPU.
 _CHANNELS: dict[Device, int] = {"cpu": 128, "cuda": 256}
 _SIDE: dict[Device, int] = {"cpu": 24, "cuda": 256}
-#: Minimum total seconds of the repetitions, so that the launch time is negligible.
-_LEAST_SECONDS: dict[Device, float] = {"cpu": 0.0, "cuda": 5e-3}
-#: Maximum longer side of the view on which another precision is compared with float32.
-_COMPARED_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 2048}
 #: Number of measurements, of which the fastest counts: another process can interrupt one.
 _MEASUREMENTS = 5
+#: Maximum longer side of the view on which another precision is compared with float32.
+_COMPARED_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 2048}
+#: Precisions of cached blend weights, the exact one first, and number of views whose weights are counted.
+_FORMATS: tuple[WeightPrecision, ...] = ("float32", "half")
+_SAMPLED_VIEWS = 3
+#: Minimum visits of a view for which caching its blend weights pays off on a CPU. Computing them takes as long as about
+#: three renders with gradient, and each use saves two thirds of a render. On GPUs, both times are measured.
+LEAST_VISITS = 5
+#: Minimum fraction of the time of a view's loss that a CUDA graph must save to be worth its memory.
+LEAST_SAVING = 0.03
+
+
+@dataclass(frozen=True)
+class WeightCost:
+    """Cost of caching the views' blend weights. Times are measured on a GPU only.
+
+    Attributes:
+        bytes: Size in bytes of the cached weights of all views, float32; None if the rasterizer cannot cache them.
+        half_bytes: Size in bytes of the cached weights of all views in half precision; None as for `bytes`.
+        seconds: Time in seconds of a view's render and gradient with recomputed weights.
+        cached_seconds: Time in seconds of a view's render and gradient with cached weights; None if the weights of a
+            view do not fit in memory.
+        caching_seconds: Time in seconds to compute a view's cached weights.
+    """
+
+    bytes: int | None = None
+    half_bytes: int | None = None
+    seconds: float = 0.0
+    cached_seconds: float | None = None
+    caching_seconds: float = 0.0
+
+    @property
+    def least_visits(self) -> float | None:
+        """Minimum visits of a view for which cached weights save time; None if they never do, or if not measured."""
+        if self.cached_seconds is None or self.cached_seconds >= self.seconds:
+            return None
+        return self.caching_seconds / (self.seconds - self.cached_seconds)
+
+    @property
+    def text(self) -> str:
+        """The measured times, for the plan."""
+        cached, recomputed = 1e3 * (self.cached_seconds or 0), 1e3 * self.seconds
+        return f"measured per view: {cached:.3g} ms cached, {recomputed:.3g} ms recomputed"
+
+
+@dataclass(frozen=True)
+class LaunchCost:
+    """Time for a view's loss and its gradient, with and without a CUDA graph.
+
+    Attributes:
+        seconds: Seconds with kernels launched one by one.
+        replayed: Seconds as a graph.
+        capture: Seconds to capture the graph, once.
+        problem: Reason why a graph cannot be used and nothing was measured; None if it can.
+    """
+
+    seconds: float = 0.0
+    replayed: float = 0.0
+    capture: float = 0.0
+    problem: str | None = None
+
+    @property
+    def saved(self) -> float:
+        """Seconds that a graph saves per visit; 0 if too few to matter."""
+        saved = self.seconds - self.replayed
+        return saved if self.problem is None and saved > LEAST_SAVING * self.seconds else 0.0
+
+    @property
+    def least_visits(self) -> float | None:
+        """Minimum visits of views that share a graph for which it saves time; None if it never does."""
+        return FIRST_VISITS + self.capture / self.saved if self.saved else None
+
+    @property
+    def text(self) -> str:
+        """The measured times, for the plan."""
+        return (
+            f"measured per view: {1e3 * self.replayed:.3g} ms as a graph, {1e3 * self.seconds:.3g} ms kernel by "
+            f"kernel, {1e3 * self.capture:.3g} ms to capture"
+        )
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Facts about the machine and its ranks.
+
+    Attributes:
+        device: Device of the feature network.
+        memory_limit: Memory budget in bytes of all ranks on one machine together, or on one GPU.
+        sharing: Maximum number of ranks that share one machine's memory, or that of a GPU.
+        ranks: Number of available ranks.
+        problems: Reason by name for each GPU rasterizer that does not work; empty on the CPU.
+    """
+
+    device: Device
+    memory_limit: int
+    sharing: int = 1
+    ranks: int = 1
+    problems: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def memory(self) -> int:
+        """Memory budget of one rank in bytes."""
+        return self.memory_limit // self.sharing
+
+
+@dataclass(frozen=True)
+class Facts:
+    """All facts from which the decisions before the trial follow, apart from the settings.
+
+    Attributes:
+        gaussians: Number N of Gaussians.
+        sh_degree: SH degree of the scene's file.
+        used_degree: Highest SH degree with a non-zero coefficient after SH attenuation, among the rendered Gaussians.
+        harmonics_energy: See `spherical_harmonics.harmonics_energy`, with the views' blend weights.
+        sizes: (height, width) of each view.
+        survey: Survey of the views.
+        machine: Facts about the machine.
+        rasterizer: Rasterizer that computes blend weights.
+        weights: Cost of cached blend weights.
+        frozen: [N] bool, frozen Gaussians; None if there are none.
+        deepest: Name of the deepest layer in use.
+        precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision, or in bfloat16 if
+            float32 was requested; None if it is unavailable.
+        gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
+    """
+
+    gaussians: int
+    sh_degree: int
+    used_degree: int
+    harmonics_energy: float
+    sizes: tuple[Size, ...]
+    survey: Survey
+    machine: Machine
+    rasterizer: str
+    weights: WeightCost
+    frozen: Tensor | None = None
+    deepest: str = "relu5_1"
+    precision_ratio: float | None = None
+    gradient_error: Difference | None = None
+
+
+@dataclass(frozen=True)
+class NetworkPixels:
+    """Pixels through the network in one iteration on a single rank, mean over views.
+
+    Attributes:
+        all: Pixels through the forward and the backward pass, including halos.
+        again: Pixels through a second forward pass, because their activations do not fit in memory.
+        without_region: Value of `all` if uncovered pixels were processed too.
+        tiles: Maximum number of tiles of a view at one scale.
+        held: Maximum number of pixels in memory at a time, including the temporary memory of a pass in units of pixels.
+    """
+
+    all: float = 0.0
+    again: float = 0.0
+    without_region: float = 0.0
+    tiles: int = 0
+    held: float = 0.0
+
+    @staticmethod
+    def of(plan: Plan, sizes: Sequence[Size], tiling: Tiling, views: Sequence[int] | None = None) -> NetworkPixels:
+        """Count the pixels of some of a plan's views, or of all covered ones; `sizes` (height, width) are of all."""
+        pixels = again = without = held = 0.0
+        tiles, views = 0, plan.covered if views is None else views
+        for index in views:
+            for scale in tiling.scales(sizes[index]):
+                size = (sizes[index][0] >> scale, sizes[index][1] >> scale)
+                region = scaled_region(plan.survey.regions[index], scale, size) if plan.weighted else None
+                areas, whole = ([t.outer.pixels for t in tiling.tiles(size, each)] for each in (region, None))
+                flags = tiling.cached(areas)
+                twice, largest = computed_twice(areas, flags), max(areas, default=0)
+                pixels, again, without = pixels + sum(areas), again + twice, without + sum(whole)
+                tiles = max(tiles, len(areas))
+                once = max((area for area, flag in zip(areas, flags, strict=True) if not flag), default=0)
+                held = max(held, sum(areas) - twice + tiling.working * largest, (1 + tiling.working) * once)
+        return NetworkPixels(pixels / len(views), again / len(views), without / len(views), tiles, held)
+
+
+def weight_cost(rasterizer: Rasterizer, cameras: Sequence[Camera], settings: Settings, budget: int) -> WeightCost:
+    """Count the blend weights of a few evenly spread views; on a GPU, also time a view with and without cached weights.
+
+    Args:
+        rasterizer: Rasterizer that computes the weights.
+        cameras: Cameras of the views that see anything.
+        settings: Settings of the job.
+        budget: Memory budget for blend weights in bytes.
+    """
+    if not rasterizer.can_cache:
+        return WeightCost()
+    sample = spread(cameras, _SAMPLED_VIEWS)
+    middle = sample[len(sample) // 2]
+    visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(cameras)
+    if not rasterizer.on_gpu and settings.cached_weights == "auto" and visits < LEAST_VISITS:
+        sample = [middle]
+    sizes = [[counted.nbytes(format_) for format_ in _FORMATS] for counted in map(rasterizer.count_weights, sample)]
+    total, half = (sum(column) * len(cameras) // len(sample) for column in zip(*sizes, strict=True))
+    fitting = [format_ for format_, size in zip(_FORMATS, sizes[len(sample) // 2], strict=True) if size <= budget]
+    if not rasterizer.on_gpu or not fitting:
+        return WeightCost(total, half)
+    caching = 0.0
+    try:
+        for _ in range(2):  # the first run compiles
+            started = time.perf_counter()
+            rasterizer.count_weights(middle).store(fitting[0])
+            wait_for(rasterizer.device)
+            caching = time.perf_counter() - started
+        cached = CachedRasterizer(rasterizer.scene, precision=fitting[0], uncached=rasterizer)
+        recomputed, applied = (each.step_seconds(middle, visits=2)[1] for each in (rasterizer, cached))
+    except torch.OutOfMemoryError:
+        return WeightCost(total, half)
+    return WeightCost(total, half, recomputed, applied, caching)
 
 
 @dataclass(frozen=True)
@@ -72,11 +285,6 @@ class PlanningContext:
     precision_ratio: float | None
     rasterizer: Rasterizer
     sh_degree: int
-
-    @property
-    def precision(self) -> Precision:
-        """Precision of the network."""
-        return precision_of(self.settings.precision, self.precision_ratio)
 
 
 def equip(
@@ -173,6 +381,18 @@ def precision_ratio(requested: Precision, device: Device, collectives: Collectiv
     return collectives.broadcast(lambda: convolution_ratio(measured, device))
 
 
+def precision_of(requested: Precision, ratio: float | None) -> Precision:
+    """Return the precision of the network: the requested one if it is faster than float32, else float32.
+
+    Processors without bfloat16 instructions compute it hundreds of times more slowly than float32.
+
+    Args:
+        requested: Requested precision.
+        ratio: See `precision_ratio`.
+    """
+    return requested if ratio is not None and ratio > 1 else "float32"
+
+
 def convolution_ratio(precision: Precision, device: Device) -> float:
     """Return the ratio of a convolution's time in float32 to its time in another precision.
 
@@ -188,35 +408,20 @@ def convolution_ratio(precision: Precision, device: Device) -> float:
 
 
 def _convolution_seconds(precision: Precision, device: Device) -> float:
-    """Return the time in seconds of a 3x3 convolution, the fastest of some."""
+    """Return the time in seconds of a 3x3 convolution, the fastest of some; the first one warms up."""
     channels, side, dtype = _CHANNELS[device], _SIDE[device], DTYPES[precision]
     image = torch.ones((1, channels, side, side), dtype=dtype, device=device)
     kernel = torch.ones((channels, channels, 3, 3), dtype=dtype, device=device)
     if device == "cuda":
         image, kernel = (tensor.contiguous(memory_format=torch.channels_last) for tensor in (image, kernel))
-
-    def run(times: int) -> float:
-        timer = Timer(device)
-        with convolutions(image.device, tf32=precision == "tf32"), timer("convolution"):
-            for _ in range(times):
+    seconds = []
+    with convolutions(image.device, tf32=precision == "tf32"):
+        for _ in range(1 + _MEASUREMENTS):
+            timer = Timer(device)
+            with timer("convolution"):
                 torch.nn.functional.conv2d(image, kernel, padding=1)
-        return timer.read()["convolution"]
-
-    return min(seconds_of(run, _LEAST_SECONDS[device]) for _ in range(_MEASUREMENTS))
-
-
-def seconds_of(run: Callable[[int], float], least: float) -> float:
-    """Return the time in seconds of one repetition, from enough repetitions to take `least` seconds after a warm-up.
-
-    Args:
-        run: Function that repeats something a number of times and returns the total seconds.
-        least: Minimum total seconds.
-    """
-    run(1)
-    times = 1
-    while (seconds := run(times)) < least:
-        times *= 2
-    return seconds / times
+            seconds.append(timer.read()["convolution"])
+    return min(seconds[1:])
 
 
 def gradient_error(context: PlanningContext, camera: Camera) -> Difference | None:

@@ -57,7 +57,6 @@ class Survey:
         covered: Indices of the views that see anything.
         regions: Rectangle of each view that contains all covered pixels.
         uncovered_fraction: Fraction of uncovered pixels in the views that see anything.
-        shown: Mean number of Gaussians visible in such a view; None if it was not counted.
         uncovered: Fraction of uncovered pixels of each view, 1 if nothing is seen; None if not recorded per view.
     """
 
@@ -65,19 +64,7 @@ class Survey:
     covered: list[int]
     regions: list[Rectangle]
     uncovered_fraction: float
-    shown: float | None = None
     uncovered: list[float] | None = None
-
-
-@dataclass(frozen=True)
-class _ViewSurvey:
-    """Survey of one view."""
-
-    region: Rectangle
-    uncovered: float  # pixels
-    pixels: int
-    covered: bool
-    shown: int  # Gaussians
 
 
 def survey_views(
@@ -100,38 +87,28 @@ def survey_views(
         CameraError: If no camera sees a Gaussian.
     """
     weights = torch.zeros(len(scene), dtype=torch.float64, device=rasterizer.device)
-    views: dict[int, _ViewSurvey] = {}
+    views: dict[int, tuple[Rectangle, float, bool]] = {}  # region, uncovered pixels, whether anything is seen
     indices = range(collectives.rank, len(cameras), collectives.size)
     started = time.perf_counter()
-    for done, index in enumerate(indices):
+    for done, index in enumerate([*indices, None]):
         if show:
             show(progress_of(done, len(cameras), collectives.size, time.perf_counter() - started))
-        views[index] = _survey_view(cameras[index], rasterizer, weights)
-    if show:
-        show(progress_of(len(indices), len(cameras), collectives.size, time.perf_counter() - started))
+        if index is not None:
+            coverage, summed = rasterizer.survey(cameras[index])
+            uncovered, seen = float((1 - coverage).sum(dtype=torch.float64)), sees_something(coverage)
+            views[index] = covered_region(coverage), uncovered, seen
+            if seen:
+                weights += summed.double()
     for others in collectives.all_gather(views):
         views |= others
-    covered = [index for index in range(len(cameras)) if views[index].covered]
+    pixels = [camera.width * camera.height for camera in cameras]
+    covered = [index for index in range(len(cameras)) if views[index][2]]
     if not covered:
         raise nothing_seen(scene.means, cameras, rasterizer.near)
-    weights = collectives.all_reduce(weights).cpu()
-    uncovered_fraction = sum(views[index].uncovered for index in covered) / sum(
-        views[index].pixels for index in covered
+    return Survey(
+        collectives.all_reduce(weights).cpu(),
+        covered,
+        [views[index][0] for index in range(len(cameras))],
+        sum(views[index][1] for index in covered) / sum(pixels[index] for index in covered),
+        [views[index][1] / pixels[index] if views[index][2] else 1.0 for index in range(len(cameras))],
     )
-    regions = [views[index].region for index in range(len(cameras))]
-    shown = sum(views[index].shown for index in covered) / len(covered)
-    ordered = [views[index] for index in range(len(cameras))]
-    uncovered = [view.uncovered / view.pixels if view.covered else 1.0 for view in ordered]
-    return Survey(weights, covered, regions, uncovered_fraction, shown, uncovered)
-
-
-def _survey_view(camera: Camera, rasterizer: Rasterizer, weights: Tensor) -> _ViewSurvey:
-    """Survey a view, and add its blend weights to weights [N] float64."""
-    coverage, summed = rasterizer.survey(camera)
-    seen = sees_something(coverage)
-    uncovered = float((1 - coverage).sum(dtype=torch.float64))
-    shown = 0
-    if seen:
-        weights += summed.double()
-        shown = int((summed > 0).sum())
-    return _ViewSurvey(covered_region(coverage), uncovered, coverage.numel(), seen, shown)

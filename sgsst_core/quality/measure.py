@@ -79,11 +79,18 @@ class Measurements:
         """Return whether to measure the job after the given step."""
         return step > 0 and step in self.moments
 
-    def seconds_left(self, step: int) -> float:
-        """Predict the seconds of all measurements from a step on, including the initial loss."""
+    def seconds_left(self, step: int, *, ends: bool = False) -> float:
+        """Predict the seconds of all measurements from a step on, including the initial loss.
+
+        Args:
+            step: Number of completed steps.
+            ends: Whether the job ends at this step, so that only `at_the_end` remains.
+        """
         expected, measured = self._stylizer.job.plan.prediction, self._stylizer.measured
-        done = {entry["step"] for entry in measured}
-        left = sum((moment >= step or not measured) and moment not in done for moment in self.moments)
+        done, moments = {entry["step"] for entry in measured}, self.moments
+        if ends and moments:
+            moments = [0, step] if self.level.start else [step]
+        left = sum((moment >= step or not measured) and moment not in done for moment in moments)
         price: float
         losses = expected.losses if expected else 0.0
         known: list[float] = [entry["seconds"] for entry in measured[1:] if "seconds" in entry]

@@ -11,14 +11,20 @@ A region that differs from the rest in its content weight only is compared with 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from sgsst_core.decision import ANOTHER_LOSS, Decision
 from sgsst_core.errors import SettingsError
 from sgsst_core.refine.split import Refinement, parents_of
+from sgsst_core.scene.camera import Camera
 from sgsst_core.style import Style
+
+#: Number of region maps that are computed by one render, and bytes per pixel of a map at all scales.
+_MAPS_PER_RENDER, _MAP_BYTES = 3, 16 / 3
 
 
 @dataclass(frozen=True)
@@ -156,3 +162,49 @@ def check_regions(regions: Regions, sh_attenuation: float = 0.0, content_weight:
     if bool(regions.frozen.all()):
         names = ", ".join(region.name for region in regions.every if region.freeze)
         raise SettingsError(f"Every Gaussian is frozen ({names}): nothing would change. Freeze fewer regions.")
+
+
+def region_decisions(regions: Regions, weights: Tensor, cameras: Sequence[Camera]) -> list[Decision]:
+    """Return the decisions about the regions as requested, and the cost of their maps.
+
+    Args:
+        regions: Regions as requested, which have been `resolved` without an error.
+        weights: [N] float64, blend weight of each Gaussian, summed over all views.
+        cameras: Cameras of all views that are stylized.
+    """
+    resolved, lines = regions.resolved(weights), []
+    for index, region in enumerate(regions.every):
+        requested, members = int(regions.members(index).sum()), resolved.members(index)
+        seen = bool((weights[members] > 0).any())
+        reason = region.select or "not in any other region"
+        lost = region.selected - requested
+        if lost > 0:
+            reason += f"; {lost:,} more are also in a later region, which takes precedence"
+        if index and not requested:
+            decision = f"warning: ignored, because it has no Gaussians{' of its own' if lost > 0 else ''}"
+        elif region.freeze:
+            decision = f"{requested:,} Gaussians stay unchanged"
+        elif index and not seen:
+            decision = f"warning: ignored, because no view sees its {requested:,} Gaussians; they count as rest"
+        elif not seen:
+            continue  # the rest is empty
+        else:
+            fraction = float(weights[members].sum() / weights.sum())
+            decision = f"{int(members.sum()):,} of {len(weights):,} Gaussians, {fraction:.1%} of what the views show,"
+            decision += f" use {region.style.text if region.style else 'the style'}"
+            decision += f", with weight {region.weight:g}" if region.weight != 1 else ""
+            decision += "" if region.content_weight is None else f", with content weight {region.content_weight:,g}"
+        lines.append(Decision(f"region {region.name}", decision, reason, error=ANOTHER_LOSS))
+    if resolved.mapped:
+        count = len(resolved.active)
+        pixels = sum(camera.width * camera.height for camera in cameras)
+        renders = 1 + -(-count // _MAPS_PER_RENDER)  # plus one for the background
+        decision = (
+            f"statistics of {count} region{'' if count == 1 else 's'} are weighted by each region's fraction of a "
+            f"pixel's blend weights; {renders} renders at a view's first visit, "
+            f"{int(_MAP_BYTES * count * pixels) / 1e6:.1f} MB for all views"
+        )
+        lines.append(
+            Decision("regions", decision, "otherwise styles would leak into other regions", error=ANOTHER_LOSS)
+        )
+    return lines

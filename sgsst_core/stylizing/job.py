@@ -179,12 +179,6 @@ class StylizationJob:
         """Caches of data of the views by name, "weights" before "intersections"."""
         return {**self.views.caches, **self.view_targets.caches}
 
-    def intersection_budget(self, weights: int) -> int:
-        """Return the budget for tile intersections in bytes if cached blend weights take `weights` bytes."""
-        rasterizer, memory = self.views.rasterizer, memory_for("rasterizer", self.memory)
-        budget = rasterizer.intersection_budget(weights) if isinstance(rasterizer, CachedRasterizer) else memory
-        return memory if budget is None else budget
-
     def gradient(
         self,
         index: int,
@@ -301,6 +295,15 @@ def prepare_job(
         memory=memory,
         style_targets=StyleTargetCache(styles.to(network.device), loss),
     )
+
+
+def continued(job: StylizationJob, plan: Plan) -> StylizationJob:
+    """Return the job of a trial under its completed plan. What the trial has cached stays, as far as it fits."""
+    job.team.expect(plan)
+    memory = view_memory(plan, job.memory)
+    job.views.limit(memory)
+    job.view_targets.limit(memory)
+    return replace(job, plan=plan, graphs=LossGraphs(job.loss) if plan.graphs else None)
 
 
 def _job_styles(

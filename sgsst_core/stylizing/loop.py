@@ -164,22 +164,14 @@ def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
 
 
 def _pace(stylizer: Stylizer) -> SecondsLeft:
-    """Return the estimator of the remaining time, including the steps of earlier sessions."""
+    """Return the estimator of the remaining time."""
     expected = stylizer.job.plan.prediction or Prediction(0.0, 0.0, 0)
     seconds = {
         "coarse": (expected.seconds_coarse, expected.first_visit_coarse),
         "sos": (expected.seconds, expected.first_visit),
     }
     phases = {phase.stage: Pace(phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.job.schedule}
-    views_per_step = stylizer.job.settings.views_per_step
-    pace = SecondsLeft(phases, stylizer.job.views.covered, views_per_step)
-    if views_per_step == 1:  # a record names only one view of its step
-        before = 0.0
-        for record in stylizer.history:
-            pace.add_step(record.stage, [record.view], record.seconds - before)
-            before = record.seconds
-        pace.resume()
-    return pace
+    return SecondsLeft(phases, stylizer.job.views.covered, stylizer.job.settings.views_per_step)
 
 
 def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
@@ -193,7 +185,7 @@ def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
 def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft, running: RunningRound) -> Progress:
     record, most, measure = stylizer.history[-1], stylizer.job.settings.max_seconds, callbacks.measure
     expected = stylizer.job.plan.prediction
-    left = pace.left(stylizer.step, stylizer.coming, limit=most - stylizer.seconds if most else None)
+    left = pace.left(stylizer.step, limit=most - stylizer.seconds if most else None)
     left += measure.seconds_left(stylizer.step) if measure else 0.0
     stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
     if expected:

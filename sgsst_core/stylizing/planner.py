@@ -2,55 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
-
-from numpy.typing import NDArray
-from torch import Tensor
 
 from sgsst_core.budget import memory_for
-from sgsst_core.decision import Decision
+from sgsst_core.decision import ANOTHER_LOSS, Decision
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.loss.feature_scale import weights_for
-from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.orbit.choice import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut
 from sgsst_core.planning import choices
-from sgsst_core.planning.choices import ANOTHER_LOSS
-from sgsst_core.planning.context import PlanningContext, equip, gradient_error
-from sgsst_core.planning.facts import Facts, weight_cost
+from sgsst_core.planning.context import Facts, NetworkPixels, PlanningContext, equip, gradient_error, weight_cost
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
 from sgsst_core.progress import Progress
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
-from sgsst_core.regions.definition import Regions
-from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras
+from sgsst_core.regions.definition import Regions, region_decisions
+from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.colors import color_subspace_of
-from sgsst_core.scene.gaussians import Scene, checked_scene
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import harmonics_energy
 from sgsst_core.settings import Settings
-from sgsst_core.style import Style, image_of
-from sgsst_core.stylizing.job import StylizationJob, prepare_job
+from sgsst_core.style import Style
+from sgsst_core.stylizing.job import StylizationJob, continued, prepare_job
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.prediction import (
-    completed_plan,
-    draft_plan,
-    measures_launches,
-    network_pixels,
-    with_spare_memory,
-)
-from sgsst_core.stylizing.refining import refine, refined
+from sgsst_core.stylizing.prediction import completed_plan, with_spare_memory
 from sgsst_core.stylizing.trial import Trial, launch_cost, run_trial
 from sgsst_core.timing import Timer
-
-#: Number of region maps that are computed by one render, and bytes per pixel of a map at all scales.
-_MAPS_PER_RENDER, _MAP_BYTES = 3, 16 / 3
 
 
 def plan_job(
@@ -63,6 +46,7 @@ def plan_job(
     photos: PhotoLoader | None = None,
     rasterizer: str | None = None,
     collectives: Collectives = ALONE,
+    plan: Plan | None = None,
     survey: Survey | None = None,
     measured: bool = False,
     show: ShowPlanning | None = None,
@@ -83,12 +67,14 @@ def plan_job(
         settings: Settings of the job.
         weights: Weights of the feature network; None for VGG19, or VGG16 if only that is installed.
         photos: See `prepare_job`.
-        rasterizer: Rasterizer that computes blend weights: "cpu", "triton", "cuda" or "reference". None to choose one.
+        rasterizer: Rasterizer that computes blend weights: "cpu", "triton" or "reference". None to choose one.
         collectives: Ranks of the job.
+        plan: Plan from an earlier run of the same job, which is used unchanged; None to make one.
         survey: Survey from an earlier plan of the same job; None to survey the views.
         measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
         show: Callback for the progress of the survey and the trial.
-        timer: Timer that records the survey as "survey", and everything else as "planning".
+        timer: Timer that records the survey as "survey", other planning as "planning", and the preparation of a job
+            with an earlier plan as "preparing".
         orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
         about_inputs: Decisions about cameras and photos that start the plan.
         regions: Regions of the scene; None if there are none.
@@ -103,117 +89,91 @@ def plan_job(
     """
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
-    timer = timer or Timer()
+    timer, weights = timer or Timer(), weights or load_network_weights("auto")
+
+    def prepared(plan: Plan, context: PlanningContext | None = None) -> StylizationJob:
+        return prepare_job(
+            plan, scene, cameras, style, settings, weights=weights, photos=photos, collectives=collectives,
+            planning_context=context, regions=regions,
+        )  # fmt: skip
+
+    if plan is not None:
+        with timer("preparing"):
+            return prepared(plan)
     with timer("planning"):
         fitted = fit_cameras(cameras, settings)
         check_scales(settings.scales, fitted, settings.coarsest_side)
         check_stroke_depth(settings, fitted, regions=regions is not None)
-        weights = weights or load_network_weights("auto")
         context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
         if survey is None:
             with timer("survey"):
                 survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
-        resolved = regions and regions.resolved(survey.total_blend_weights)
         if show:
             show(Progress(stage="probing"))
-        facts = collectives.broadcast(lambda: _facts(context, survey, resolved))
-        draft = draft_plan(facts, settings, precision=context.precision, measured=measured)
+        facts = collectives.broadcast(lambda: _facts(context, survey, regions))
+        draft = choices.draft_plan(facts, settings, measured=measured)
         activations = memory_for("activations", context.machine.memory)
-        pixels = network_pixels(draft, facts, make_loss(context.network, settings, activations).tiling)
+        pixels = NetworkPixels.of(draft, facts.sizes, make_loss(context.network, settings, activations).tiling)
         of_a_view = int(pixels.held * context.network.held_bytes_per_pixel())
         draft = with_spare_memory(draft, facts, of_a_view)
-        request_lines = [
-            *about_inputs,
-            *([refine_decision(refinement, settings)] if refinement is not None else []),
-            *(orbit_decisions(orbit, fitted, survey.uncovered) if orbit is not None else []),
-            *(_about_regions(regions, resolved, draft, fitted) if regions and resolved is not None else []),
-            *_about_styles(style, regions, settings),
-        ]
-
-        def prepared(plan: Plan) -> StylizationJob:
-            return prepare_job(
-                plan, scene, cameras, style, settings, weights=weights, photos=photos, collectives=collectives,
-                planning_context=context, regions=regions,
-            )  # fmt: skip
-
-        job, trials, cost = None, dict[int, Trial](), None
-        for ranks in _candidates(facts.machine.ranks, settings):
-            job = own = None  # frees the memory of the last one
-            try:
-                job = prepared(replace(draft, ranks=ranks))
-                own = run_trial(job)
-            except RankLeftOut:
-                pass
-            of_first = collectives.all_gather(own)[0]
-            assert of_first is not None  # the first rank takes part in every trial
-            trials[ranks] = of_first
-        if job is not None and measures_launches(draft, facts, settings):
-            cost = launch_cost(job)
+        lines = [*about_inputs]
+        if refinement is not None:
+            lines.append(refine_decision(refinement, settings))
+        if orbit is not None:
+            lines += orbit_decisions(orbit, fitted, survey.uncovered)
+        if regions is not None:
+            lines += region_decisions(regions, survey.total_blend_weights, [fitted[index] for index in draft.covered])
+        lines += _about_styles(style, regions, settings)
+        counts = _rank_counts(facts.machine.ranks, settings)
+        job, trials = _try(lambda ranks: prepared(replace(draft, ranks=ranks), context), counts, collectives, show)
+        cost = launch_cost(job) if job is not None and choices.considers_graphs(draft, facts, settings) else None
         plan = collectives.broadcast(lambda: completed_plan(draft, facts, settings, pixels, trials, cost))
         plan = with_spare_memory(plan, facts, of_a_view)  # graphs, which the draft lacks, leave less
-        plan = replace(plan, refinement=refinement, decisions=(*request_lines, *plan.decisions))
-        if job is None or (plan.ranks, plan.spare) != (job.collectives.size, draft.spare):
-            job = None
-            return prepared(plan)
-        job.team.expect(plan)
-        return replace(job, plan=plan, graphs=LossGraphs(job.loss) if plan.graphs else None)
+        plan = replace(plan, refinement=refinement, decisions=(*lines, *plan.decisions))
+        if job is not None and plan.ranks == job.collectives.size:
+            return continued(job, plan)
+        job = None  # frees its memory
+        return prepared(plan, context)
 
 
-def refine_and_plan(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    style: Tensor | NDArray[Any] | Style,
-    settings: Settings,
-    *,
-    weights: BackboneWeights | None = None,
-    photos: PhotoLoader | None = None,
-    rasterizer: str | None = None,
-    collectives: Collectives = ALONE,
-    regions: Regions | None = None,
-    show: ShowPlanning | None = None,
-) -> StylizationJob:
-    """Refine the scene if the settings request it, then plan and prepare the job; see `plan_job`.
+def _try(
+    prepared: Callable[[int], StylizationJob],
+    counts: Sequence[int],
+    collectives: Collectives,
+    show: ShowPlanning | None,
+) -> tuple[StylizationJob | None, dict[int, Trial]]:
+    """Make a trial of a job with each of some numbers of ranks.
 
-    Inputs are checked, and converted if necessary.
+    Returns:
+        The last job, or None if this rank does not take part in it; and the trials by number of ranks.
     """
-    style, regions = Style.given(style), regions and regions.with_checked_styles()
-    scene, cameras = checked_scene(scene), checked_cameras(cameras)
-    weights = weights or load_network_weights("auto")
-    refinement = refine(
-        scene,
-        cameras,
-        style,
-        settings,
-        weights=weights,
-        rasterizer=rasterizer,
-        collectives=collectives,
-        regions=regions,
-        show=show,
-    )
-    scene, regions = refined(scene, refinement), regions and regions.refined(refinement)
-    return plan_job(
-        scene,
-        cameras,
-        style,
-        settings,
-        weights=weights,
-        photos=photos and (lambda index: image_of(photos(index), f"photo of view {index}")),
-        rasterizer=rasterizer,
-        collectives=collectives,
-        regions=regions,
-        refinement=refinement,
-        show=show,
-    )
+    trials: dict[int, Trial] = {}
+    for ranks in counts:
+        job = own = None  # frees the memory of the last one
+
+        def show_views(visited: int, views: int) -> None:
+            if show:
+                show(Progress(stage="probing", step=len(trials) * views + visited, total=len(counts) * views))
+
+        try:
+            job = prepared(ranks)
+            own = run_trial(job, show_views)
+        except RankLeftOut:
+            pass
+        of_first = collectives.all_gather(own)[0]
+        assert of_first is not None  # the first rank takes part in every trial
+        trials[ranks] = of_first
+    return job, trials
 
 
-def _candidates(available: int, settings: Settings) -> list[int]:
+def _rank_counts(available: int, settings: Settings) -> list[int]:
     """Return the numbers of ranks to try: all, half of them and so on. The job of the last trial can be continued."""
     if not settings.rebalance:
         return [available]
     return sorted({max(available >> halvings, 1) for halvings in range(available.bit_length())})
 
 
-def _facts(context: PlanningContext, survey: Survey, resolved: Regions | None) -> Facts:
+def _facts(context: PlanningContext, survey: Survey, regions: Regions | None) -> Facts:
     """Gather the facts on which the decisions before the trial depend; one rank does this for all."""
     scene, settings = context.scene, context.settings
     views = [context.cameras[index] for index in survey.covered]
@@ -221,14 +181,14 @@ def _facts(context: PlanningContext, survey: Survey, resolved: Regions | None) -
     return Facts(
         gaussians=len(scene),
         sh_degree=context.sh_degree,
-        used_degree=scene.used_degree(choices.rendered_gaussians(survey)),
+        used_degree=scene.used_degree(survey.total_blend_weights > 0),
         harmonics_energy=harmonics_energy(scene, survey.total_blend_weights),
         sizes=tuple((camera.height, camera.width) for camera in context.cameras),
         survey=survey,
         machine=context.machine,
         rasterizer=context.rasterizer.name,
-        weights=weight_cost(context.rasterizer, views, settings, budget, choices.LEAST_VISITS),
-        frozen=None if resolved is None else resolved.frozen,
+        weights=weight_cost(context.rasterizer, views, settings, budget),
+        frozen=None if regions is None else regions.resolved(survey.total_blend_weights).frozen,
         deepest=max(context.network.layers),
         precision_ratio=context.precision_ratio,
         gradient_error=gradient_error(context, views[0]),
@@ -251,49 +211,3 @@ def _about_styles(style: Style, regions: Regions | None, settings: Settings) -> 
             "; features are matched with those of all images, whose weights matter only if there are too many features"
         )
     return [*lines, Decision("styles", f"a mixture: {style.text}", reason, error=ANOTHER_LOSS)]
-
-
-def _about_regions(regions: Regions, resolved: Regions, plan: Plan, cameras: Sequence[Camera]) -> list[Decision]:
-    """Return the decisions about the regions and the cost of their maps.
-
-    Args:
-        regions: Regions as requested.
-        resolved: Regions after `Regions.resolved`.
-        plan: Plan under construction.
-        cameras: Cameras of all views.
-    """
-    weights = plan.survey.total_blend_weights
-    lines = []
-    for index, region in enumerate(regions.every):
-        requested, members = int(regions.members(index).sum()), resolved.members(index)
-        seen = bool((weights[members] > 0).any())
-        reason = region.select or "not in any other region"
-        lost = region.selected - requested
-        if lost > 0:
-            reason += f"; {lost:,} more are also in a later region, which takes precedence"
-        if index and not requested:
-            decision = f"warning: ignored, because it has no Gaussians{' of its own' if lost > 0 else ''}"
-        elif region.freeze:
-            decision = f"{requested:,} Gaussians stay unchanged"
-        elif index and not seen:
-            decision = f"warning: ignored, because no view sees its {requested:,} Gaussians; they count as rest"
-        elif not seen:
-            continue  # the rest is empty
-        else:
-            fraction = float(weights[members].sum() / weights.sum())
-            decision = f"{int(members.sum()):,} of {len(weights):,} Gaussians, {fraction:.1%} of what the views show,"
-            decision += f" use {region.style.text if region.style else 'the style'}"
-            decision += f", with weight {region.weight:g}" if region.weight != 1 else ""
-            decision += "" if region.content_weight is None else f", with content weight {region.content_weight:,g}"
-        lines.append(Decision(f"region {region.name}", decision, reason, error=ANOTHER_LOSS))
-    if not resolved.mapped:
-        return lines
-    count = len(resolved.active)
-    pixels = sum(cameras[index].width * cameras[index].height for index in plan.covered)
-    renders = 1 + -(-count // _MAPS_PER_RENDER)  # plus one for the background
-    decision = (
-        f"statistics of {count} region{'' if count == 1 else 's'} are weighted by each region's fraction of a pixel's "
-        f"blend weights; {renders} renders at a view's first visit, {int(_MAP_BYTES * count * pixels) / 1e6:.1f} MB "
-        "for all views"
-    )
-    return [*lines, Decision("regions", decision, "otherwise styles would leak into other regions", error=ANOTHER_LOSS)]

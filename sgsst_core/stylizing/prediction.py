@@ -1,4 +1,4 @@
-"""Plan of a job from the facts about it, completed and predicted from its trial; without rendering or measuring."""
+"""Prediction of a job's time and memory from its trial, and the choices that depend on the trial."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from dataclasses import replace
 
 from sgsst_core.budget import measuring_memory, memory_for, peak_memory
 from sgsst_core.decision import Decision
-from sgsst_core.loss.tiling import Tiling
 from sgsst_core.number_format import duration
 from sgsst_core.planning import choices
-from sgsst_core.planning.facts import Facts, LaunchCost, NetworkPixels
+from sgsst_core.planning.context import Facts, LaunchCost, NetworkPixels
 from sgsst_core.planning.measurement_choice import (
     LEAST_ALLOWED,
     LEVELS,
-    LOSS_VIEWS,
     RENDERED,
     Prices,
     allowed_seconds,
@@ -23,9 +21,8 @@ from sgsst_core.planning.measurement_choice import (
     novel_view_seconds,
 )
 from sgsst_core.planning.plan import Plan, Prediction
-from sgsst_core.scene.pyramid import scale_count
-from sgsst_core.settings import Precision, Settings
-from sgsst_core.stylizing.trial import NETWORK, Trial
+from sgsst_core.settings import Settings
+from sgsst_core.stylizing.trial import Trial
 
 #: Time from the last step to the last file written: constant seconds for images and report, and seconds per Gaussian
 #: for the neighbor search and for writing (measured with 4 million Gaussians on two cores; an estimate elsewhere).
@@ -43,46 +40,6 @@ _NOVEL_GAUSSIAN_BYTES, _NOVEL_PIXEL_BYTES = 12, 84
 _RENDER, _DEPTH_RENDERS = 0.5, 2
 
 
-def draft_plan(facts: Facts, settings: Settings, *, precision: Precision, measured: bool) -> Plan:
-    """Choose everything that needs no trial. The plan lacks ranks, graphs, measurements, decisions and prediction.
-
-    Args:
-        facts: Facts about the job.
-        settings: Settings of the job.
-        precision: Precision of the network.
-        measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
-    """
-    survey = facts.survey
-    weighted, _ = choices.position_weights(survey, settings)
-    scan = choices.is_scan(survey, weighted=weighted)
-    rendered = choices.rendered_gaussians(survey)
-    cached_weights, _ = choices.blend_weights(facts, settings, choices.Visits.of(survey, facts.sizes, settings))
-    return Plan(
-        survey=survey,
-        optimized=rendered if facts.frozen is None else rendered & ~facts.frozen,
-        seen=rendered,
-        covered=tuple(survey.covered),
-        weighted=weighted,
-        steps_coarse=choices.steps_coarse(choices.computed_scales(facts.sizes, settings), settings)[0],
-        training_background=choices.training_background(settings, scan=scan),
-        warm_start=choices.warm_start(survey, settings, scan=scan)[0],
-        memory_limit=facts.machine.memory_limit,
-        device=facts.machine.device,
-        rasterizer=facts.rasterizer if cached_weights == "none" else "cached",
-        uncached=facts.rasterizer,
-        precision=precision,
-        cached_weights=cached_weights,
-        measured=measured,
-        loss_views=min(LOSS_VIEWS[0], len(survey.covered)),
-    )
-
-
-def network_pixels(plan: Plan, facts: Facts, tiling: Tiling) -> NetworkPixels:
-    """Count the pixels through the network on a single rank."""
-    regions = [plan.survey.regions[index] if plan.weighted else None for index in plan.covered]
-    return NetworkPixels.of([(facts.sizes[i], region) for i, region in zip(plan.covered, regions, strict=True)], tiling)
-
-
 def with_spare_memory(plan: Plan, facts: Facts, activations: int) -> Plan:
     """Add to a plan the memory for activations that the steps of a single rank on a GPU do not need.
 
@@ -91,23 +48,13 @@ def with_spare_memory(plan: Plan, facts: Facts, activations: int) -> Plan:
         facts: Facts about the job.
         activations: Bytes of the activations of a view.
     """
-    machine = facts.machine
-    if machine.device == "cpu" or machine.ranks > 1:
+    if plan.device == "cpu" or facts.machine.ranks > 1:
         return plan
-    budget = memory_for("activations", machine.memory)
-    needed = activations
+    budget, needed = memory_for("activations", facts.machine.memory), activations
     if plan.measured and plan.is_approximated:  # the float32 reference needs more
         needed = max(min(int(activations * _reference_size(plan)), budget), activations)
     # A CUDA graph does not share its memory: evaluating the loss without the graph needs the same amount again.
     return replace(plan, spare=max(budget - needed - (activations if plan.graphs else 0), 0))
-
-
-def measures_launches(plan: Plan, facts: Facts, settings: Settings) -> bool:
-    """Return whether views of one size are visited often enough on a GPU to consider a CUDA graph of their loss."""
-    sizes = {facts.sizes[index] for index in plan.covered}
-    visits = (settings.steps_coarse + settings.steps_sos) * settings.views_per_step / len(sizes)
-    rare = visits < choices.LEAST_GRAPH_VISITS
-    return plan.device == "cuda" and not rare and not choices.divides_views(facts.machine.ranks, settings)
 
 
 def completed_plan(
@@ -135,65 +82,41 @@ def completed_plan(
         for ranks, trial in trials.items()
     }
     ranks = choices.choose_ranks(seconds)
-    trial, survey = trials[ranks], facts.survey
-    visits = choices.Visits.of(survey, facts.sizes, settings)
-    phases = bool(plan.steps_coarse) + bool(settings.steps_sos)
-    graphs, launch_lines = choices.launches(facts, settings, visits, phases, cost)
-    plan = replace(plan, ranks=ranks, graphs=graphs)
-    prediction = _predicted_steps(plan, facts, settings, trials, cost)
+    trial = trials[ranks]
+    plan = replace(plan, ranks=ranks, graphs=choices.uses_graphs(plan, facts, settings, cost))
+    one_rank = trials[1].sos.seconds if facts.machine.ranks > 1 and 1 in trials else None
+    prediction = replace(_predicted_steps(plan, facts, settings, trial, cost), seconds_one_rank=one_rank)
     if plan.measured:
         plan, prediction = _with_measurements(plan, prediction, facts, settings, trial)
     process, device = _peak_bytes(plan, facts, settings, trial)
     plan = replace(plan, prediction=replace(prediction, peak_bytes=process, device_bytes=device))
-    scan = choices.is_scan(survey, weighted=plan.weighted)
-    weights_line = choices.blend_weights(facts, settings, visits)[1]
-    if plan.cached_weights != "none":
-        weights_line = replace(weights_line, seconds=max(trial.render - trial.sos.of("render", "raster_backward"), 0.0))
-    counts = [scale_count(*facts.sizes[index], settings.coarsest_side) for index in plan.covered]
-    lines = (
-        *choices.about_gaussians(facts, plan.seen, settings),
-        *choices.about_views(facts),
-        *choices.about_uncovered_pixels(pixels, survey, trial.sos.of(*NETWORK)),
-        *choices.position_weights(survey, settings)[1],
-        *choices.about_training_background(plan.training_background, survey, settings, trial.sos.of("prepare")),
-        *choices.warm_start(survey, settings, scan=scan)[1],
-        *choices.about_colors(settings),
-        *choices.about_network(pixels, facts, settings, trial.sos.of("matching"), trial.sos.of("vgg_forward")),
-        *choices.about_rasterizer(facts, cached=plan.cached_weights != "none"),
-        *launch_lines,
-        weights_line,
-        *choices.about_scales(counts, settings),
-        *choices.steps_coarse(choices.computed_scales(facts.sizes, settings), settings)[1],
-        *choices.about_early_stop(plan.training_background, len(plan.covered), settings),
-        *choices.about_shared_gpus(facts),
-        *choices.about_ranks(ranks, seconds, facts.machine.ranks),
-        *choices.precision(facts, settings)[1],
-        *([_about_measuring(plan, settings)] if plan.measured else []),
-    )
-    return replace(plan, decisions=lines)
+    saved = max(trial.render - trial.sos.of("render", "raster_backward"), 0.0)
+    parts = {**trial.sos.parts, "cached weights": saved}
+    lines = choices.decisions(plan, facts, settings, pixels, parts, cost, seconds)
+    return replace(plan, decisions=(*lines, *([_about_measuring(plan, settings)] if plan.measured else [])))
 
 
-def _predicted_steps(
-    plan: Plan, facts: Facts, settings: Settings, trials: Mapping[int, Trial], cost: LaunchCost | None
-) -> Prediction:
+def _predicted_steps(plan: Plan, facts: Facts, settings: Settings, trial: Trial, cost: LaunchCost | None) -> Prediction:
     """Return the prediction for the steps, with first visits and style; those of the trial have been made already."""
-    trial, views = trials[plan.ranks], len(plan.covered)
+    views = len(plan.covered)
     saved = settings.views_per_step * cost.saved if cost and plan.graphs else 0.0
-    seconds = max(trial.sos.seconds - saved, 0.0), max(trial.coarse.seconds - saved, 0.0)
     unvisited = max(1 - trial.views / views, 0.0)
-    first = trial.sos.first * unvisited, trial.coarse.first * unvisited
+    phases = [
+        (steps, max(own.seconds - saved, 0.0), own.first * unvisited)
+        for steps, own in ((settings.steps_sos, trial.sos), (plan.steps_coarse, trial.coarse))
+    ]
     style = trial.style * max(len({facts.sizes[index] for index in plan.covered}) - 1, 0)
     job = style + sum(
-        steps * own + min(steps * settings.views_per_step, views) * more
-        for steps, own, more in zip((settings.steps_sos, plan.steps_coarse), seconds, first, strict=True)
+        steps * seconds + min(steps * settings.views_per_step, views) * first for steps, seconds, first in phases
     )
+    (_, seconds, first), (_, seconds_coarse, first_coarse) = phases
     return Prediction(
-        *seconds,
+        seconds,
+        seconds_coarse,
         0,
         communication=trial.sos.of("communication"),
-        seconds_one_rank=trials[1].sos.seconds if facts.machine.ranks > 1 and 1 in trials else None,
-        first_visit=first[0],
-        first_visit_coarse=first[1],
+        first_visit=first,
+        first_visit_coarse=first_coarse,
         style=style,
         job=min(job, settings.max_seconds or job),
     )

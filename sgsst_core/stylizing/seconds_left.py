@@ -1,4 +1,4 @@
-"""Estimate of the remaining time of a job: measured steps, or those that the plan predicts, times the steps left.
+"""Remaining time of a job: measured steps, or those that the plan predicts, times the steps left.
 
 The first visit of a view in a phase takes longer than later ones, so steps with and without first visits are counted
 separately. What no step has shown yet is taken from the plan, scaled by the ratio of measured to predicted steps.
@@ -7,7 +7,7 @@ separately. What no step has shown yet is taken from the plan, scaled by the rat
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -21,7 +21,7 @@ class Pace:
 
     Attributes:
         steps: Number of steps of the phase.
-        expected: Predicted seconds of a step whose views have all been visited before; 0 if unknown.
+        expected: Predicted seconds of a step whose views have all been visited before.
         expected_first: Predicted additional seconds of each view's first visit.
         visited: Views that the phase has visited in this session; caches are empty after a resume.
         later: Seconds of the latest steps without first visits.
@@ -35,23 +35,13 @@ class Pace:
     later: deque[float] = field(default_factory=lambda: deque(maxlen=_LATEST))
     first: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=_LATEST))
 
-    @property
-    def ratio(self) -> float | None:
-        """Ratio of measured to predicted seconds of a step; None if unknown."""
-        return median(self.later) / self.expected if self.later and self.expected else None
-
-    def prices(self, ratio: float, unknown: float) -> tuple[float, float]:
+    def prices(self, ratio: float) -> tuple[float, float]:
         """Return the seconds of a step, and the additional seconds of each first visit.
 
         Args:
             ratio: Ratio of measured to predicted seconds of steps of any phase.
-            unknown: Seconds of a step if nothing is known about the phase.
         """
-        if self.later:
-            step = median(self.later)
-        else:
-            known = [*([self.expected * ratio] if self.expected else []), *(seconds for seconds, _ in self.first)]
-            step = min(known, default=unknown)
+        step = median(self.later) if self.later else min([self.expected * ratio, *(own for own, _ in self.first)])
         if not self.first:
             return step, self.expected_first * ratio
         return step, max(median((seconds - step) / views for seconds, views in self.first), 0.0)
@@ -84,38 +74,24 @@ class SecondsLeft:
             phase.later.append(seconds)
         self._seconds += seconds
 
-    def resume(self) -> None:
-        """Assign all steps so far to an earlier session of the job: every view has a first visit again."""
-        for phase in self._phases.values():
-            phase.visited = set()
-        self._seconds = 0.0
-
     def add_beside(self, seconds: float) -> None:
         """Record time that is neither a step nor a measurement: a checkpoint or a preview."""
         self._beside += seconds
 
-    def left(self, step: int, queue: Sequence[int], *, limit: float | None = None) -> float:
+    def left(self, step: int, *, limit: float | None = None) -> float:
         """Return the remaining seconds of the steps, and of what happens between them except for measurements.
 
         Args:
             step: Number of steps completed in all sessions.
-            queue: Remaining views of this round, next one first.
             limit: Upper bound on the remaining seconds of steps; None for no bound.
         """
         phases, seconds, start = list(self._phases.values()), 0.0, 0
-        ratio = next((phase.ratio for phase in reversed(phases) if phase.ratio), 1.0)
-        every = [seconds for phase in phases for seconds in (*phase.later, *(first for first, _ in phase.first))]
+        ratios = [median(phase.later) / phase.expected for phase in phases if phase.later and phase.expected]
         for phase in phases:
             steps = phase.steps - min(max(step - start, 0), phase.steps)
-            later, first = phase.prices(ratio, median(every) if every else 0.0)
-            coming = queue if step >= start else ()
-            seconds += steps * later + self._first_visits(phase, coming, steps * self._views_per_step) * first
+            later, first = phase.prices(ratios[-1] if ratios else 1.0)
+            unvisited = len(self._views - phase.visited)  # each round visits all of them
+            seconds += steps * later + min(unvisited, steps * self._views_per_step) * first
             start += phase.steps
         beside = self._beside / self._seconds if self._seconds else 0.0
         return (seconds if limit is None else min(seconds, max(limit, 0.0))) * (1 + beside)
-
-    def _first_visits(self, phase: Pace, queue: Sequence[int], visits: int) -> float:
-        """Return the number of first visits; those after the queue count with their probability."""
-        unknown, soon = self._views - phase.visited, set(queue[:visits])
-        later = min((visits - min(visits, len(queue))) / max(len(self._views), 1), 1.0)
-        return len(unknown & soon) + len(unknown - soon) * later

@@ -18,16 +18,16 @@ from torch import Tensor
 
 from sgsst_core.budget import device_peak
 from sgsst_core.errors import DivergedError
-from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.regions.definition import Regions
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.camera import Camera, checked_cameras
+from sgsst_core.scene.gaussians import Scene, checked_scene
 from sgsst_core.settings import Settings
-from sgsst_core.style import Style
+from sgsst_core.style import Style, image_of
 from sgsst_core.stylizing.evaluation import (
     Evaluation,
     ShowViews,
@@ -39,7 +39,8 @@ from sgsst_core.stylizing.evaluation import (
 from sgsst_core.stylizing.job import StylizationJob, with_second_attempt
 from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.planner import refine_and_plan
+from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.result_colors import result_colors, transferred_colors
 from sgsst_core.stylizing.schedule import (
     BEFORE_STEPS,
@@ -121,9 +122,9 @@ class Stylizer:
         regions: Regions | None = None,
         show: ShowPlanning | None = None,
     ) -> Self:
-        """Plan a job and create its stylizer; see `refine_and_plan`.
+        """Check the inputs, refine the scene if the settings request it, plan the job, and create its stylizer.
 
-        If the settings request refinement, the job contains the refined scene.
+        The arguments are those of `plan_job`. The job contains the refined scene.
 
         Example:
             >>> scene, cameras = load_scene("scene.ply").scene, load_cameras("cameras.json")
@@ -132,16 +133,31 @@ class Stylizer:
             >>> stylizer.job.total_steps
             2
         """
-        job = refine_and_plan(
+        style, regions = Style.given(style), regions and regions.with_checked_styles()
+        scene, cameras = checked_scene(scene), checked_cameras(cameras)
+        weights = weights or load_network_weights("auto")
+        refinement = refine(
             scene,
             cameras,
             style,
             settings,
             weights=weights,
-            photos=photos,
             rasterizer=rasterizer,
             collectives=collectives,
             regions=regions,
+            show=show,
+        )
+        job = plan_job(
+            refined(scene, refinement),
+            cameras,
+            style,
+            settings,
+            photos=photos and (lambda index: image_of(photos(index), f"photo of view {index}")),
+            regions=regions and regions.refined(refinement),
+            refinement=refinement,
+            weights=weights,
+            rasterizer=rasterizer,
+            collectives=collectives,
             show=show,
         )
         return cls(job)
@@ -300,11 +316,6 @@ class Stylizer:
         else:
             return
         self.job.view_targets.prefetch(index, phase.scales(self.job.scales(index)))
-
-    @property
-    def coming(self) -> list[int]:
-        """Remaining views of this round, next one first."""
-        return self._order.left[::-1]
 
     def evaluate(
         self, indices: Sequence[int], sh_dc: Tensor | None = None, show: ShowViews = show_nothing

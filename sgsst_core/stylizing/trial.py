@@ -7,26 +7,27 @@ changes nothing else, so the steps that follow are the same.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
-from statistics import mean
+from statistics import mean, median
 
 import psutil
 import torch
 
-from sgsst_core.budget import device_peak
+from sgsst_core.budget import device_peak, memory_for
 from sgsst_core.loss.graphs import LossGraphs, graphs_problem
-from sgsst_core.planning.facts import LaunchCost, NetworkPixels
+from sgsst_core.planning.context import LaunchCost, NetworkPixels
+from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.stylizing.job import StylizationJob, with_second_attempt
 from sgsst_core.stylizing.optimizer import ColorOptimizer
 from sgsst_core.stylizing.schedule import Phase, drawn_views
 from sgsst_core.stylizing.training_background import drawn_color
 from sgsst_core.timing import Timer
 
-#: A visit is repeated until the repetitions take so many seconds, but at most so many times; the fastest one counts.
-_ENOUGH_SECONDS, _REPETITIONS = 0.3, 3
+#: A visit that takes fewer seconds is repeated so many times, of which the fastest counts; others are repeated once.
+_FAST, _REPETITIONS = 0.15, 3
 #: Seconds of a visit above which it is not repeated, and no second view is visited.
 _SLOW = 1.0
 #: Activities whose time is in proportion to the pixels through the network.
@@ -87,10 +88,14 @@ class Trial:
     free: int
 
 
-def run_trial(job: StylizationJob) -> Trial:
-    """Visit one or two views of a job in both phases. All ranks of the job must call this, and get the same result."""
-    own = _Visitor(job).run()
-    trials = job.collectives.all_gather(own)
+def run_trial(job: StylizationJob, show: Callable[[int, int], None] = lambda done, total: None) -> Trial:
+    """Visit one or two views of a job in both phases. All ranks of the job must call this, and get the same result.
+
+    Args:
+        job: Job, before its first step.
+        show: Callback that receives the number of visited and of all views, where each phase counts.
+    """
+    trials = job.collectives.all_gather(_Visitor(job, show).run())
     slowest = max(trials, key=lambda trial: trial.sos.seconds)
     largest = max(trials, key=lambda trial: (trial.device or 0, trial.process + trial.growth))
     return replace(slowest, **{name: getattr(largest, name) for name in ("process", "device", "passing", "growth")})
@@ -99,82 +104,80 @@ def run_trial(job: StylizationJob) -> Trial:
 class _Visitor:
     """Visitor of the views that a rank's first steps visit."""
 
-    def __init__(self, job: StylizationJob) -> None:
-        self._job = job
+    def __init__(self, job: StylizationJob, show: Callable[[int, int], None]) -> None:
+        self._job, self._show = job, show
         self._colors = job.views.scene.sh_dc.clone().to(job.views.rasterizer.device)
         self._optimizer = ColorOptimizer(self._colors, job.network.unit, bounded=job.settings.bounded)
         self._visited: list[int] = []
 
     def run(self) -> Trial:
         job, device = self._job, self._job.network.device
-        groups, (coarse, sos) = job.team.groups, job.schedule
+        groups, rasterizer = job.team.groups, job.views.rasterizer
         # Every group visits as many views as the others, because their ranks communicate; and none that no step visits.
         different = min(len(job.views.covered), job.total_steps * job.settings.views_per_step)
         visits = 2 if 2 * groups <= different else 1
         order = list(islice(drawn_views(job.views.covered, job.settings.seed), visits * groups))
-        costs: list[tuple[StepCost, StepCost]] = []
+        costs: list[list[StepCost]] = [[] for _ in job.schedule]
         with _peak_of_process() as process:
             for index in order[job.team.own_group :: groups]:
                 self._visited.append(index)
-                costs.append((self._cost(index, coarse), self._cost(index, sos)))
-                if job.collectives.broadcast(lambda: costs[0][1].seconds > _SLOW):
+                for own, phase in zip(costs, job.schedule, strict=True):
+                    self._show(sum(map(len, costs)), visits * len(costs))
+                    own.append(self._cost(index, phase))
+                if job.collectives.broadcast(lambda: costs[-1][0].seconds > _SLOW):
                     break
             camera = job.views.cameras[self._visited[0]]
-            render = job.views.rasterizer.uncached.step_seconds(camera, 2)[1]
+            render = with_second_attempt(job, lambda: rasterizer.uncached.step_seconds(camera, 2)[1])
+        coarse, sos = map(_mean, costs)
+        if not job.plan.steps_coarse:
+            sos = replace(sos, first=coarse.first + sos.first)
         on_device = device_peak(device)
         peak, now = (process[0], _resident()) if on_device is None else (on_device, torch.cuda.memory_allocated(device))
-        growth, novel, free = self._memory_to_come()
-        sizes = {(job.views.cameras[index].height, job.views.cameras[index].width) for index in self._visited}
-        prepare = [mean(own) for name in ("intersections", "colors") if (own := self._seconds_of(name))]
-        in_coarse, in_sos = (_mean([cost[at] for cost in costs]) for at in (0, 1))
-        if not job.plan.steps_coarse:
-            in_sos = replace(in_sos, first=in_coarse.first + in_sos.first)
+        forecast, budget = self._forecast(), 0
+        if "intersections" in forecast:
+            budget = self._intersection_budget(forecast) - forecast["intersections"][1]
+        # The median, because the first view of the survey includes the start of libraries.
+        prepared = [job.caches[name].costs.values() for name in ("intersections", "colors") if name in job.caches]
         return Trial(
-            coarse=in_coarse,
-            sos=self._scaled(in_sos),
+            coarse=coarse,
+            sos=self._scaled(sos),
             views=len(self._visited) * groups,
-            style=job.style_targets.seconds / len(sizes),
+            style=job.style_targets.seconds / len({self._size(index) for index in self._visited}),
             render=render,
-            prepare=sum(prepare),
+            prepare=sum(median(seconds for _, seconds in own) for own in prepared if own),
             process=process[0],
             device=on_device,
             passing=max(peak - now, 0),
-            growth=growth,
-            novel=novel,
-            free=free,
+            growth=max(sum(final - job.caches[name].used for name, (_, final) in forecast.items()), 0),
+            novel=int(self._bytes_of_a_view("intersections")),
+            free=max(budget, 0),
         )
 
     def _cost(self, index: int, phase: Phase) -> StepCost:
-        """Visit a view, repeatedly if that is fast. The first phase warms up the kernels, so it is always repeated."""
+        """Visit a view, and again if that is fast. The first phase warms up the kernels, so it is always repeated."""
         job, before = self._job, {name: len(cache.costs) for name, cache in self._job.caches.items()}
         first = self._visit(index, phase)
         fresh = {
             name: sum(seconds for key, (_, seconds) in list(cache.costs.items())[before[name] :] if key in cache)
             for name, cache in job.caches.items()
         }
-        prepared, later, repeated = sum(fresh.values()), first, 0.0
-        for repetition in range(_REPETITIONS):
-            slow = later["total"] - (0.0 if repetition else prepared) > _SLOW
-            wanted = (repeated < _ENOUGH_SECONDS and not slow) or (phase.scale is not None and not repetition)
-            if not job.collectives.all_gather(wanted)[0]:
-                break
-            again = self._visit(index, phase)
-            later = min(later, again, key=lambda visit: visit["total"]) if repetition else again
-            repeated += again["total"]
-        on_gpu = job.network.device.type == "cuda"
-        if later is first:
-            later = {**first, "total": first["total"] - prepared, "prepare": max(first["prepare"] - prepared, 0.0)}
-        elif on_gpu:
-            prepared = max(first["total"] - later["total"], 0.0)
-        cached = {name: fraction for name, (fraction, _) in self._forecast().items()}
-        always = sum((1 - cached[name]) * seconds for name, seconds in fresh.items()) / (sum(fresh.values()) or 1.0)
+        prepared, forecast = sum(fresh.values()), self._forecast()
+        later = {**first, "total": first["total"] - prepared, "prepare": max(first["prepare"] - prepared, 0.0)}
+        fast, warms_up = later["total"] <= _SLOW, phase.scale is not None
+        repetitions = _REPETITIONS if later["total"] < _FAST or (warms_up and fast) else int(fast or warms_up)
+        again = [self._visit(index, phase) for _ in range(job.collectives.broadcast(lambda: repetitions))]
+        if again:
+            later = min(again, key=lambda visit: visit["total"])
+            if job.network.device.type == "cuda":
+                prepared = max(first["total"] - later["total"], 0.0)
+        uncached = sum((1 - forecast[name][0]) * seconds for name, seconds in fresh.items())
+        always = prepared * uncached / (sum(fresh.values()) or 1.0)
+        total, once = later.pop("total"), later.get("optimizer", 0.0)
         turns = job.settings.views_per_step // job.team.groups
-        total = later.pop("total")
-        once = later.get("optimizer", 0.0)
-        return StepCost(turns * (total - once + always * prepared) + once, (1 - always) * prepared, later)
+        return StepCost(turns * (total - once + always) + once, prepared - always, later)
 
     def _visit(self, index: int, phase: Phase) -> dict[str, float]:
-        """Make a step on one view, and return its seconds by activity, and as "total"."""
+        """Make a step on one view, and return its seconds by activity, and as "total", without those for the style."""
         job, styled = self._job, self._job.style_targets.seconds
         job.timer.clear()
         clock = Timer()
@@ -203,52 +206,42 @@ class _Visitor:
     def _scaled(self, cost: StepCost) -> StepCost:
         """Scale the time of the network from the visited views to the mean view."""
         job = self._job
-        regions, tiling = job.plan.survey.regions if job.plan.weighted else None, job.loss.tiling
-        every = {
-            index: (
-                (job.views.cameras[index].height, job.views.cameras[index].width),
-                regions[index] if regions else None,
-            )
-            for index in job.views.covered
-        }
-        pixels = NetworkPixels.of([every[index] for index in self._visited], tiling).all
-        factor = NetworkPixels.of([*every.values()], tiling).all / pixels
-        more = (factor - 1) * cost.of(*NETWORK) * (job.settings.views_per_step // job.team.groups)
-        return replace(cost, seconds=cost.seconds + more, first=cost.first * factor)
+        sizes = [self._size(index) for index in range(len(job.views))]
+        every, visited = (
+            NetworkPixels.of(job.plan, sizes, job.loss.tiling, views).all for views in (job.plan.covered, self._visited)
+        )
+        more = (every / visited - 1) * cost.of(*NETWORK) * (job.settings.views_per_step // job.team.groups)
+        return replace(cost, seconds=cost.seconds + more, first=cost.first * every / visited)
+
+    def _size(self, index: int) -> tuple[int, int]:
+        return self._job.views.cameras[index].height, self._job.views.cameras[index].width
 
     def _forecast(self) -> dict[str, tuple[float, int]]:
         """Return the fraction of the views whose data will be cached, and the final size in bytes, by cache."""
         job, result = self._job, dict[str, tuple[float, int]]()
-        visits = (job.total_steps * job.settings.views_per_step) + (job.plan.loss_views if job.plan.measured else 0)
+        visits = job.total_steps * job.settings.views_per_step + (job.plan.loss_views if job.plan.measured else 0)
         views = min(visits, len(job.views.covered))
-        weights = 0.0
         for name, cache in job.caches.items():  # weights come before tile intersections, whose budget they share
             needed, capacity = self._bytes_of_a_view(name) * views, cache.capacity
-            if name == "intersections" and "weights" in job.caches:
-                needed, capacity = needed * (1 - weights), job.intersection_budget(result["weights"][1])
+            if name == "intersections":
+                needed *= 1 - result.get("weights", (0.0, 0))[0]
+                capacity = self._intersection_budget(result)
             fraction = 1.0 if capacity is None or needed <= capacity else capacity / needed
-            weights = fraction if name == "weights" else weights
             result[name] = fraction, int(needed * fraction)
         return result
 
+    def _intersection_budget(self, forecast: Mapping[str, tuple[float, int]]) -> int:
+        """Return the budget in bytes for tile intersections beside the cached blend weights of a forecast."""
+        rasterizer, memory = self._job.views.rasterizer, memory_for("rasterizer", self._job.memory)
+        weights = forecast.get("weights", (0.0, 0))[1]
+        budget = rasterizer.intersection_budget(weights) if isinstance(rasterizer, CachedRasterizer) else None
+        return memory if budget is None else budget
+
     def _bytes_of_a_view(self, name: str) -> float:
         """Return the mean size in bytes of the data of a view in a cache. The survey has computed its intersections."""
-        costs = self._job.caches[name].costs
+        costs = self._job.caches[name].costs if name in self._job.caches else {}
         sizes = sum(size for size, _ in costs.values())
         return sizes / max(len(costs) if name == "intersections" else len(self._visited), 1)
-
-    def _seconds_of(self, name: str) -> list[float]:
-        cache = self._job.caches.get(name)
-        return [seconds for _, seconds in cache.costs.values()] if cache else []
-
-    def _memory_to_come(self) -> tuple[int, int, int]:
-        """Return `growth`, `novel` and `free` of a trial."""
-        caches, forecast = self._job.caches, self._forecast()
-        growth = sum(final - caches[name].used for name, (_, final) in forecast.items())
-        if "intersections" not in caches:
-            return max(growth, 0), 0, 0
-        final, budget = forecast["intersections"][1], self._job.intersection_budget(forecast.get("weights", (0, 0))[1])
-        return max(growth, 0), int(self._bytes_of_a_view("intersections")), max(budget - final, 0)
 
 
 def _mean(costs: list[StepCost]) -> StepCost:

@@ -37,8 +37,7 @@ class ViewTargets:
         weighted: Whether statistics are weighted by rendered coverage.
         photos: Function that loads the content image [H, W, 3] of a view by its index; None for unstylized renders.
             With a GPU it is also called in a thread, see `prefetch`.
-        memory: Memory budget in bytes for everything that is cached about views, see `content_fraction`. A quarter of
-            it is for colors (`Views`).
+        memory: See `limit`.
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
         background: Background color of the rasterizer.
         drawn: Whether the background color changes from step to step; content images are then cached instead of
@@ -72,15 +71,13 @@ class ViewTargets:
         self._drawn = drawn
         self._maps = maps
         self._content_maps = content_maps
-        self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
-        has_maps = maps is not None or content_maps is not None
-        cached = int(memory * content_fraction(device.type, weighted=weighted, has_maps=has_maps))
+        self._coverage: Cache[int, list[Tensor]] = Cache(0, _pyramid_bytes)
         self._region_weights: Cache[tuple[int, bool], list[list[Tensor]]] = Cache(
-            memory // 4 if has_maps else 0, lambda every: sum(map(_pyramid_bytes, every))
+            0, lambda every: sum(map(_pyramid_bytes, every))
         )
-        images = cached // 2 if drawn else 0
-        self._images: Cache[_ContentKey, ScaledView] = Cache(images, _image_bytes)
-        self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
+        self._images: Cache[_ContentKey, ScaledView] = Cache(0, _image_bytes)
+        self._content: Cache[_ContentKey, ContentFeatures] = Cache(0)
+        self.limit(memory)
         self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
 
     @property
@@ -92,6 +89,22 @@ class ViewTargets:
             "images": self._images,
             "content": self._content,
         }
+
+    def limit(self, memory: int) -> None:
+        """Set the memory budget in bytes for everything that is cached about views.
+
+        A quarter of it is for colors (`Views`), one for coverage, and one for region maps; content uses the rest. On a
+        GPU, content also uses the quarter for coverage if there are no position weights.
+        """
+        has_maps = self._maps is not None or self._content_maps is not None
+        cached = int(
+            memory * content_fraction(self.loss.network.device.type, weighted=self.weighted, has_maps=has_maps)
+        )
+        images = cached // 2 if self._drawn else 0
+        self._coverage.limit(memory // 4)
+        self._region_weights.limit(memory // 4 if has_maps else 0)
+        self._images.limit(images)
+        self._content.limit(cached - images)
 
     def target(self, index: int, scales: Sequence[int], background: Color | None = None) -> ViewTarget:
         """Return the target of a view at some scales; cached if it fits.

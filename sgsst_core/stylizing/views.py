@@ -55,7 +55,7 @@ class Views:
         cameras: One camera per view.
         rasterizer: Rasterizer of the views.
         covered: Indices of the views that see anything.
-        memory: Memory budget in bytes for everything that is cached about views; a quarter of it is for colors.
+        memory: See `limit`.
         clamp_aware_gradient: Whether to use the clamp-aware gradient (`view_colors_gradient`).
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
         divider: Divider of each view among the ranks that render it together; None for a single rank.
@@ -89,15 +89,21 @@ class Views:
         self._divider = divider
         self._regions = regions
         self._shares: dict[int, Shares] = {}
-        shown = memory // 16 if self.collectives.size > 1 else 0
-        self._shown: Cache[int, ShownGaussians] = Cache(shown)
-        self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4 - shown)
+        self._shown: Cache[int, ShownGaussians] = Cache(0)
+        self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory)
+        self.limit(memory)
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
 
     @property
     def caches(self) -> dict[str, Cache[Any, Any]]:
         """Caches of data of the views by name, "weights" before "intersections"."""
         return {"colors": self.colors.cache, "shown": self._shown, **self.rasterizer.caches}
+
+    def limit(self, memory: int) -> None:
+        """Set the memory budget in bytes for everything that is cached about views; a quarter of it is for colors."""
+        shown = memory // 16 if self.collectives.size > 1 else 0
+        self._shown.limit(shown)
+        self.colors.cache.limit(memory // 4 - shown)
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -324,6 +324,7 @@ def test_job_that_is_finished_early_keeps_its_colors(service: Service, files: di
         assert client.post(f"/v1/jobs/{job_id}/finish").json()["status"] == "finishing"
         final = wait_until(service, client, job_id, "succeeded", "failed")
         assert final["result"]["stopped"] == "on-request"
+        assert final["progress"]["eta_s"] is None
         assert final["result"]["loss_after"] < final["result"]["loss_before"]
         steps = final["result"]["steps"]
         assert 5 <= steps < 1_000_000

@@ -80,19 +80,37 @@ def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
+def test_job_that_ends_early_has_no_steps_left(request_: JobSpec) -> None:
+    reports: list[Progress] = []
+    ended = execute(
+        prepare(request_),
+        progress=reports.append,
+        stop=lambda: False,
+        finish=lambda: reports[-1].step == 3,
+        warn=print,
+    )
+    assert (ended.stopped, ended.steps) == ("on-request", 3)
+    third = next(index for index, now in enumerate(reports) if now.step == 3)
+    step, after = reports[third : third + 2]
+    assert after.stage == "measuring"
+    assert 0 < (after.eta_s or 0) < (step.eta_s or 0)
+
+
 @pytest.mark.slow
 def test_planning_is_shown_and_resume_reuses_the_plan(request_: JobSpec, tmp_path: Path) -> None:
     whole = small_request(tmp_path / "whole", 8)
     run_job(prepare(whole))
     planned: list[Progress] = []
     first = prepare(request_, show_planning=planned.append)
-    assert [(now.step, now.total) for now in planned] == [(0, 3), (1, 3), (2, 3), (3, 3), (0, 0)]
-    assert [now.eta_s is None for now in planned] == [True, False, False, False, True]
-    assert planned[-2].fraction == 1.0
-    assert planned[-2].eta_s == 0.0
+    surveyed = [now for now in planned if now.stage == "planning"]
+    assert [(now.step, now.total) for now in surveyed] == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert [now.eta_s is None for now in surveyed] == [True, False, False, False]
+    assert (surveyed[-1].fraction, surveyed[-1].eta_s) == (1.0, 0.0)
+    assert [(now.step, now.total) for now in planned[4:]] == [(0, 0), (0, 4), (1, 4), (2, 4), (3, 4)]
+    planned.clear()
     assert run_job(first, steps=3).stopped == "interrupted"
     second = prepare(request_, resume=Resume(True), show_planning=planned.append)
-    assert len(planned) == 5, "nothing is looked at again"
+    assert not planned, "nothing is surveyed or tried again"
     assert second.resumed is not None
     assert second.resumed.state.step == 3
     assert second.stylizer.job.plan == second.resumed.plan
@@ -129,7 +147,8 @@ def test_first_preview_precedes_planning(request_: JobSpec, tmp_path: Path) -> N
         return sorted(path.name for path in folder.iterdir())
 
     job = prepare(request_, preview=previews, show_planning=lambda now: happened.append((now.step, names())))
-    assert happened == [(done, ["step_0000000.jpg"]) for done in (0, 1, 2, 3, 0)]
+    assert [done for done, _ in happened[:4]] == [0, 1, 2, 3]
+    assert all(written == ["step_0000000.jpg"] for _, written in happened)
     first = (tmp_path / "previews" / "step_0000000.jpg").read_bytes()
     execute(job, progress=lambda now: None, stop=lambda: False, warn=pytest.fail, preview=previews)
     assert names() == ["step_0000000.jpg", "thumbnail.jpg"], "the hour is not over"
@@ -187,7 +206,9 @@ def test_planning_is_shown(request_: JobSpec) -> None:
     reports: list[Progress] = []
     job = prepare(request_, show_planning=reports.append)
     views = len(job.stylizer.job.views)
-    assert [progress.step for progress in reports] == [*range(views + 1), 0]
+    assert [progress.step for progress in reports if progress.stage == "planning"] == [*range(views + 1)]
+    probing = [(progress.step, progress.total) for progress in reports[views + 1 :]]
+    assert probing == [(0, 0), (0, 4), (1, 4), (2, 4), (3, 4)]
 
 
 def test_report_has_seconds_before_the_first_step(request_: JobSpec) -> None:

@@ -16,7 +16,7 @@ if torch.cuda.is_available():
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.planning.choices import LEAST_GRAPH_VISITS
-from sgsst_core.planning.facts import LaunchCost
+from sgsst_core.planning.context import LaunchCost
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import StylizationJob
@@ -95,7 +95,7 @@ def test_bfloat16_is_not_used_if_it_is_emulated(
 
 def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_weights: BackboneWeights) -> None:
     for steps in (LEAST_GRAPH_VISITS, LEAST_GRAPH_VISITS - 1):
-        settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16)
+        settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16, position_weights="off")
         stylizer = Stylizer.planned(
             wall(10, 8), cameras(2, 48, 32), style(), settings, weights=tiny_weights, rasterizer="cpu"
         )
@@ -117,4 +117,6 @@ def test_graphs_reduce_the_spare_memory(
         planned = plan_job(*inputs, settings, weights=tiny_weights, rasterizer="cpu")
         spare[planned.plan.graphs] = planned.plan.spare
         assert (planned.graphs is not None) is planned.plan.graphs
+        used = [cache.used for cache in planned.view_targets.caches.values()]
+        assert sum(used) > 0  # by the trial, whose job is continued
     assert 0 < spare[True] < spare[False]

@@ -13,7 +13,7 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning import context as module
-from sgsst_core.planning.context import convolution_ratio, equip, gradient_error, precision_ratio, seconds_of
+from sgsst_core.planning.context import convolution_ratio, equip, gradient_error, precision_ratio
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToTf32, to_tf32
@@ -104,25 +104,6 @@ def test_tf32_needs_every_rank_to_have_it(monkeypatch: pytest.MonkeyPatch) -> No
     assert precision_ratio("tf32", "cuda", Others()) == 3.0
     has_it = False
     assert precision_ratio("tf32", "cuda", Others()) is None
-
-
-def test_interrupted_measurements_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    seconds = iter([2.0, 2.0, 9.0, 2.0, 2.0, 9.0, 1.0, 1.0, 9.0, 1.0])
-    monkeypatch.setattr(module, "seconds_of", lambda run, least: next(seconds))
-    assert convolution_ratio("bfloat16", "cpu") == 2.0
-
-
-@pytest.mark.parametrize(("least", "runs"), [(0.0, [1, 1]), (1.0, [1, 1]), (5.0, [1, 1, 2, 4, 8])])
-def test_repetitions_take_long_enough(least: float, runs: list[int]) -> None:
-    """Each simulated run takes a second; the first one takes ten seconds, because it prepares."""
-    counts: list[int] = []
-
-    def run(times: int) -> float:
-        counts.append(times)
-        return float(times) if counts[1:] else 10.0
-
-    assert seconds_of(run, least) == 1.0
-    assert counts == runs
 
 
 def test_tf32_on_a_cpu_gives_the_float32_job(tiny_weights: BackboneWeights) -> None:

@@ -19,15 +19,6 @@ from tests.small_scenes import blind_camera, cameras, style, wall
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_survey_counts_the_gaussians_that_a_view_shows() -> None:
-    scene, views = wall(), [*cameras(2), blind_camera()]
-    rasterizer = make_rasterizer("reference", scene)
-    ones = torch.ones(views[0].height, views[0].width, 3)
-    counts = [int((rasterizer.color_gradient(ones, camera)[:, 0] > 0).sum()) for camera in views[:2]]
-    assert survey_views(scene, views, make_rasterizer("cpu", scene)).shown == sum(counts) / 2
-    assert 0 < sum(counts) < 2 * len(scene)
-
-
 def test_survey_reports_its_progress() -> None:
     scene, reports = wall(), list[Progress]()
     survey_views(scene, cameras(3), make_rasterizer("cpu", scene), show=reports.append)
@@ -57,7 +48,7 @@ def test_earlier_survey_is_reused(tiny_weights: BackboneWeights) -> None:
     second = plan_job(
         scene, cameras(2), Style.of(style()), settings, weights=tiny_weights, survey=first.survey, show=reports.append
     ).plan
-    assert reports == [Progress(stage="probing")]
+    assert {each.stage for each in reports} == {"probing"}
     assert second.survey is first.survey
     assert torch.equal(second.seen, first.seen)
 

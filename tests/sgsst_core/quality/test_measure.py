@@ -169,10 +169,12 @@ def test_remaining_measuring_time_is_predicted(tiny_weights: BackboneWeights) ->
     stylizer = make(tiny_weights, Prediction(1.0, 1.0, 0, losses=3.0, measuring=15.0, job=100.0))
     measure = Measurements(stylizer)
     assert measure.seconds_left(0) == 6 * 2.0 + 3.0  # 12 s of 6 moments
+    assert measure.seconds_left(3, ends=True) == 2 * 2.0 + 3.0  # the start and the end
     stylizer.measured = [{"step": 0, "level": 0, "again": 1.5, "seconds": 9.0}]
     assert measure.seconds_left(0) == 5 * 1.5 + 3.0
     stylizer.measured += [{"step": step, "seconds": seconds} for step, seconds in ((1, 5.0), (2, 0.5), (4, 1.0))]
     assert measure.seconds_left(4) == 2 * 1.0 + 3.0
+    assert measure.seconds_left(5, ends=True) == 1.0 + 3.0
     assert measure.seconds_left(8) == 2 * 1.0 + 3.0  # the moment of step 8 is still due
     stylizer.measured += [{"step": step, "seconds": 1.0} for step in (8, STEPS)]
-    assert measure.seconds_left(STEPS) == 3.0
+    assert measure.seconds_left(STEPS) == measure.seconds_left(STEPS, ends=True) == 3.0

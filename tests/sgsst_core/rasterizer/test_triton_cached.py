@@ -13,8 +13,7 @@ from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.context import equip
-from sgsst_core.planning.facts import weight_cost
+from sgsst_core.planning.context import equip, weight_cost
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Precision
 from sgsst_core.rasterizer.cached import CachedRasterizer
@@ -222,7 +221,7 @@ VIEWS = cameras(2, 32, 24)
 def test_plan_predicts_the_bytes_of_cached_weights(tiny_weights: BackboneWeights) -> None:
     scene = ball(60)
     planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
-    cost = weight_cost(planning_context.rasterizer, VIEWS, make_settings(), 1 << 30, 5)
+    cost = weight_cost(planning_context.rasterizer, VIEWS, make_settings(), 1 << 30)
     planned: dict[Precision, int | None] = {"float32": cost.bytes, "half": cost.half_bytes}
     for precision, size in planned.items():
         cached = CachedRasterizer(scene, precision=precision, uncached=planning_context.rasterizer)  # type: ignore[arg-type]

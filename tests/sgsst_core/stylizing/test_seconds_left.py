@@ -61,16 +61,16 @@ def session(
         for _ in range(views_per_step):
             queue = queue or chance.sample(range(VIEWS), VIEWS)
             views.append(queue.pop(0))
-        if step == start + 1:
-            visited = {phase.stage: set() for phase in phases}
-            estimator.resume()
+        if step <= start:  # an earlier session
+            prices.append(0.0)
+            continue
         fresh = len(set(views) - visited[phase.stage])
         visited[phase.stage].update(views)
         prices.append(phase.seconds + fresh * phase.first_visit)
         estimator.add_step(phase.stage, views, prices[-1])
-        number = sum(entry.stage == phase.stage for entry in estimates[start:]) + 1
-        estimates.append(Estimate(phase.stage, number, estimator.left(step, queue), 0.0))
-    return [replace(entry, truth=sum(prices[index + 1 :])) for index, entry in enumerate(estimates)][start:]
+        number = sum(entry.stage == phase.stage for entry in estimates) + 1
+        estimates.append(Estimate(phase.stage, number, estimator.left(step), 0.0))
+    return [replace(entry, truth=sum(prices[start + index + 1 :])) for index, entry in enumerate(estimates)]
 
 
 @pytest.mark.parametrize("start", [0, 7, 30, 40])
@@ -87,7 +87,7 @@ def test_estimate_is_exact_if_steps_take_the_predicted_time(start: int, views_pe
 @pytest.mark.parametrize("start", [0, 40])
 def test_predictions_are_scaled_once_views_are_visited_again(factor: float, start: int) -> None:
     slower = [replace(p, seconds=p.seconds * factor, first_visit=p.first_visit * factor) for p in (COARSE, SOS)]
-    for entry in session(slower, [COARSE, SOS], start)[0 if start else VIEWS :]:
+    for entry in session(slower, [COARSE, SOS], start)[VIEWS:]:
         assert entry.left == pytest.approx(entry.truth, rel=1e-12), entry
 
 
@@ -102,25 +102,15 @@ def test_estimate_is_within_a_quarter_after_five_steps_of_the_last_phase(known: 
                 assert entry.left == pytest.approx(entry.truth, rel=0.25), entry
 
 
-def test_estimate_without_predictions_uses_the_measured_steps() -> None:
-    nothing = [ExpectedPhase(phase.stage, phase.steps) for phase in (COARSE, SOS)]
-    estimates = session([COARSE, SOS], nothing)
-    assert all(entry.left > 0 for entry in estimates[:-1])
-    later = [entry for entry in estimates if entry.stage == "sos" and entry.number > VIEWS + VIEWS]
-    assert all(entry.left == entry.truth for entry in later)
-
-
-def test_first_visits_after_this_round_count_with_their_probability() -> None:
-    """Four steps are left: two of this round and two of the 12 of the next one.
-
-    Three views are new, one of them in this round.
-    """
+def test_first_visits_are_at_most_the_visits_left() -> None:
+    """Nine of twelve views have been visited, and four or two steps are left."""
     phase = ExpectedPhase("sos", 20, 1.0, 6.0)
     estimator = estimator_of([phase], range(VIEWS))
     for view in range(9):
         estimator.add_step("sos", [view], 7.0)
     estimator.add_step("sos", [1], 1.0)
-    assert estimator.left(16, [9, 0]) == 4 * 1.0 + (1 + 2 * 2 / 12) * 6.0
+    assert estimator.left(16) == 4 * 1.0 + 3 * 6.0
+    assert estimator.left(18) == 2 * 1.0 + 2 * 6.0
 
 
 def test_estimate_includes_checkpoints_and_time_limit() -> None:
@@ -129,7 +119,7 @@ def test_estimate_includes_checkpoints_and_time_limit() -> None:
     estimator.add_step("sos", [0], 3.0)
     estimator.add_step("sos", [0], 1.0)
     estimator.add_beside(1.0)
-    assert estimator.left(2, []) == 8 * 1.0 * 1.25
-    assert estimator.left(2, [], limit=4.0) == 4.0 * 1.25
-    assert estimator.left(2, [], limit=-1.0) == 0.0
-    assert estimator.left(10, []) == 0.0
+    assert estimator.left(2) == 8 * 1.0 * 1.25
+    assert estimator.left(2, limit=4.0) == 4.0 * 1.25
+    assert estimator.left(2, limit=-1.0) == 0.0
+    assert estimator.left(10) == 0.0

@@ -11,8 +11,8 @@ import torch
 from sgsst_core.decision import Decision
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.planning.choices import OPTIMIZER_BYTES
-from sgsst_core.planning.facts import Facts, LaunchCost, Machine, NetworkPixels, WeightCost
+from sgsst_core.planning.choices import OPTIMIZER_BYTES, draft_plan
+from sgsst_core.planning.context import Facts, LaunchCost, Machine, NetworkPixels, WeightCost
 from sgsst_core.planning.measurement_choice import LEAST_ALLOWED
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
@@ -21,7 +21,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.planner import plan_job
-from sgsst_core.stylizing.prediction import completed_plan, draft_plan
+from sgsst_core.stylizing.prediction import completed_plan
 from sgsst_core.stylizing.schedule import drawn_views
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.trial import StepCost, Trial, run_trial
@@ -98,7 +98,7 @@ def plan_of(
     known: Facts, trials: dict[int, Trial] | None = None, cost: LaunchCost | None = None, **values: Any
 ) -> Plan:
     settings = make_settings(**{"steps_coarse": 40, "steps_sos": 40, "coarsest_side": 300, **values})
-    draft = draft_plan(known, settings, precision="float32", measured=True)
+    draft = draft_plan(known, settings, measured=True)
     return completed_plan(draft, known, settings, NetworkPixels(1e6, 0.0, 1e6, 1), trials or {1: TRIAL}, cost)
 
 
