@@ -232,9 +232,9 @@ def _about_gaussians(plan: Plan, facts: Facts, settings: Settings) -> Iterator[D
         nothing = ": there is nothing to attenuate" if attenuation else ""
         yield Decision(item, "no view directions are computed", f"the scene has degree 0{nothing}")
     elif attenuation == 1:
-        gone = f"degrees 1 to {degree} are attenuated to 0, in the result too; no view directions are computed"
+        without = f"degrees 1 to {degree} are attenuated to 0, in the result too; no view directions are computed"
         error = "colors no longer depend on the view direction"
-        yield Decision(item, gone, "requested", bytes=saved, error=error)
+        yield Decision(item, without, "requested", bytes=saved, error=error)
     elif attenuation:
         less = (
             f"coefficients of degrees 1 to {degree} are multiplied by {1 - attenuation:.3g}, in the result too; "
