@@ -22,6 +22,7 @@ if not torch.cuda.is_available():
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import BackboneWeights, fetch_network_weights, load_network_weights
 from tests import networks, triton_interpreter
+from tests.pretend_cuda.counts import Counts
 
 if os.environ.get("TRITON_INTERPRET") == "1" and importlib.util.find_spec("triton"):
     triton_interpreter.cache_names_of_builtins()
@@ -51,6 +52,15 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def counts() -> Iterator[Counts]:
+    """Simulate a GPU, and yield the counts of its launches, copies and waits."""
+    from tests.pretend_cuda.runtime import pretend_cuda
+
+    with pretend_cuda() as counts:
+        yield counts
 
 
 @pytest.fixture(scope="session")

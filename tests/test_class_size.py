@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -45,22 +44,3 @@ def test_no_class_has_more_than_15_attributes(package: str) -> None:
         for node in classes(path.read_text())
     }
     assert {name: count for name, count in counts.items() if count > MOST_ATTRIBUTES} == {}
-
-
-def test_attributes_set_by_several_methods_are_counted_once() -> None:
-    source = """
-        class Counter:
-            step: int = 0
-
-            def __init__(self, other):
-                self.first, self._second = 1, 2
-                self.third: int = 3
-                other.fourth = self.fifth
-
-            def count(self):
-                self.first += 1
-                if self.step:
-                    self.sixth = 6
-    """
-    (node,) = classes(textwrap.dedent(source))
-    assert attributes(node) == {"first", "_second", "third", "sixth"}

@@ -44,14 +44,3 @@ def test_identifiers_are_terms(folder: str) -> None:
     assert paths
     bad = [f"{path.relative_to(ROOT)}:{line}: {name}" for path in paths for line, name in vague(path.read_text())]
     assert bad == []
-
-
-def test_all_kinds_of_definitions_are_checked() -> None:
-    source = """
-def is_kept(told, *, found_rows):
-    self.made_by, _twin = told
-    for thing in found_rows:
-        roommate = thing.kept
-def test_what_is_found(): ...
-"""
-    assert {name for _, name in vague(source)} == {"is_kept", "told", "found_rows", "made_by", "_twin", "thing"}

@@ -135,7 +135,7 @@ def test_overridden_connection_methods_exist(method: str) -> None:
     assert method in vars(Connection)
     assert method in vars(HttpToolsProtocol), (
         f"uvicorn's HTTP protocol has no {method} any more: api/http/connection.py overrides nothing there. Find what "
-        "it is called now; tests/api/http/test_hostile.py shows whether heads are bounded again."
+        "it is called now; tests/api/http/hostile shows whether heads are bounded again."
     )
 
 

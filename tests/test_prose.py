@@ -57,17 +57,3 @@ def test_docstrings_start_with_a_noun_or_a_verb(folder: str) -> None:
         if OPENS_BADLY.match(text)
     ]
     assert bad == []
-
-
-@pytest.mark.parametrize(
-    ("docstring", "bad"),
-    [
-        ("Of the network on images.", ["Of the network on images."]),
-        ("Return the mean.\n\nArgs:\n    device: that computes.\n    rows: Rows.", ["that computes."]),
-        ("A report.\n\nAttributes:\n    first, second: from which it was made.", ["from which it was made."]),
-        ("Read a file.\n\nRaises:\n    ValueError: what is wrong.", ["what is wrong."]),
-        ("Offset of a row.\n\nReturns:\n    That row.\n\nArgs:\n    whatever: Offset.", []),
-    ],
-)
-def test_bad_openers_are_detected(docstring: str, bad: list[str]) -> None:
-    assert [text for text in prose(docstring) if OPENS_BADLY.match(text)] == bad

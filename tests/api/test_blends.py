@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx2
@@ -33,9 +32,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
-    with Service(tmp_path_factory.mktemp("service") / "data") as running:
-        yield running
+def service(whole_service: Service) -> Service:
+    return whole_service
 
 
 @pytest.fixture(scope="module")

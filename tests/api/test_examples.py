@@ -37,9 +37,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
-    with Service(tmp_path_factory.mktemp("examples") / "data") as running:
-        yield running
+def service(whole_service: Service) -> Service:
+    return whole_service
 
 
 @pytest.fixture(autouse=True)

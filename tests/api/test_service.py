@@ -198,35 +198,6 @@ def test_job_from_submission_to_ply(service: Service, files: dict[str, Path], tm
 
 
 @pytest.mark.slow
-def test_ply_is_sent_in_ranges(service: Service, files: dict[str, Path], short_job: str, tmp_path: Path) -> None:
-    with service.client() as client:
-        where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
-        whole = client.get(where)
-        assert whole.headers["content-disposition"].startswith('attachment; filename="scene_style-stylized.ply"')
-        tag, size, expected = whole.headers["etag"], len(whole.content), whole.content
-        parts = b""
-        for start in range(0, size, 10_000):
-            headers = {"Range": f"bytes={start}-{start + 9_999}", "If-Range": tag}
-            part = client.get(where, headers=headers)
-            assert part.status_code == 206
-            assert part.headers["content-range"] == f"bytes {start}-{min(size, start + 10_000) - 1}/{size}"
-            parts += part.content
-        assert parts == expected
-        assert client.get(where, headers={"Range": "bytes=-7"}).content == expected[-7:]
-        assert client.get(where, headers={"Range": "bytes=5-", "If-Range": '"other"'}).status_code == 200
-        beyond = client.get(where, headers={"Range": f"bytes={size}-"})
-        assert (beyond.status_code, beyond.headers["content-range"]) == (416, f"bytes */{size}")
-        assert client.get(where, headers={"If-None-Match": tag}).status_code == 304
-        head = client.head(where)
-        assert (head.headers["content-length"], head.content) == (str(size), b"")
-        assert client.get(f"/v1/jobs/{short_job}/artifacts/.checkpoint").status_code == 404
-        assert client.get(f"/v1/jobs/{short_job}/artifacts/../../sgsst.db").status_code == 404
-        path = tmp_path / "stylized.ply"
-        path.write_bytes(parts)
-        assert len(read_scene(path).scene) == len(read_scene(files["scene"]).scene)
-
-
-@pytest.mark.slow
 def test_compressed_scene_and_results_in_other_formats(
     service: Service, files: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -427,70 +398,6 @@ def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path
             client.post(f"/v1/jobs/{job_id}/cancel")
         for job_id in jobs:
             wait_until(service, client, job_id, "canceled")
-
-
-@pytest.mark.slow
-def test_dry_run_plans_without_queueing(service: Service, files: dict[str, Path]) -> None:
-    with service.client() as client:
-        before = len(client.get("/v1/jobs").json()["jobs"])
-        body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-        data = {"parameters": json.dumps(PARAMETERS)}
-        answer = client.post("/v1/jobs", params={"dry_run": True}, files=body, data=data)
-        assert answer.status_code == 200, answer.text
-        plan = answer.json()
-        assert (plan["gaussians"], plan["views"], plan["sh_degree"]) == (616, 3, 1)
-        assert plan["plan"]["decisions"]
-        assert plan["estimated_seconds"] > 0
-        assert plan["memory_bytes"] > 0
-        assert plan["device_memory_bytes"] is None
-        assert len(client.get("/v1/jobs").json()["jobs"]) == before
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("short_job")
-def test_api_process_loads_no_pytorch_or_ray(service: Service) -> None:
-    process = service.process("api.http.server")
-    assert process is not None
-    mapped = Path(f"/proc/{process.pid}/maps").read_text()
-    assert "libtorch" not in mapped
-    assert "ray/_raylet" not in mapped
-
-
-@pytest.mark.slow
-def test_client_commands(service: Service, files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
-    def sgsst(*arguments: str) -> subprocess.CompletedProcess[str]:
-        environment = {**service.environment, "SGSST_URL": service.url}
-        command = [sys.executable, "-m", "api.cli", *arguments]
-        return subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
-
-    common = [str(files["scene"]), "--style", str(files["style"]), "--cameras", str(files["cameras"])]
-    extra = ["--steps-sos", str(STEPS), "--backbone", "vgg16", "--seed", "3", "--parameters", '{"early_stop": false}']
-    planned = sgsst("submit", *common, *extra, "--dry-run")
-    assert (planned.returncode, planned.stderr) == (0, "")
-    assert planned.stdout.startswith("616 Gaussians, 3 views")
-    done = sgsst("submit", *common, *extra, "--out", "mine.ply")
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "mine.ply").read_bytes() == expected
-    newest = json.loads(sgsst("jobs", "--json", "--limit", "1").stdout)[0]
-    assert "succeeded" in sgsst("status", newest["id"]).stdout
-    assert sgsst("watch", newest["id"], "--json").stdout.splitlines()[-1].endswith('"attempt": 1}')
-    assert sgsst("download", newest["id"], "plan.json").stdout == "plan.json\n"
-    assert json.loads((tmp_path / "plan.json").read_text())["decisions"]
-    wrong = sgsst("submit", str(files["style"]), "--style", str(files["style"]), "--orbit", "3")
-    assert (wrong.returncode, "is not a scene file" in wrong.stderr) == (2, True)
-    assert sgsst("status", "job_00000000000000000000").returncode == 3
-
-    with Client(service.url) as client:
-        ended = client.wait(
-            client.submit(
-                *[files[name] for name in ("scene", "style")], orbit=2, resolution=32, preset="preview", steps_sos=1
-            ).id
-        )
-        assert ended.status == "succeeded", ended.error
-        part = tmp_path / "result.ply.part"
-        part.write_bytes(b"an older download of something else")
-        client.download(ended.id, tmp_path / "result.ply")
-        assert (tmp_path / "result.ply").read_bytes()[:3] == b"ply"
 
 
 @pytest.mark.slow

@@ -53,6 +53,7 @@ def test_failing_hosts_lose_time_but_no_jobs(tmp_path: Path) -> None:
     fleet.store.close()
 
 
+@pytest.mark.slow
 def test_whole_host_job_is_not_starved_and_others_run(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path, hosts=3, gpus_each=4, host_days=1e9, seed=0)
     small = [job(float(number), "many", 0.2 + number % 5 / 2, workers=1) for number in range(60)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +15,8 @@ if torch.cuda.is_available():
 
 from sgsst_core.bench import doctor
 from tests.pretend_cuda.counts import Counts
-from tests.pretend_cuda.runtime import pretend_cuda
 
 pytest.importorskip("triton")
-
-
-@pytest.fixture
-def counts() -> Iterator[Counts]:
-    with pretend_cuda() as counts:
-        yield counts
 
 
 def numbers() -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +30,6 @@ pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
 #: Maximum bytes of a few scalars.
 SCALARS = 256
-
-
-@pytest.fixture
-def counts() -> Iterator[Counts]:
-    with pretend_cuda() as counts:
-        yield counts
 
 
 def request_(

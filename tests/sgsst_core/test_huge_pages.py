@@ -18,6 +18,7 @@ print(next(line.split()[1] for line in open("/proc/self/smaps_rollup") if line.s
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", ["0", None])
 def test_large_tensors_use_huge_pages(switch: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """The user's environment variables take precedence over the default."""

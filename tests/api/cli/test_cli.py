@@ -12,10 +12,8 @@ import signal
 import struct
 import subprocess
 import sys
-import zipfile
 import zlib
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,14 +27,11 @@ from PIL import Image
 from plyfile import PlyData
 
 from api.cli.main import app, main
-from api.cli.scene_tools import view_file_names
-from sgsst_core.bench.error_time import Curve
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
 from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.gaussians import TENSORS
-from sgsst_core.scene.rendering import Rendering
 from tests.sgsst_core.trainer_scenes import write_gsplat, write_nerfstudio
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
@@ -105,104 +100,6 @@ def test_several_styles_are_mixed_by_weight(files: Files, capsys: pytest.Capture
     assert "the weight must be a finite number above 0, not 0" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_regions_have_own_styles_and_frozen_colors(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    other = files.style.with_name("other.png")
-    Image.new("RGB", (40, 40), (200, 40, 40)).save(other)
-    options = [
-        "--region",
-        "right:half-space=1,0,0,0.5",
-        "--region-style",
-        f"right={other}",
-        "--region-weight",
-        "right=2",
-        "--region-content-weight",
-        "right=balanced",
-    ]
-    options += ["--region", "left:half-space=-1,0,0,0.5", "--region-freeze", "left", "--region", "far:sphere=0,0,99,1"]
-    assert main(files.stylize("--steps-sos", "2", "--warm-start", "--clamp-aware-gradient", *options)) == 0
-    said = capsys.readouterr().out
-    assert "use other.png, with weight 2, with content weight 10,000" in said
-    assert "region far:           warning: ignored, because it has no Gaussians" in said
-    before, after = second_reader(files.ply), second_reader(files.out)
-    frozen = before["x"] <= -0.5
-    for name, values in before.items():
-        assert np.array_equal(values[frozen].view(np.uint32), after[name][frozen].view(np.uint32))
-    assert (after["f_dc_0"][~frozen] != before["f_dc_0"][~frozen]).all()
-    report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    by_name = {each["name"]: each for each in report["regions"]}
-    assert by_name["right"] | {"gaussians": 0, "fraction": 0} == {
-        "name": "right",
-        "select": "half-space=1,0,0,0.5",
-        "gaussians": 0,
-        "fraction": 0,
-        "style": "other.png",
-        "weight": 2.0,
-        "freeze": False,
-        "content_weight": 1e4,
-        "stylized": True,
-    }
-    assert by_name["left"]["gaussians"] == frozen.sum()
-    assert not by_name["far"]["stylized"]
-    assert sum(each["fraction"] for each in report["regions"]) == pytest.approx(1)
-    plan = [
-        "plan",
-        str(files.ply),
-        "--cameras",
-        str(files.cameras),
-        "--style",
-        str(files.style),
-        "--backbone",
-        "vgg16",
-    ]
-    assert main([*plan, *options, "--out", str(files.out.with_suffix(".json"))]) == 0
-    assert "region right" in files.out.with_suffix(".json").read_text()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--region", "a:cube=1"], "is not a known selection"),
-        (["--region", "a:mask=nowhere.npy"], "nowhere.npy: cannot be read: No such file"),
-        (["--region", "a:property=color>1"], "no property 'color'"),
-        (["--region-freeze", "rest"], "Every Gaussian is frozen (rest)"),
-        (["--region", "a:half-space=0,0,1,0", "--region-style", "a=nowhere.png"], "nowhere.png"),
-    ],
-)
-def test_invalid_regions_are_rejected(
-    files: Files, capsys: pytest.CaptureFixture[str], options: list[str], message: str
-) -> None:
-    assert main(files.stylize(*options)) == 2
-    assert message in capsys.readouterr().err
-    assert not files.out.exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("form", ["compressed.ply", "spz"])
-def test_stylize_reads_and_writes_compressed_scenes(
-    files: Files, capsys: pytest.CaptureFixture[str], form: str
-) -> None:
-    write_scene(files.ply, read_scene(files.ply).scene, by_name(form))
-    source = read_scene(files.ply).scene
-    files.out = files.out.with_name(f"wall.{form}")
-    assert main(files.stylize("--steps-sos", "3")) == 0
-    shown = capsys.readouterr().out
-    assert f"compressed:           {form}, " in shown
-    assert "dB PSNR against the PLY" in shown
-    assert str(files.out) in shown
-    assert str(files.out.with_name("wall.ply")) in shown
-    ply, packed = read_scene(files.out.with_name("wall.ply")), read_scene(files.out)
-    assert (ply.format, packed.format) == ("ply", form)
-    assert torch.equal(ply.scene.means, source.means)
-    assert not torch.equal(ply.scene.sh_dc, source.sh_dc)
-    report = json.loads(files.out.with_name("wall.report.json").read_text())
-    assert (report["compressed"]["name"], report["compressed"]["bytes"]) == (files.out.name, files.out.stat().st_size)
-    assert report["compressed"]["psnr_db"] > 35
-    for command in ("render", "check"):
-        options = ["--out", str(files.out.parent / "renders")] if command == "render" else []
-        assert main([command, str(files.out), "--cameras", str(files.cameras), *options]) == 0
-
-
 def test_compressed_result_never_overwrites_scene(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     before = files.ply.read_bytes()
     files.out = files.ply.with_suffix(".spz")
@@ -249,13 +146,6 @@ def test_same_command_writes_same_bytes(files: Files) -> None:
     assert files.out.read_bytes() == first
 
 
-def test_resolution_and_views_follow_options(files: Files) -> None:
-    main(files.stylize("--steps-sos", "1", "--resolution", "80", "--views", "2", "--preset", "preview"))
-    report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    assert report["cameras"]["sizes"] == [[80, 60]]
-    assert report["cameras"]["names"] == ["view_0", "view_2"]
-
-
 def test_plan_lists_skipped_work(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     write_scene(files.ply, ball())
     out = files.out.with_name("plan.json")
@@ -270,23 +160,6 @@ def test_plan_lists_skipped_work(files: Files, capsys: pytest.CaptureFixture[str
     assert "position weights" in capsys.readouterr().out
 
 
-def test_plan_and_check_report_lenses(files: Files, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    capture = Path(__file__).parents[2] / "sgsst_core" / "files" / "captures" / "nerfstudio"
-    write_scene(files.ply, replace(ball(), means=ball().means - torch.tensor([0.0, 0.0, 3.0])))
-    for name in ("img_0", "img_1", "img_2"):
-        Image.new("RGB", (160, 120)).save(tmp_path / f"{name}.png")
-    command = [str(files.ply), "--cameras", str(capture), "--resolution", "80"]
-    plan = ["plan", *command, "--style", str(files.style), "--backbone", "vgg16", "--out", str(tmp_path / "plan.json")]
-    assert main(["check", *command]) == 0
-    assert "views: lenses" in capsys.readouterr().out
-    assert main(plan) == 0
-    assert "only the pinhole part" in capsys.readouterr().out
-    assert main([*plan, "--images", str(tmp_path)]) == 0
-    items = [(line["item"], line["decision"]) for line in json.loads((tmp_path / "plan.json").read_text())["decisions"]]
-    assert ("lenses", "the photos are undistorted") in items
-    assert ("photos", "3 are resized to their views") in items
-
-
 def test_plan_never_overwrites_inputs(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
     for out in (files.ply, files.cameras, files.ply.parent):
@@ -294,18 +167,6 @@ def test_plan_never_overwrites_inputs(files: Files, capsys: pytest.CaptureFixtur
         assert main([*command, "--out", str(out)]) == 2
         assert (files.ply.read_bytes(), files.cameras.read_bytes()) == before
         assert str(out) in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_photos_are_content_images(files: Files, tmp_path: Path) -> None:
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for i in range(3):
-        Image.new("RGB", (128, 96), (40 * i, 80, 120)).save(photos / f"view_{i}.png")
-    assert main(files.stylize("--steps-sos", "1", "--images", str(photos))) == 0
-    report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    assert report["cameras"]["content"] == str(photos)
-    assert report["loss"]["before"]["scales"]["0"]["content"] > 0
 
 
 def test_orbit_needs_no_camera_file(files: Files) -> None:
@@ -320,31 +181,6 @@ def test_orbit_needs_no_camera_file(files: Files) -> None:
         assert views.format == "JPEG"
     assert "Views of the orbit" in files.out.with_name("stylized.report.html").read_text()
     assert report["position_weights"]["used"] is True
-
-
-def test_plan_sheet_shows_orbit_views(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    write_scene(files.ply, ball())
-    sheet, out = files.ply.with_name("views.jpg"), files.ply.with_name("plan.json")
-    command = ["plan", str(files.ply), "--style", str(files.style), "--backbone", "vgg16", "--out", str(out)]
-    command += ["--orbit", "4", "--elevation", "30", "--radius", "5", "--up", "z", "--resolution", "64"]
-    assert main([*command, "--sheet", str(sheet)]) == 0
-    assert str(sheet) in capsys.readouterr().out
-    with Image.open(sheet) as views:
-        assert views.width > 4 * 30
-    decisions = {each["item"]: each for each in json.loads(out.read_text())["decisions"]}
-    assert decisions["up"]["decision"] == "z"
-    assert decisions["cameras"]["decision"] == "4 views in a ring at 30 degrees, 5 from the center"
-    assert main([*command, "--sheet", str(out)]) == 2
-    assert "views.jpg" in capsys.readouterr().err
-
-
-def test_plan_does_not_overwrite_the_style(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    style = files.style.rename(files.style.with_suffix(".jpg"))
-    content = style.read_bytes()
-    command = ["plan", str(files.ply), "--style", str(style), "--orbit", "4", "--backbone", "vgg16"]
-    assert main([*command, "--sheet", str(style)]) == 2
-    assert "style.jpg: is the style image, which would be overwritten" in capsys.readouterr().err
-    assert style.read_bytes() == content
 
 
 def test_names_that_are_too_long_are_refused(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
@@ -362,98 +198,6 @@ def test_names_that_are_too_long_are_refused(files: Files, capsys: pytest.Captur
         assert re.search("^error: .*x{300}.*: File name too long. Check the path.$", capsys.readouterr().err)
     assert main(["submit", scene, "--style", long, "--orbit", "3", "--json"]) == 2
     assert json.loads(capsys.readouterr().err)["code"] == "path"
-
-
-def test_endless_benchmark_is_refused(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "error-time", str(files.ply), "--style", str(files.style), "--cameras", str(files.cameras)]
-    for seconds in ("inf", "nan", "1e400"):
-        assert main([*command, "--seconds", seconds]) == 2
-        assert "--seconds" in capsys.readouterr().err
-
-
-def test_plan_does_not_overwrite_images_of_a_job(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = files.ply.with_name("images")
-    (folder / "left").mkdir(parents=True)
-    photo = files.style.rename(folder / "left" / "view_0.jpg")
-    content = photo.read_bytes()
-    other = photo.with_name("other.jpg")
-    other.write_bytes(content)
-    command = ["plan", str(files.ply), "--style", str(other), "--cameras", str(files.cameras), "--sheet", str(photo)]
-    region = ["--region", "near:sphere=0,0,0,1", "--region-style", f"near={photo}"]
-    for more, message in (
-        (["--images", str(folder)], "view_0.jpg: is the photo, which would be overwritten"),
-        (["--region", f"near:masks={folder}"], "view_0.jpg: is the mask, which would be overwritten"),
-        (region, "view_0.jpg: is the style image, which would be overwritten"),
-    ):
-        assert main([*command, *more]) == 2
-        assert message in capsys.readouterr().err
-    assert photo.read_bytes() == content
-
-
-def test_orbit_auto_chooses_number_of_views(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    write_scene(files.ply, ball())
-    out = files.ply.with_name("renders")
-    assert main(["render", str(files.ply), "--orbit", "auto", "--resolution", "32", "--out", str(out)]) == 0
-    assert 12 <= len(list(out.iterdir())) <= 64
-    capsys.readouterr()
-    assert main(["render", str(files.ply), "--cameras", str(files.cameras), "--radius", "3", "--out", str(out)]) == 2
-    assert "--radius" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_drop_invalid_drops_invalid_gaussians(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = wall()
-    scene.opacities[7] = float("nan")
-    write_scene(files.ply, scene)
-    assert main(files.stylize("--steps-sos", "1")) == 2
-    assert "--drop-invalid" in capsys.readouterr().err
-    assert main(files.stylize("--steps-sos", "1", "--drop-invalid")) == 0
-    assert len(read_scene(files.out).scene) == len(scene) - 1
-    report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    assert report["scene"]["dropped"] == 1
-
-
-@pytest.mark.slow
-def test_target_loss_stops_run_and_report_has_loss_over_time(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(files.stylize("--steps-sos", "60", "--target-loss", "0.8", "--learning-rate", "0.1")) == 0
-    shown = capsys.readouterr().out
-    assert "reached --target-loss" in shown
-    report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    assert report["stopped"] == "target-loss"
-    assert 3 <= len(report["history"]) < 60
-    assert report["loss_over_time"]["relative"] <= 0.8
-    assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
-
-
-@pytest.mark.slow
-def test_converged_run_stops_early(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    """With almost no learning rate the loss does not fall, so the run ends after two windows of 24 steps."""
-    options = ["--steps-sos", "60", "--early-stop", "--learning-rate", "1e-9", "--no-bounded"]
-    assert main(files.stylize(*options)) == 0
-    assert "no longer falls" in capsys.readouterr().out
-    report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    assert (report["stopped"], len(report["history"])) == ("converged", 48)
-
-
-@pytest.mark.slow
-def test_report_has_novel_views_approximations_and_findings(files: Files) -> None:
-    assert main(files.stylize("--steps-sos", "16", "--cached-weights", "half")) == 0
-    report = json.loads(files.out.with_name("stylized.report.json").read_text())
-    moments = report["novel_views"]["moments"]
-    assert [moment["step"] for moment in moments] == [0, 1, 2, 4, 8, 16]
-    assert moments[0]["gram_relative"] == 1
-    assert moments[-1]["gram_relative"] < 1
-    assert moments[0]["consistency"]["short"]["rmse"] >= 0
-    judged = report["novel_views"]["judged"]
-    assert judged["before"]["content"] == 0 < judged["after"]["content"]
-    assert judged["after"]["style"] != judged["before"]["style"]
-    assert report["approximations"]["what"] == ["half-precision blend weights"]
-    assert all(0 < moment["relative_error"] < 0.1 for moment in report["approximations"]["moments"])
-    assert isinstance(report["findings"], list)
-    page = files.out.with_name("stylized.report.html").read_text()
-    assert "half-precision blend weights" in page
-    plan = json.loads(files.out.with_name("stylized.plan.json").read_text())
-    assert plan["decisions"] == report["plan"]["decisions"]
 
 
 @pytest.mark.slow
@@ -483,21 +227,6 @@ def test_bench_error_time_writes_table_plot_and_scenes(files: Files, capsys: pyt
     values = json.loads((folder / "error_time.json").read_text())
     assert len(values["variants"]["standard"]["points"]) == 6
     assert len(read_scene(folder / "standard.ply").scene) == len(wall())
-
-
-@pytest.mark.slow
-def test_interrupted_bench_error_time_leaves_its_measurements(files: Files, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(curve: Curve) -> str:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("api.cli.bench.point_line", interrupt)
-    folder = files.out.with_name("bench")
-    command = ["bench", "error-time", str(files.ply), "--cameras", str(files.cameras), "--style", str(files.style)]
-    command += ["--backbone", "vgg16", "--out", str(folder), "--coarsest-side", "24"]
-    with suppress(KeyboardInterrupt, SystemExit):
-        main([*command, "--seconds", "2", "--variants", "standard,coarse-only"])
-    values = json.loads((folder / "error_time.json").read_text())
-    assert [len(variant["points"]) for variant in values["variants"].values()] == [1]
 
 
 @pytest.mark.slow
@@ -631,15 +360,6 @@ def test_time_budget_writes_result_and_checkpoint(files: Files, capsys: pytest.C
 
     assert main([*options, "--resume"]) == 2
     assert "this job is finished" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_new_job_mentions_old_checkpoint(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    main(files.stylize("--steps-sos", "3", "--max-seconds", "0.000001"))
-    capsys.readouterr()
-    assert main(files.stylize("--steps-sos", "2")) == 0
-    assert "exists from an earlier run" in capsys.readouterr().out
-    assert not files.out.with_name("stylized.checkpoint.safetensors").exists()
 
 
 # --- bad input -----------------------------------------------------------------------------------------------------
@@ -838,13 +558,6 @@ def test_missing_cameras_error_names_cameras_and_orbit(files: Files, capsys: pyt
     assert "--orbit" in error
 
 
-def test_images_with_orbit_are_rejected(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    command = files.stylize("--orbit", "3", "--images", str(files.ply.parent))
-    at = command.index("--cameras")
-    assert main(command[:at] + command[at + 2 :]) == 2
-    assert "--images" in capsys.readouterr().err
-
-
 def test_unwritable_folder_is_rejected_before_work_starts(
     files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -868,21 +581,6 @@ def test_missing_weights_error_names_fetch_command(
         assert main(files.stylize("--backbone", backbone)) == 2
         assert "sgsst weights fetch vgg1" in capsys.readouterr().err
     assert not files.out.parent.exists()
-
-
-def test_damaged_weights_are_rejected(
-    files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data = bytearray((cache_folder() / "vgg16.safetensors").read_bytes())
-    data[len(data) // 2] ^= 1
-    (tmp_path / "vgg16.safetensors").write_bytes(data)
-    monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
-    assert main(files.stylize()) == 2
-    assert "damaged" in capsys.readouterr().err
-    assert main(["weights", "list"]) == 1
-    listed = capsys.readouterr()
-    assert next(line for line in listed.out.splitlines() if line.startswith("vgg16")).split()[3] == "DAMAGED"
-    assert "sgsst weights fetch vgg16" in " ".join(listed.err.split())
 
 
 @pytest.mark.parametrize(
@@ -968,17 +666,6 @@ def test_render_writes_a_video_whose_frames_are_the_renders(
         assert errors[index] < 10  # H.264 halves the resolution of colors, which matters at this size
 
 
-def test_video_passes_through_the_views_that_render_writes(files: Files, tmp_path: Path) -> None:
-    """The path's ends are the first and the last camera, pixel for pixel."""
-    command = ["render", str(files.ply), "--cameras", str(files.cameras)]
-    assert main([*command, "--out", str(tmp_path / "views")]) == 0
-    assert main([*command, "--video", str(tmp_path / "video"), "--seconds", "0.1"]) == 0
-    views, frames = (sorted((tmp_path / name).iterdir()) for name in ("views", "video"))
-    for view, frame in ((views[0], frames[0]), (views[-1], frames[-1])):
-        difference = np.asarray(Image.open(view)).astype(int) - np.asarray(Image.open(frame))
-        assert np.abs(difference).max() <= 1
-
-
 @pytest.mark.parametrize("transition", ["wipe", "fade"])
 def test_comparison_starts_with_the_unstylized_scene(files: Files, tmp_path: Path, transition: str) -> None:
     scene = read_scene(files.ply).scene
@@ -1003,21 +690,6 @@ def test_comparison_starts_with_the_unstylized_scene(files: Files, tmp_path: Pat
         assert np.array_equal(middle[:, 32:], before[:, 32:])
     else:
         assert np.abs(middle - (before + after) / 2).max() <= 1
-
-
-def test_transparent_video_has_straight_alpha(files: Files, tmp_path: Path) -> None:
-    """Composited over a background, it is the video over this background."""
-    write_files(files.ply.parent, ball(), cameras(3))
-    command = ["render", str(files.ply), "--cameras", str(files.cameras), "--fps", "2", "--seconds", "1"]
-    assert main([*command, "--transparent", "--video", str(tmp_path / "clear")]) == 0
-    assert main([*command, "--background", "white", "--video", str(tmp_path / "white")]) == 0
-    clear, white = (
-        np.asarray(Image.open(tmp_path / name / "frame_0000.png")).astype(float) for name in ("clear", "white")
-    )
-    alpha = clear[:, :, 3:] / 255
-    assert alpha.min() == 0
-    assert alpha.max() > 0.9
-    assert np.abs(alpha * clear[:, :, :3] + (1 - alpha) * 255 - white).max() <= 2
 
 
 @pytest.mark.parametrize(
@@ -1059,23 +731,6 @@ def test_interrupted_video_leaves_nothing(files: Files, tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".sgsst*"))
 
 
-def test_render_rejects_same_inputs_as_stylize(
-    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    _blind_cameras(files)
-    command = ["render", str(files.ply), "--cameras", str(files.cameras), "--out", str(tmp_path / "renders")]
-    assert main(command) == 2
-    assert "sees a Gaussian" in capsys.readouterr().err
-    assert main(command[:2] + command[4:]) == 2
-    assert "--orbit" in capsys.readouterr().err
-    files.ply.unlink()
-    assert main(command) == 2
-    assert "scene.ply" in capsys.readouterr().err
-    assert not (tmp_path / "renders").exists()
-    assert main([*command[:-1], str(files.style)]) == 2
-    assert "style.png" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("name", [format.name for format in RESULT_FORMATS])
 def test_convert_writes_what_it_reads(files: Files, capsys: pytest.CaptureFixture[str], name: str) -> None:
     written, back = files.out.with_name(f"scene.{name}"), files.out.with_name("back.ply")
@@ -1113,39 +768,6 @@ def test_convert_says_what_it_changes(files: Files, capsys: pytest.CaptureFixtur
     assert main(["convert", str(files.ply), str(files.out), "--drop-invalid"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "1 invalid ones dropped, 3 infinite opacities read as almost 0 or 1" in said
-
-
-def test_convert_writes_an_unpacked_sog(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    archive, meta = files.out.with_name("scene.sog"), files.out.parent / "unpacked" / "meta.json"
-    for out in (archive, meta):
-        assert main(["convert", str(files.ply), str(out), "--compare", "--cameras", str(files.cameras)]) == 0
-    packed, unpacked = (line for line in capsys.readouterr().out.splitlines() if line.startswith("compared:"))
-    assert packed == unpacked
-    with zipfile.ZipFile(archive) as members:
-        assert {name: members.read(name) for name in members.namelist()} == {
-            path.name: path.read_bytes() for path in meta.parent.iterdir()
-        }
-
-
-@pytest.mark.parametrize(("name", "lost"), [("a.sog", False), ("a.glb", False), ("a.ply", False), ("a.spz", True)])
-def test_convert_reports_a_lost_render_mode(
-    files: Files, capsys: pytest.CaptureFixture[str], name: str, lost: bool
-) -> None:
-    written = files.out.with_name(name)
-    arguments = ["convert", str(files.ply), str(written), "--render-mode", "antialiased", "--eps2d", "0.1"]
-    assert main([*arguments, "--compare", "--cameras", str(files.cameras)]) == 0
-    said = capsys.readouterr().out
-    assert ("its format cannot state antialiased, eps2d 0.1" in said) == lost
-    assert ("since it cannot state antialiased, eps2d 0.1" in said) == lost
-    assert read_scene(written).scene.rendering == Rendering("antialiased", 0.3 if lost else 0.1)
-
-
-def test_check_reports_what_the_render_mode_changes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["check", str(files.ply), "--cameras", str(files.cameras)]
-    assert main([*arguments, "--render-mode", "antialiased", "--eps2d", "0.2"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "dB PSNR" in said
-    assert main([*arguments, "--eps2d", "0"]) == 2
 
 
 def test_convert_writes_usd(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
@@ -1190,37 +812,6 @@ def test_blend_mixes_a_scene_and_its_result(files: Files, capsys: pytest.Capture
     assert read_scene(files.out.with_suffix(".spz")).scene.sh_dc.abs().max() < 0.02
 
 
-def test_blend_refuses_what_it_cannot_blend(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    smaller = files.ply.with_name("smaller.ply")
-    write_scene(smaller, read_scene(files.ply).scene.subset(torch.arange(9)))
-    before = files.ply.read_bytes()
-    for arguments, message in (
-        ([files.ply], "There is one scene to blend"),
-        ([files.ply, smaller], "has 9 Gaussians"),
-        ([files.ply, f"{files.ply}:-1"], "sum 0"),
-        ([files.ply, files.ply.with_name("missing.ply")], "missing.ply: cannot be read"),
-        ([files.ply, files.style], "is not a scene file"),
-    ):
-        assert main(["blend", *map(str, arguments), "--out", str(files.out)]) == 2
-        assert message in " ".join(capsys.readouterr().err.split())
-    assert main(["blend", str(files.ply), str(files.ply), "--out", str(files.ply)]) == 2
-    assert main(["blend", str(files.ply), str(files.ply), "--out", str(files.out.with_name("a.splat"))]) == 2
-    assert files.ply.read_bytes() == before
-    assert not files.out.parent.exists()
-
-
-def test_view_file_names_are_safe_and_sorted() -> None:
-    names = ["../up.JPG", "a:b*?.png", "", "x" * 300, "frame.0001", "Ünï.png", "."]
-    views = [replace(camera, name=name) for camera, name in zip(cameras(7), names, strict=True)]
-    files = view_file_names(views)
-    assert files == sorted(files)
-    assert files[:3] == ["0000_up.png", "0001_a_b.png", "0002.png"]
-    assert files[4] == "0004_frame.0001.png"
-    assert max(map(len, files)) < 100
-    many = view_file_names([views[0]] * 10_001)
-    assert many == sorted(many)
-
-
 def test_weights_list_and_fetch(
     tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -1249,15 +840,6 @@ def test_help_and_version_import_no_pytorch() -> None:
     check = "import sys, api.cli.main; sys.exit(any(name in sys.modules for name in ('torch', 'numba', 'matplotlib')))"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     assert subprocess.run([sys.executable, "-c", check], env=environment).returncode == 0
-
-
-@pytest.mark.parametrize("role", ["ply", "style", "cameras"])
-def test_urls_are_refused_unchanged(files: Files, role: str, capsys: pytest.CaptureFixture[str]) -> None:
-    url = "https://files.example.com/file"
-    arguments = [url if each == str(getattr(files, role)) else each for each in files.stylize()]
-    assert main(arguments) == 2
-    assert f"{url}: only `sgsst submit` takes URLs" in capsys.readouterr().err
-    assert not files.out.parent.exists()
 
 
 @pytest.mark.parametrize(
@@ -1295,25 +877,6 @@ def test_error_is_one_line_on_stderr(tmp_path: Path) -> None:
 
 
 # --- check ---------------------------------------------------------------------------------------------------------
-
-
-def test_check_reports_extremes_and_consequences(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = wall()
-    scene.means[3, 0] = float("nan")
-    scene.quats[5] = 0
-    write_scene(files.ply, scene)
-    Image.new("RGB", (40, 40), (90, 90, 90)).save(files.style)
-    options = ["--cameras", str(files.cameras), "--style", str(files.style)]
-    before = sorted(files.ply.parent.iterdir())
-    assert main(["check", str(files.ply), *options]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    for expected in ("infinite values", "2 of 616", "first: Gaussian 3", "one color"):
-        assert expected in shown, shown
-    assert sorted(files.ply.parent.iterdir()) == before
-
-    files.ply.write_bytes(b"not a scene")
-    assert main(["check", str(files.ply), *options]) == 2
-    assert str(files.ply) in capsys.readouterr().err
 
 
 #: Commands that write, up to the file or folder, all with inputs that do not exist.

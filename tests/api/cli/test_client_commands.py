@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import httpx2
 import pytest
-from PIL import Image
 
 from api.cli.main import main
 from api.client import Client
@@ -39,13 +36,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return [str(ply), "--style", str(style), "--cameras", str(cameras)]
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """Yield an API process without a dispatcher: its jobs stay in the queue."""
-    with Service(tmp_path_factory.mktemp("commands") / "data", alone=True) as running:
-        yield running
-
-
 @pytest.fixture(autouse=True)
 def url(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SGSST_URL", service.url)
@@ -55,31 +45,6 @@ def submit(files: list[str], capsys: pytest.CaptureFixture[str], *options: str) 
     """Submit a job, and return its id."""
     assert main(["submit", *files, *options]) == 0
     return capsys.readouterr().out.strip()
-
-
-@pytest.mark.slow
-def test_masks_of_regions_are_sent(
-    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
-) -> None:
-    """Each mask is sent under a name of its own, so that two files of one name do not collide."""
-    for folder, content in (("a", bytes(77)), ("b", bytes([1, *bytes(76)]))):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "mask.bin").write_bytes(content)
-    Image.new("L", (64, 48), 255).save(tmp_path / "a" / "view_0.png")
-    masked = [f"--region=one:mask={tmp_path}/a/mask.bin", f"--region=two:mask={tmp_path}/b/mask.bin"]
-    job_id = submit(files, capsys, *masked, f"--region=three:masks={tmp_path}/a")
-    with service.client() as client:
-        job = client.get(f"/v1/jobs/{job_id}").json()
-        second = client.get(f"/v1/jobs/{job_id}/inputs/mask:1").content
-        inputs = client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]
-    assert [each["select"] for each in job["parameters"]["regions"]] == [
-        "mask=region_0.bin",
-        "mask=region_1.bin",
-        "masks=region_2",
-    ]
-    names = [entry["name"] for entry in inputs if entry["role"] == "mask"]
-    assert names == ["region_0.bin", "region_1.bin", "region_2/view_0.png"]
-    assert second == bytes([1, *bytes(76)])
 
 
 def finish(service: Service, job_id: str, content: bytes, folder: Path, **result: Any) -> None:
@@ -251,20 +216,6 @@ def test_outputs_are_checked_before_a_job_is_queued(
     assert len(httpx2.get(f"{service.url}/v1/jobs").json()["jobs"]) == before
 
 
-def test_download_names_a_target_that_cannot_be_written(
-    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
-) -> None:
-    job_id = submit(files, capsys)
-    finish(service, job_id, b"result", tmp_path)
-    (tmp_path / "file").touch()
-    for out, message in ((tmp_path, "is a folder"), (tmp_path / "file" / "out.ply", "there is a file of that name")):
-        for more in ([], ["--overwrite"]):
-            assert main(["download", job_id, "--out", str(out), *more]) == 2
-            assert message in capsys.readouterr().err
-    assert main(["download", job_id, "--out", str(tmp_path / "new" / "out.ply")]) == 0
-    assert (tmp_path / "new" / "out.ply").read_bytes() == b"result"
-
-
 def test_download_to_a_full_disk_leaves_nothing(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:
@@ -275,25 +226,6 @@ def test_download_to_a_full_disk_leaves_nothing(
         assert main(["download", job_id, "--out", str(out)]) == 2
     assert f"error: {out}: cannot be written: File too large." in capsys.readouterr().err
     assert list(out.parent.iterdir()) == []
-
-
-def test_name_of_another_format_is_refused_before_the_download(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing is requested: the port of a closed socket refuses connections, which is another error."""
-    monkeypatch.setenv("SGSST_URL", "http://127.0.0.1:9")
-    for options, message in (
-        (["--format", "glb", "--out", "x.spz"], "x.spz: ends in .spz, but the format of the download is GLB"),
-        (["--format", "spz", "--out", "x.ply"], "x.ply: ends in .ply, but the format of the download is SPZ"),
-        (["--out", "x.splat"], "x.splat: ends in .splat, but the format of the download is PLY"),
-        (["blends/stylized_0.7.ply", "--out", "x.spz"], "Give a name that ends in .ply."),
-        (["blends/stylized_0.7.ply", "--format", "spz"], "only stylized.ply is compressed"),
-    ):
-        assert main(["download", MISSING, *options]) == 2
-        assert message in capsys.readouterr().err
-    for options in (["--format", "glb", "--out", "x.GLB"], ["--format", "glb", "--out", "x"], ["--out", "x.sog"]):
-        assert main(["download", MISSING, *options]) == 1
-        assert "cannot be reached" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("job_id", ["", "?", ".", "..", "a/b", "a b#c"])
@@ -438,40 +370,6 @@ def test_address_of_another_program_is_reported(capsys: pytest.CaptureFixture[st
                 assert main([*command, "--url", url + path]) == 1
                 assert f"does not answer like the service: {what}. Check the address." in capsys.readouterr().err
         server.shutdown()
-
-
-def test_colons_of_names_are_no_emoji(files: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    job_id = submit(files, capsys, "--name", ":abc: [b]")
-    assert main(["status", job_id, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["name"] == ":abc: [b]"
-    assert main(["jobs", "--limit", "1"]) == 0
-    assert ":abc: [b]" in capsys.readouterr().out
-    assert main(["submit", ":abc:", *files[1:]]) == 2
-    assert capsys.readouterr().err == "error: :abc:: not a file. Check the path.\n"
-
-
-def test_list_of_jobs_fits_80_columns(
-    files: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    job_id = submit(files, capsys, "--name", "a scene · " + "a name that is longer than its column, " * 3 + "waves")
-    assert main(["jobs", "--limit", "3"]) == 0
-    heading, *rows = capsys.readouterr().out.splitlines()
-    assert all(len(line) <= 80 for line in (heading, *rows))
-    assert rows[0].startswith(job_id)
-    assert re.search(r"  a sc\S*….*waves  queued, #", rows[0])
-    assert len(rows) <= 3
-
-
-def test_short_help_and_completion(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ([], ["submit"], ["keys"], ["keys", "create"]):
-        assert main([*command, "-h"]) == main([*command, "--help"]) == 0
-    assert "--install-completion" in (capsys.readouterr().out)
-    complete = {"_SGSST_COMPLETE": "complete_bash", "COMP_WORDS": "sgsst downl", "COMP_CWORD": "1"}
-    environment = os.environ | complete | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", "import sys; from api.cli.main import main; sys.exit(main())"]
-    process = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert process.stdout.split() == ["download"], process.stderr
 
 
 @pytest.mark.slow

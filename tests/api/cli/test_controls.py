@@ -65,12 +65,6 @@ def test_controls_take_effect_and_are_reported(tmp_path: Path, capsys: pytest.Ca
     assert float(held(packed.sh_rest).abs().max()) < 0.8 * float(held(before.sh_rest).abs().max())
 
 
-def test_plan_lists_controls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command("plan", tmp_path, "--out", str(tmp_path / "plan.json"), *CONTROLS)) == 0
-    items = [entry["item"] for entry in json.loads((tmp_path / "plan.json").read_text())["decisions"]]
-    assert {"colors", "spherical harmonics", "weights of scales"} <= set(items)
-
-
 @pytest.mark.parametrize(
     ("options", "problem"),
     [

@@ -6,7 +6,7 @@ import base64
 import io
 import re
 import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -33,9 +33,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
-    with Service(tmp_path_factory.mktemp("mcp") / "data") as running:
-        yield running
+def service(whole_service: Service) -> Service:
+    return whole_service
 
 
 @asynccontextmanager

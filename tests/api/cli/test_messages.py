@@ -11,7 +11,7 @@ import pytest
 
 from api.cli.main import main
 from tests.full_disk import full_disk
-from tests.small_scenes import cameras, wall, write_files
+from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
@@ -106,27 +106,3 @@ def test_unknown_words_are_refused_with_the_valid_ones(option: str, capsys: pyte
     command = ["stylize", "scene.ply", "--style", "style.png", "--out", "out.ply", option, "foo"]
     assert main(command) == 2
     assert f"Invalid value for '{option}': 'foo' is not one of '" in capsys.readouterr().err
-
-
-def test_contradictory_values_are_refused_in_our_words(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stylize", "scene.ply", "--style", "style.png", "--out", "out.ply", "--scales", "0,0"]) == 2
-    shown = capsys.readouterr().err
-    assert "--scales" in shown
-    assert "Value error" not in shown
-
-
-@pytest.mark.parametrize("video", [False, True])
-def test_render_prints_the_warnings_that_check_reports(
-    video: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene, views, _ = write_files(tmp_path, wall(), cameras(3))
-    raw = scene.read_bytes().replace(b"\nelement", b"\ncomment SplatRenderMode: other\nelement", 1)
-    scene.write_bytes(raw)
-    out = ["--video", str(tmp_path / "%03d.png"), "--fps", "1", "--seconds", "2"] if video else ["--out", str(tmp_path)]
-    assert main(["render", str(scene), "--cameras", str(views), "--resolution", "24", *out]) == 0
-    warning = (
-        "warning: rendering: drawn classic unless stated otherwise: the comment 'SplatRenderMode: other' is unknown"
-    )
-    assert warning in capsys.readouterr().err.splitlines()
-    assert main(["check", str(scene), "--cameras", str(views)]) == 0
-    assert "SplatRenderMode" in capsys.readouterr().out

@@ -25,12 +25,10 @@ from api.client.inputs import camera_files, image_files
 from api.client.transport import TRIES
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
-from service.store import Store, open_store
-from sgsst_core.files.camera_folder import CameraWarning
+from service.store import Store
 from tests.api.service import Service
 from tests.http_servers import serve
 from tests.nginx import Nginx
-from tests.sgsst_core.files.test_camera_files import colmap, views
 from tests.small_scenes import wall, write_files
 
 
@@ -38,19 +36,6 @@ from tests.small_scenes import wall, write_files
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
     return {"scene": ply, "style": style, "cameras": cameras}
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
-    with Service(tmp_path_factory.mktemp("client") / "data", alone=True) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def store(service: Service) -> Iterator[Store]:
-    opened = open_store(ServiceSettings(data=service.data))
-    yield opened
-    opened.close()
 
 
 @pytest.fixture(autouse=True)
@@ -137,13 +122,6 @@ def test_interrupted_call_is_canceled(service: Service, files: dict[str, Path]) 
 
 
 # --- the same scenario through both --------------------------------------------------------------------------------
-
-
-def test_close_cancels_interrupted_calls() -> None:
-    client = Client("http://127.0.0.1:9")
-    left = client._portal.start_task_soon(asyncio.sleep, 1000)
-    client.close()
-    assert left.cancelled()
 
 
 @both
@@ -283,25 +261,12 @@ def test_cameras_are_found_as_on_the_command_line(
     assert camera_files(tmp_path / given) == [tmp_path / name for name in sent]
 
 
-def test_smaller_model_is_sent_with_a_warning(tmp_path: Path) -> None:
-    for model, count in (("0", 1), ("1", 2)):
-        colmap(tmp_path / "sparse" / model, views(count), text=True)
-    with pytest.warns(CameraWarning, match=rf"0 has 1 images, and the model {tmp_path}/sparse/1 beside it 2\."):
-        assert camera_files(tmp_path)[0] == tmp_path / "sparse" / "0" / "cameras.txt"
-
-
 def test_photos_of_all_formats_are_sent_except_hidden_files(tmp_path: Path) -> None:
     for name in ("a.HEIC", "b.avif", "c.jpg", "._c.jpg", "notes.txt"):
         (tmp_path / name).touch()
     assert [name for _, name in image_files(tmp_path)] == ["a.HEIC", "b.avif", "c.jpg"]
     (tmp_path / os.fsdecode("\uac00.png".encode("cp949"))).touch()  # sent as the cameras that name it are read
     assert image_files(tmp_path)[-1][1] == "\xb0\xa1.png"
-
-
-@pytest.mark.parametrize("find", [camera_files, image_files])
-def test_missing_folder_is_reported_as_missing(find: Callable[[Path], Any], tmp_path: Path) -> None:
-    with pytest.raises(RequestError, match=r"missing: does not exist\. Check the path\."):
-        find(tmp_path / "missing")
 
 
 @pytest.mark.parametrize(
@@ -324,15 +289,6 @@ def test_plan_reports_progress(connect: Any, service: Service, files: dict[str, 
         with pytest.raises(RequestError, match="that a view sees is frozen") as caught:
             client.plan(files["scene"], files["style"], regions=[frozen], **options)
         assert (caught.value.status, caught.value.problem["code"]) == (422, "invalid-settings")
-
-
-@both
-def test_several_jobs_use_one_upload(connect: Any, service: Service, files: dict[str, Path]) -> None:
-    with connect(service.url) as client:
-        uploaded = client.upload(files["scene"], "other.ply")
-    with service.client() as plain:
-        shown = plain.get(f"/v1/uploads/{uploaded}").json()
-        assert (shown["filename"], shown["complete"]) == ("other.ply", True)
 
 
 # --- connections that break ----------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from tests.small_scenes import wall, write_files
 SECRET = "what nobody may see"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(sandbox.missing()), reason=f"the kernel lacks {sandbox.missing()}")
 def test_compromised_reader_does_not_affect_service(tmp_path: Path) -> None:
     ply, cameras, style = write_files(tmp_path, wall())

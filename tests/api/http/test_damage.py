@@ -15,7 +15,7 @@ from api.http.routes import artifacts as routes
 from service.errors import LostFileError, NotFoundError
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
 from service.store.leases import Lease
 from tests.api.service import Service, check_documented
 from tests.small_scenes import wall, write_files
@@ -34,19 +34,6 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     data.chmod(0o755)  # as an earlier version created it
     with Service(data, alone=True) as running:
         yield running
-
-
-@pytest.fixture(scope="module")
-def store(service: Service) -> Iterator[Store]:
-    opened = open_store(ServiceSettings(data=service.data))
-    yield opened
-    opened.close()
-
-
-@pytest.fixture
-def client(service: Service) -> Iterator[httpx2.Client]:
-    with service.client() as opened:
-        yield opened
 
 
 def submit(client: httpx2.Client, files: dict[str, tuple[str, bytes]]) -> str:

@@ -162,6 +162,7 @@ def server() -> Iterator[str]:
     thread.join()
 
 
+@pytest.mark.slow
 def test_deadline_is_of_a_request_without_progress(server: str) -> None:
     answer = httpx2.get(f"{server}/hang")
     assert (answer.status_code, answer.json()["code"]) == (503, problems.DEADLINE_EXCEEDED.code)

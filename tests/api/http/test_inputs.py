@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator
 from email.message import Message
 from pathlib import Path
 from typing import Any
@@ -44,25 +43,6 @@ HOSTILE = [
     "'quoted' \\",
     "\ud800.png",
 ]
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    with Service(tmp_path_factory.mktemp("inputs") / "data", alone=True) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def store(service: Service) -> Iterator[Store]:
-    opened = open_store(ServiceSettings(data=service.data))
-    yield opened
-    opened.close()
-
-
-@pytest.fixture(scope="module")
-def client(service: Service) -> Iterator[httpx2.Client]:
-    with service.client() as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ def colors(path: Path) -> np.ndarray:
     return np.stack([rows[name] for name in COLORS], axis=1)
 
 
-def test_frozen_mask_stays_bit_identical(tmp_path: Path) -> None:
+def test_frozen_mask_stays_bit_identical(whole_service: Service, tmp_path: Path) -> None:
     """The mask has a bit for each row of the file, also for a dropped one."""
     ply, cameras, style = write_files(tmp_path, wall())
     rows = PlyData.read(ply)["vertex"].data.copy()
@@ -32,7 +32,7 @@ def test_frozen_mask_stays_bit_identical(tmp_path: Path) -> None:
     PlyData([PlyElement.describe(rows, "vertex")]).write(ply)
     mask = np.random.default_rng(3).random(616) < 0.5
     (tmp_path / "bits.bin").write_bytes(np.packbits(mask, bitorder="little").tobytes())
-    with Service(tmp_path / "data") as service, Client(service.url) as client:
+    with Client(whole_service.url) as client:
         job = client.submit(
             ply,
             style,
@@ -53,7 +53,9 @@ def test_frozen_mask_stays_bit_identical(tmp_path: Path) -> None:
     assert not same[~mask[remaining]].any()
 
 
-def test_photos_of_any_name_give_the_result_of_the_command(tmp_path: Path) -> None:
+def test_photos_of_any_name_give_the_result_of_the_command(
+    whole_service: Service, tiny_installed: Path, tmp_path: Path
+) -> None:
     ply, cameras, style = write_files(tmp_path, wall())
     names = ["cam#0/v%3.png", "cam#0/v_3.png", "caf\u00e9 v#3.png"]
     views = [{**view, "img_name": name} for view, name in zip(json.loads(cameras.read_text()), names, strict=True)]
@@ -63,7 +65,7 @@ def test_photos_of_any_name_give_the_result_of_the_command(tmp_path: Path) -> No
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.linear_gradient("L").resize((64, 48)).rotate(90 * level).save(path)
     parameters: dict[str, Any] = {"steps_coarse": 1, "steps_sos": 6, "backbone": "vgg16"}
-    with Service(tmp_path / "data") as service, Client(service.url) as client:
+    with Client(whole_service.url) as client:
         job = client.submit(ply, style, cameras=cameras, photos=tmp_path / "photos", **parameters)
         assert client.wait(job.id).status == "succeeded"
         client.download(job.id, tmp_path / "result.ply")

@@ -25,7 +25,6 @@ from service.store import Store, open_store
 from tests.api.http.test_api import TUS, form, refused
 from tests.api.service import Service, wait_for
 from tests.postgres import Postgres, controlled_server, fresh_database, is_installed
-from tests.small_scenes import wall, write_files
 
 #: Concurrent requests: more than an API process has threads for.
 MANY = 60
@@ -72,12 +71,6 @@ class Outage:
 
 def create_upload(client: httpx2.Client) -> httpx2.Response:
     return client.post("/v1/uploads", headers={**TUS, "Upload-Length": "100"})
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    return {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
 
 
 def open_service(data: Path, database: str | None, files: dict[str, bytes]) -> Iterator[tuple[Service, str, str, str]]:

@@ -6,8 +6,6 @@ import asyncio
 import io
 import json
 import math
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx2
@@ -16,23 +14,11 @@ import torch
 from PIL import Image
 
 from tests.api.service import PATIENCE, Service, wait_for
-from tests.small_scenes import cameras, wall, write_files
+from tests.small_scenes import cameras
 
 #: Region that freezes every Gaussian in view, but not those at the corners of the wall.
 IN_VIEW = {"name": "middle", "select": "sphere=0,0,3,2.5", "freeze": True}
 PARAMETERS = {"preset": "preview", "backbone": "vgg16", "resolution": 128}
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
-    with Service(tmp_path_factory.mktemp("planning") / "data", alone=True) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    scene, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    return {"scene": scene.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
 
 
 def request(files: dict[str, bytes], **parameters: Any) -> dict[str, Any]:
@@ -162,6 +148,7 @@ def test_mismatched_cameras_are_rejected_immediately(service: Service, files: di
             assert detail in answer.json()["detail"]
 
 
+@pytest.mark.slow
 def test_disconnect_cancels_planning_with_events(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         events(client, files)

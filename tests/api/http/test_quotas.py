@@ -24,7 +24,6 @@ from tests.api.http.test_api import TUS, form, refused
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.postgres import fresh_database, is_installed, server
 from tests.raised import raises_problem
-from tests.small_scenes import wall, write_files
 
 
 class Clock:
@@ -78,12 +77,6 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     limits = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_JOBS_A_DAY_PER_KEY": "1", "SGSST_MAX_CONNECTIONS": "5"}
     with Service(data, alone=True, **limits) as running:
         yield running
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    return {"scene": ply.read_bytes(), "cameras": cameras.read_bytes(), "style": style.read_bytes()}
 
 
 def key(service: Service, quotas: Quotas) -> str:

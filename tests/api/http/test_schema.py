@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import copy
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,8 @@ from schemathesis.specs.openapi.checks import missing_required_header, negative_
 from api.http.app import create_app
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import Store
+from tests.api.conftest import Services
 from tests.api.service import Service
 from tests.small_scenes import wall, write_files
 
@@ -66,18 +67,9 @@ def checks() -> list[Any]:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+def service(services: Services) -> Service:
     # A huge Upload-Length must not fail for lack of disk space.
-    limits = {"SGSST_MAX_UPLOAD_BYTES": "1000000", "SGSST_REQUIRE_KEYS": "true"}
-    with Service(tmp_path_factory.mktemp("schema") / "data", alone=True, **limits) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def store(service: Service) -> Iterator[Store]:
-    opened = open_store(ServiceSettings(data=service.data))
-    yield opened
-    opened.close()
+    return services(SGSST_MAX_UPLOAD_BYTES="1000000", SGSST_REQUIRE_KEYS="true")
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.access import MOST_SESSIONS
 from service.store.jobs import NewJob
+from tests.api.conftest import KEYED, Services
 from tests.api.service import Service, check_documented
 from tests.raised import raises_problem
 
@@ -24,21 +25,9 @@ COOKIE = "sgsst_session"
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("session") / "data"
-
-
-@pytest.fixture(scope="module")
-def service(data: Path) -> Iterator[Service]:
-    with Service(data, alone=True, SGSST_REQUIRE_KEYS="true", SGSST_TRUSTED_PROXIES="") as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def store(service: Service) -> Iterator[Store]:
-    opened = open_store(ServiceSettings(data=service.data))
-    yield opened
-    opened.close()
+def service(services: Services) -> Service:
+    """Return an API process that requires keys, without a dispatcher."""
+    return services(**KEYED)
 
 
 @pytest.fixture
@@ -102,9 +91,9 @@ def test_cookie_is_secure_on_https_pages(service: Service, key: str) -> None:
         assert cookie_of(sign_in(browser, key, Origin=f"https://{host}"))["secure"]
 
 
-def test_stored_session_digest_is_no_cookie(browser: httpx2.Client, service: Service, data: Path, key: str) -> None:
+def test_stored_session_digest_is_no_cookie(browser: httpx2.Client, service: Service, key: str) -> None:
     text = cookie_of(sign_in(browser, key)).value
-    with sqlite3.connect(data / "sgsst.db") as connection:
+    with sqlite3.connect(service.data / "sgsst.db") as connection:
         (stored,) = connection.execute("SELECT group_concat(sha256) FROM sessions").fetchone()
         everything = "\n".join(connection.iterdump())
     assert text not in everything
@@ -144,9 +133,9 @@ def test_revoking_key_ends_its_sessions(browser: httpx2.Client, store: Store) ->
     assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False}
 
 
-def test_api_processes_share_sessions(browser: httpx2.Client, data: Path, key: str) -> None:
+def test_api_processes_share_sessions(browser: httpx2.Client, service: Service, key: str) -> None:
     text = cookie_of(sign_in(browser, key)).value
-    with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as other, other.client() as client:
+    with Service(service.data, alone=True, SGSST_REQUIRE_KEYS="true") as other, other.client() as client:
         assert client.get("/v1/jobs", headers={"Cookie": f"{COOKIE}={text}"}).status_code == 200
     assert browser.get("/v1/jobs").status_code == 200
 
@@ -389,8 +378,8 @@ def test_sessions_per_key_are_limited(tmp_path: Path) -> None:
     store.close()
 
 
-def test_invalid_cookie_is_ignored_without_keys(tmp_path: Path) -> None:
-    with Service(tmp_path / "data", alone=True) as service, service.client() as browser:
+def test_invalid_cookie_is_ignored_without_keys(services: Services) -> None:
+    with services().client() as browser:
         browser.cookies.set(COOKIE, "old")
         assert browser.get("/v1/session").json() == {"keys_needed": False, "signed_in": False}
         assert browser.get("/v1/jobs").status_code == 200

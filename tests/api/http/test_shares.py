@@ -17,6 +17,7 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.access import MOST_SHARES
 from service.store.tables import CounterRow, ShareRow
+from tests.api.conftest import KEYED, Services
 from tests.api.service import Service, check_documented
 from tests.small_scenes import wall, write_files
 
@@ -24,17 +25,9 @@ PLY, COLORS = b"ply\nstylized", b"\0\1" * 9
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """Yield an API process that requires keys, without a dispatcher."""
-    with Service(tmp_path_factory.mktemp("shares") / "data", alone=True, SGSST_REQUIRE_KEYS="true") as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def store(service: Service) -> Iterator[Store]:
-    opened = open_store(ServiceSettings(data=service.data))
-    yield opened
-    opened.close()
+def service(services: Services) -> Service:
+    """Return an API process that requires keys, without a dispatcher."""
+    return services(**KEYED)
 
 
 @pytest.fixture
@@ -290,6 +283,7 @@ def test_stored_digest_is_no_token_and_logs_contain_none(
     assert token.partition(".")[2] not in service.log.read_text()
 
 
+@pytest.mark.slow
 def test_requests_of_a_link_are_limited(files: dict[str, Path], tmp_path: Path) -> None:
     settings = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_REQUESTS_A_SECOND_PER_KEY": "0.5"}
     with Service(tmp_path / "data", alone=True, **settings) as service, service.client() as visitor:

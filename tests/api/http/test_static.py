@@ -6,7 +6,6 @@ import gzip
 import hashlib
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx2
@@ -16,16 +15,16 @@ from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_fil
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import FORMATS
 from sgsst_core.options import STRENGTHS
+from tests.api.conftest import KEYED, Services
 from tests.api.service import Service
 
 BUNDLE = "vendor/swagger-ui/swagger-ui-bundle.js"
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx2.Client]:
-    data = tmp_path_factory.mktemp("static") / "data"
-    with Service(data, alone=True, SGSST_REQUIRE_KEYS="true") as running, running.client() as opened:
-        yield opened
+def service(services: Services) -> Service:
+    """Return an API process that requires keys, which pages and their files do not need."""
+    return services(**KEYED)
 
 
 @pytest.fixture(scope="module")

@@ -156,6 +156,7 @@ def run(pair: Pair, count: int, seed: int) -> None:
         assert path.name.partition("-")[0] == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+@pytest.mark.slow
 def test_upload_is_locked_across_processes(pair: Pair) -> None:
     """The second of two writers is refused. Otherwise, a file could be named by the digest of other content."""
     with pair.services[0].client() as client:

@@ -13,9 +13,9 @@ from tests.api.service import Service
 from tests.small_scenes import cameras, wall, write_files
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def browser() -> Iterator[Any]:
-    """Yield a browser for one test module. While it is open, nothing else may use asyncio."""
+    """Yield a browser for the tests of the page. While it is open, nothing else may use asyncio."""
     reason = missing()
     if reason:
         pytest.skip(reason)
@@ -24,9 +24,8 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, tiny_installed: Path) -> Iterator[Service]:
-    with Service(tmp_path_factory.mktemp("service") / "data") as running:
-        yield running
+def service(whole_service: Service) -> Service:
+    return whole_service
 
 
 @pytest.fixture

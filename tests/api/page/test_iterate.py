@@ -96,37 +96,6 @@ def test_another_painting_and_changes_send_nothing_again(
     watched.check()
 
 
-def test_changes_restore_regions_with_masks(
-    visit: Visit, service: Service, files: dict[str, Path], night: Path, tmp_path: Path
-) -> None:
-    mask = tmp_path / "left.bin"
-    mask.write_bytes(bytes([0b00001111] * 77))
-    region = {"name": "left", "select": "mask=left.bin", "weight": 0.25, "style": "night.png"}
-    body = [(role, (path.name, path.read_bytes())) for role, path in [*files.items(), ("style", night), ("mask", mask)]]
-    values = STEPS | {"steps_sos": 2, "regions": [region]}
-    answer = httpx2.post(f"{service.url}/v1/jobs", files=body, data={"parameters": json.dumps(values)}, timeout=60)
-    before = httpx2.get(f"{service.url}/v1/jobs/{done(service, answer.json()['id'])}").json()
-    watched = visit(f"/#/jobs/{before['id']}")
-    page, sent = watched.page, uploads_of(watched)
-    page.get_by_role("button", name="Same with changes").click()
-    watched.settled()
-    row = page.get_by_role("group", name="Region 1")
-    row.get_by_text("308 Gaussians selected by hand").wait_for()
-    page.locator("[data-name=resolution]").wait_for()
-    page.reload()
-    page.get_by_role("button", name="Remove scene.ply").wait_for()
-    page.get_by_role("img", name="night.png").wait_for()
-    page.get_by_text("3 cameras shown in the scene").wait_for()
-    row.get_by_text("308 Gaussians selected by hand").wait_for()
-    for name, value in {"Name": "left", "Weight": "0.25", "Style": '"night.png"'}.items():
-        assert row.get_by_label(name).input_value() == value
-    again = started(watched, service)
-    assert not sent
-    assert again["parameters"]["regions"] == before["parameters"]["regions"]
-    assert digests(again, "mask") == digests(before, "mask")
-    watched.check()
-
-
 def test_painting_of_a_region_is_not_one_of_the_job(
     visit: Visit, service: Service, files: dict[str, Path], night: Path, tmp_path: Path
 ) -> None:
@@ -245,18 +214,4 @@ def test_paintings_are_chosen_from_the_gallery(visit: Visit, service: Service, f
     assert job["parameters"]["content_weight"] == STRENGTHS["light"]
     assert job["name"] == "scene · style + great_wave"
     httpx2.post(f"{service.url}/v1/jobs/{job['id']}/cancel").raise_for_status()
-    watched.check()
-
-
-def test_each_preset_shows_its_estimated_time(visit: Visit, files: dict[str, Path]) -> None:
-    watched = visit(width=900, height=700)
-    page = watched.page
-    choose(watched, files)
-    set_options(watched, measure=0)
-    page.get_by_role("button", name="Estimate time").click()
-    times = page.locator(".presets .time")
-    for index in range(3):
-        times.nth(index).filter(has_text="about").wait_for()
-    set_options(watched, resolution=48)
-    assert times.all_inner_texts() == ["", "", ""], "they were made for another resolution"
     watched.check()

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import httpx2
 import pytest
-from PIL import Image
 
-from tests.api.page.actions import LONG, STEPS, Visit, choose, done, set_options, submit
+from tests.api.page.actions import LONG, Visit, choose, done, set_options, submit
 from tests.api.service import Service
 
 pytestmark = pytest.mark.slow
@@ -53,27 +52,4 @@ def test_job_is_renamed(visit: Visit, service: Service, files: dict[str, Path]) 
     page.get_by_label("New name").fill("")
     page.keyboard.press("Enter")
     page.get_by_role("heading", name="scene · style").wait_for()
-    watched.check()
-
-
-def test_compared_jobs_have_different_labels(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """Labels are the names of the styles, made distinct where they are equal; both sides never show the same job."""
-    night = files["style"].with_name("night.png")
-    Image.new("RGB", (64, 64), (20, 30, 90)).save(night)
-    quick = STEPS | {"steps_coarse": 1, "steps_sos": 1, "name": "same"}
-    ids = [done(service, submit(service, files | {"style": style}, **quick)) for style in (files["style"], night)]
-    watched = visit(f"/#/compare/{ids[0]}/{ids[1]}")
-    page = watched.page
-    page.get_by_role("heading", name="style and night").wait_for()
-    page.locator(".side.left", has_text="style").wait_for()
-    page.locator(".side.right", has_text="night").wait_for()
-    page.get_by_label("Left").select_option(ids[1])
-    page.locator(".side.left", has_text="night").wait_for()
-    assert page.get_by_label("Right").input_value() != ids[1]
-    assert page.locator(".side.right").inner_text() != page.locator(".side.left").inner_text()
-
-    second = done(service, submit(service, files, **quick, seed=1))
-    page.goto(f"{service.url}/#/compare/{ids[0]}/{second}")
-    page.get_by_label("Right").locator(f"option[value={second}]").wait_for(state="attached")
-    assert page.locator(".side.right").inner_text() != page.locator(".side.left").inner_text()
     watched.check()

@@ -18,11 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import resized
-from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.page.actions import (
     LONG,
     REFUSED,
@@ -38,7 +35,7 @@ from tests.api.page.actions import (
 )
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
-from tests.small_scenes import ball, wall, write_files
+from tests.small_scenes import wall, write_files
 
 pytestmark = pytest.mark.slow
 
@@ -177,23 +174,6 @@ def test_upload_pauses_and_goes_on(visit: Visit, files: dict[str, Path], tmp_pat
     watched.check("net::ERR", "423", "409")  # the first part's request may still hold the upload, or end meanwhile
 
 
-def test_upload_resumes_as_soon_as_the_browser_is_online(visit: Visit, files: dict[str, Path]) -> None:
-    """Timers never end here: the upload does not wait for its next attempt."""
-    watched = visit()
-    page = watched.page
-    set_options(watched, **LONG)
-    choose(watched, files)
-    page.get_by_text("3 cameras shown in the scene").wait_for()
-    watched.context.set_offline(True)
-    page.evaluate("() => { window.setTimeout = () => 0; }")
-    page.get_by_role("button", name="Start").click()
-    page.get_by_text("no connection").wait_for()
-    watched.context.set_offline(False)
-    page.get_by_role("button", name="Cancel").click()
-    page.locator(".badge", has_text="Canceled").wait_for()
-    watched.check("net::ERR")
-
-
 def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     """After a restart of the server, the event stream resumes where it stopped, and the loss history is complete."""
     job_id = submit(service, files, **LONG)
@@ -292,59 +272,6 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     watched.check()
 
 
-def test_refined_result_has_a_geometry_of_its_own(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    job_id = done(service, submit(service, files, refine=2, name="refined"))
-    stylized = httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content
-    path = files["scene"].with_name("refined.ply")
-    path.write_bytes(stylized)
-    assert len(read_scene(path).scene) > 616
-    watched = visit(f"/#/jobs/{job_id}")
-    watched.wipe("Home")
-    right = watched.pixels()
-    watched.wipe("End")
-    assert np.abs(watched.pixels() - right).mean() > 5
-    watched.check("status of 404")  # the page first asks for colors alone, which do not exist
-
-
-def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """Geometry comes from the compressed file, colors from the result, in the order of the file."""
-    packed = files["scene"].with_name("scene.spz")
-    write_scene(packed, read_scene(files["scene"]).scene, SPZ)
-    job_id = done(service, submit(service, files | {"scene": packed}, name="packed"))
-    result = files["scene"].with_name("stylized.ply")
-    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
-    watched = visit(f"/#/jobs/{job_id}", width=600, height=500)
-    watched.page.get_by_label("Camera", exact=True).select_option("1")
-    camera = resized(read_cameras(files["cameras"])[1], 384)
-    for key, path in (("End", packed), ("Home", result)):
-        wanted = rendered(path, camera)
-        watched.wipe(key)
-        assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered image
-    watched.check()
-
-
-def test_requested_render_mode_is_shown(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    """The stored scene states no mode, so that the job's parameters decide."""
-    small = files["scene"].with_name("small.ply")
-    scene = wall(100, 80)
-    scene = replace(scene, scales=torch.full_like(scene.scales, math.log(0.006)))
-    write_scene(small, scene)
-    job_id = done(service, submit(service, files | {"scene": small}, name="antialiased", render_mode="antialiased"))
-    result = files["scene"].with_name("stylized.ply")
-    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
-    assert read_scene(result).scene.rendering.antialiased
-    watched = visit(f"/#/jobs/{job_id}", width=600, height=500)
-    watched.page.get_by_label("Camera", exact=True).select_option("1")
-    camera = resized(read_cameras(files["cameras"])[1], 384)
-    watched.wipe("Home")
-    wanted = rendered(result, camera)
-    classic = read_scene(result).rendered("classic", None).scene
-    other = make_rasterizer("cpu", classic).render(scene_colors(classic, camera), camera).clamp(0, 1).numpy() * 255
-    frame = frame_of(watched, wanted)
-    assert psnr(frame, wanted) > psnr(frame, other) + 6
-    watched.check()
-
-
 def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     """Open a finished job from the list and use its view, without a pointer."""
     job_id = done(service, submit(service, files, name="by keyboard"))
@@ -403,21 +330,6 @@ def test_accessible_and_never_too_wide(
         violations = Axe().run(page)
         assert violations.violations_count == 0, f"{name}: {violations.generate_report()}"
         assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth"), name
-    watched.check()
-
-
-def test_nothing_moves_while_the_page_loads(visit: Visit) -> None:
-    watched = visit(width=1000, height=700)
-    watched.page.locator("[data-name=resolution]").wait_for()
-    moved = watched.page.evaluate(
-        """() => new Promise((done) => {
-          let sum = 0;
-          new PerformanceObserver((list) => { for (const entry of list.getEntries()) sum += entry.value; })
-            .observe({ type: "layout-shift", buffered: true });
-          setTimeout(() => done(sum), 300);
-        })"""
-    )
-    assert moved < 0.1  # the threshold of a good layout shift
     watched.check()
 
 
@@ -503,41 +415,6 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
     assert moved[side].float().mean() in (0, 1)
     assert moved[~side].float().mean() == 1 - moved[side].float().mean()
     watched.check()
-
-
-def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) -> None:
-    """On a phone, one finger rotates the scene, a pinch moves it away, and the page does not scroll."""
-    watched = Watched(browser, service.url, width=360, height=640, has_touch=True, is_mobile=True)
-    page = watched.page
-    page.goto(service.url)
-    ply, _, _ = write_files(tmp_path, ball())
-    page.get_by_text("Tap to choose a scene").wait_for()
-    assert page.get_by_text("Drop your scene here").is_hidden()
-    page.get_by_label("Scene", exact=True).set_input_files(ply)
-    page.locator("canvas.view").scroll_into_view_if_needed()
-    first = watched.pixels()
-    box = page.locator("canvas.view").bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    scrolled = page.evaluate("() => scrollY")
-    touch(watched, [[(x - 40 + 8 * i, y)] for i in range(10)])
-    rotated = watched.pixels()
-    assert np.abs(rotated - first).mean() > 1
-    touch(watched, [[(x - 60 + 4 * i, y), (x + 60 - 4 * i, y)] for i in range(10)])
-    assert 0 < shown(watched.pixels()) < 0.6 * shown(rotated)
-    assert page.evaluate("() => scrollY") == scrolled
-    watched.check()
-    watched.context.close()
-
-
-def touch(watched: Watched, places: list[list[tuple[float, float]]]) -> None:
-    """Simulate fingers that touch the screen, move from position to position, and are lifted."""
-    device = watched.context.new_cdp_session(watched.page)
-    for number, fingers in enumerate(places):
-        points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(fingers)]
-        device.send(
-            "Input.dispatchTouchEvent", {"type": "touchMove" if number else "touchStart", "touchPoints": points}
-        )
-    device.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
 
 def shown(pixels: NDArray[np.float64]) -> int:

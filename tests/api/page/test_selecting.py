@@ -14,7 +14,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.scene.gaussians import Scene
 from tests.api.page.actions import STEPS, choose, set_options
 from tests.api.page.browser import Watched
@@ -142,21 +142,6 @@ def test_changes_are_undone_and_redone(watched: Watched) -> None:
     assert inverted == [not value for value in both]
     assert after == [both, boxed, both, boxed, loaded, loaded]
     assert not any(cleared)
-
-
-def test_growth_adds_near_neighbors(watched: Watched) -> None:
-    """A line of Gaussians grows by those that are at most the distance away that is derived from the density."""
-    centers = np.zeros((400, 3), np.float32)
-    centers[:, 0] = np.linspace(-1, 1, 400)
-    seed = {"op": "sphere", "center": [0, 0, 0], "radius": 0.1, "mode": "add"}
-    before, once, twice = flags(watched, centers, seed, {"op": "grow"}, {"op": "grow"})
-    widths = [each.sum() * 2 / 399 for each in (before, once, twice)]
-    assert widths[0] == pytest.approx(0.2, abs=0.01)
-    assert widths[1] - widths[0] == pytest.approx(widths[2] - widths[1], abs=0.012)
-    assert widths[1] > widths[0] + 0.01
-    for each in (before, once, twice):
-        (places,) = np.nonzero(each)
-        assert len(places) == places[-1] - places[0] + 1
 
 
 def test_connected_colors_stop_at_gaps(watched: Watched) -> None:
@@ -357,22 +342,4 @@ def test_panel_works_by_keyboard_on_small_screens(visit: Visit, files: dict[str,
     some_selected(watched)
     page.get_by_role("button", name="Cancel").press("Enter")
     assert "selected by hand" not in page.get_by_role("group", name="Region 1").inner_text()
-    watched.check()
-
-
-def test_masks_survive_other_views_but_not_another_scene(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
-    watched = opened(visit, files)
-    page = watched.page
-    page.get_by_role("button", name="Invert").click()
-    selected(watched, "616 of")
-    page.get_by_role("button", name="Use selection").click()
-    page.get_by_text("616 Gaussians selected by hand").wait_for()
-    page.get_by_role("link", name="Jobs").click()
-    page.get_by_role("link", name="New", exact=True).click()
-    region = page.get_by_role("group", name="Region 1")
-    region.get_by_text("616 Gaussians selected by hand").wait_for()
-    other = tmp_path / "other.ply"
-    write_scene(other, wall(10, 10))
-    choose(watched, {"scene": other})
-    region.get_by_text("selected by hand").wait_for(state="hidden")
     watched.check()

@@ -64,6 +64,7 @@ def write_the_end(service: Service, content: bytes, where: str, *, linked: bool)
     store.close()
 
 
+@pytest.mark.slow
 def test_last_part_can_be_sent_again(service: Service) -> None:
     contents = {linked: os.urandom(10_000) for linked in (False, True)}
     places = {linked: begin(service, content) for linked, content in contents.items()}

@@ -17,6 +17,7 @@ from service.errors import ConflictError, DamagedFileError, LostFileError, NoSpa
 from service.files import stored_blobs
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder, Receiver, write_all
+from service.files.objects import ObjectStore
 from service.files.stored_blobs import StoredBlobs
 from service.settings import ServiceSettings
 from service.store import Store
@@ -42,14 +43,15 @@ class Fleet:
     store: Store
     url: str
     s3: FaultyS3
+    objects: ObjectStore
 
     def host(self, name: str) -> StoredBlobs:
         settings = ServiceSettings(data=self.folder / name, min_free_bytes=0, artifacts=self.url)
-        return StoredBlobs(settings, self.store.inputs, Artifacts(self.url).objects)
+        return StoredBlobs(settings, self.store.inputs, self.objects)
 
     def names(self) -> list[str]:
         """Return the names of all objects in the file store."""
-        return sorted(Artifacts(self.url).objects.below(""))
+        return sorted(self.objects.below(""))
 
     def take(self, host: StoredBlobs, data: bytes) -> str:
         """Store a file through a host."""
@@ -85,7 +87,7 @@ def fleet(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     url = f"s3://inputs/{os.urandom(4).hex()}"
     assert httpx2.put(f"{server}/inputs").status_code == 200
     store = new_store(ServiceSettings(data=tmp_path / "database"))
-    yield Fleet(tmp_path, store, url, s3)
+    yield Fleet(tmp_path, store, url, s3, Artifacts(url).objects)
     s3.heal()
     store.close()
     s3.close()
@@ -114,11 +116,10 @@ def test_uploading_again_repairs_a_damaged_blob(fleet: Fleet, lost: bool, size: 
     one, two = fleet.host("one"), fleet.host("two")
     sha256 = fleet.take(one, data)
     (name,) = fleet.names()
-    objects = Artifacts(fleet.url).objects
     if lost:
-        objects.remove(name)
+        fleet.objects.remove(name)
     else:
-        objects.put(_file(fleet.folder, bytes(size)), name)
+        fleet.objects.put(_file(fleet.folder, bytes(size)), name)
     with pytest.raises(LostFileError if lost else DamagedFileError):
         fleet.read(two, sha256)
     upload = fleet.upload(size)
@@ -128,6 +129,7 @@ def test_uploading_again_repairs_a_damaged_blob(fleet: Fleet, lost: bool, size: 
     assert fleet.read(fleet.host("three"), sha256) == data
 
 
+@pytest.mark.slow
 def test_ranges_are_read_without_a_full_copy(fleet: Fleet) -> None:
     data = os.urandom(2 * MB + 7)
     one, two = fleet.host("one"), fleet.host("two")
@@ -135,7 +137,7 @@ def test_ranges_are_read_without_a_full_copy(fleet: Fleet) -> None:
     for start, stop in ((0, len(data)), (MB - 1, MB + 2), (2 * MB, 2 * MB + 7), (5, 5)):
         assert b"".join(two.read(row, start, stop)) == data[start:stop]
     assert not [path for path in (fleet.folder / "two" / "cache").rglob("*") if path.is_file() and path.stat().st_size]
-    Artifacts(fleet.url).objects.remove(f"blobs/{row.location}")
+    fleet.objects.remove(f"blobs/{row.location}")
     with pytest.raises(FileNotFoundError):
         list(two.read(row, 0, 5))
 
@@ -143,8 +145,8 @@ def test_ranges_are_read_without_a_full_copy(fleet: Fleet) -> None:
 def test_unused_blobs_are_collected(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     host = fleet.host("one")
     sha256 = fleet.take(host, b"wanted by nobody")
-    Artifacts(fleet.url).objects.put(_file(fleet.folder, b"x"), "blobs/aa/orphan")
-    Artifacts(fleet.url).objects.put(_file(fleet.folder, b"x"), "uploads/upl_1/orphan")
+    fleet.objects.put(_file(fleet.folder, b"x"), "blobs/aa/orphan")
+    fleet.objects.put(_file(fleet.folder, b"x"), "uploads/upl_1/orphan")
     host.collect()
     assert len(fleet.names()) == 3, "the rows may still be on their way"
     monkeypatch.setattr(stored_blobs, "_ORPHAN_SECONDS", -HOUR)
@@ -253,6 +255,7 @@ def test_disk_without_inodes_rejects_files(fleet: Fleet, monkeypatch: pytest.Mon
     host.ensure_space(0)
 
 
+@pytest.mark.slow
 def test_unfinished_upload_is_collected(fleet: Fleet) -> None:
     upload = fleet.upload(100)
     fleet.append(fleet.host("one"), upload, bytes(60))
@@ -312,6 +315,7 @@ def test_store_outage_is_reported_as_unavailable(fleet: Fleet, monkeypatch: pyte
     assert fleet.read(two, sha256) == data
 
 
+@pytest.mark.slow
 def test_silent_store_is_retried(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"the scene"
     sha256 = fleet.take(fleet.host("one"), data)

@@ -66,6 +66,7 @@ def stored(tmp_path: Path) -> Iterator[Stored]:
     store.close()
 
 
+@pytest.mark.slow
 def test_blends_of_one_key_do_not_delay_another_key(stored: Stored, tmp_path: Path) -> None:
     one, other = (stored.finished(owner, tmp_path) for owner in ("one", "other"))
     order: list[str] = []
@@ -107,6 +108,7 @@ def test_parallel_blends_cannot_pass_their_limit(stored: Stored, tmp_path: Path)
     assert sum(row.name.startswith("blends/") for row in stored.store.jobs.artifacts(job.id)) == MOST_BLENDS
 
 
+@pytest.mark.slow
 def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Path) -> None:
     job = stored.finished("one", tmp_path)
     before = {row.name for row in stored.store.jobs.artifacts(job.id)}

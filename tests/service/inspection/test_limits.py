@@ -81,6 +81,7 @@ def large(path: Path, side: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_limits_grow_with_the_size_of_a_scene(files: dict[str, Path], tmp_path: Path) -> None:
     files["scene"] = large(tmp_path / "large.ply", 300)
     findings = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)

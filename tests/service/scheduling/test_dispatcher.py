@@ -33,19 +33,6 @@ from tests.stores import new_store
 SHA = "a" * 64
 
 
-@pytest.fixture
-def settings(tmp_path: Path) -> ServiceSettings:
-    return ServiceSettings(data=tmp_path / "data", poll_seconds=0.05)
-
-
-@pytest.fixture
-def store(settings: ServiceSettings) -> Iterator[Store]:
-    opened = new_store(settings)
-    opened.inputs.add_blob(SHA, "aa/blob", 3)
-    yield opened
-    opened.close()
-
-
 @contextmanager
 def at_work(settings: ServiceSettings, store: Store) -> Iterator[Dispatcher]:
     """Run a dispatcher in a thread within the block."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,33 +14,7 @@ from service.files.artifacts import Artifacts
 from service.scheduling.publishing import Outbox, Publisher
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.jobs import NewJob
 from service.store.leases import Lease
-from tests.stores import new_store
-
-SHA = "a" * 64
-
-
-@pytest.fixture
-def settings(tmp_path: Path) -> ServiceSettings:
-    return ServiceSettings(data=tmp_path / "data")
-
-
-@pytest.fixture
-def store(settings: ServiceSettings) -> Iterator[Store]:
-    opened = new_store(settings)
-    opened.inputs.add_blob(SHA, "aa/blob", 3)
-    yield opened
-    opened.close()
-
-
-@pytest.fixture
-def lease(store: Store) -> Lease:
-    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
-    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    taken = store.leases.take("one")
-    assert taken is not None
-    return taken
 
 
 @pytest.fixture

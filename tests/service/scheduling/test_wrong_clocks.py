@@ -31,7 +31,7 @@ DAY = 86_400.0
 LEASE = 6.0
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
 def settings(request: pytest.FixtureRequest, tmp_path: Path) -> ServiceSettings:
     """Return the settings of a service with a new database and short leases."""
     database = None if request.param == "sqlite" else migrated_database(request.getfixturevalue("postgres"))

@@ -12,8 +12,11 @@ from tests.postgres import fresh_database
 from tests.service.store.helpers import SHA, Clock, store_settings
 from tests.stores import migrated_database, new_store
 
+#: The same statements run on both databases; the fast tests use the one that needs no server.
+DATABASES = ["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)]
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+
+@pytest.fixture(params=DATABASES)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> str | None:
     """Return the URL of an empty PostgreSQL database, or None for SQLite at its default path."""
     return None if request.param == "sqlite" else fresh_database(request.getfixturevalue("postgres"))
@@ -24,7 +27,7 @@ def clock() -> Clock:
     return Clock()
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@pytest.fixture(params=DATABASES)
 def store(request: pytest.FixtureRequest, tmp_path: Path, clock: Clock) -> Iterator[Store]:
     if request.param == "sqlite":
         opened = new_store(store_settings(tmp_path, None), clock)

@@ -32,6 +32,7 @@ def test_this_machine_works(tiny_installed: Path) -> None:
     assert "7 checks agree" in findings[-1].text
 
 
+@pytest.mark.slow
 def test_missing_weights_are_a_problem(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -98,6 +98,7 @@ def vgg16_folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_both_weight_conventions_give_the_same_features(vgg19_folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "vgg_conv.pth"
     torch.save(caffe_state(random_vgg("vgg19")), file)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -24,7 +23,6 @@ from sgsst_core.style import Style
 from sgsst_core.timing import Timer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
-from tests.pretend_cuda.runtime import pretend_cuda
 from tests.sgsst_core.synthetic_images import synthetic_image
 
 pytest.importorskip("triton")
@@ -32,12 +30,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 HEIGHT, WIDTH = 32, 48
 SCALES = [0, 1]
-
-
-@pytest.fixture
-def counts() -> Iterator[Counts]:
-    with pretend_cuda() as counts:
-        yield counts
 
 
 @pytest.fixture
@@ -72,7 +64,7 @@ def assert_same(actual: SosResult, expected: SosResult) -> None:
     assert actual.values.cpu().equal(expected.values.cpu())
 
 
-@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("weighted", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_graph_is_bit_identical_to_eager_mode_for_every_view(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, weighted: bool
 ) -> None:

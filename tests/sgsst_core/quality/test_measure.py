@@ -131,6 +131,7 @@ def test_interrupted_job_is_measured_at_its_start_and_end(tiny_weights: Backbone
     assert [entry["step"] for entry in stylizer.measured] == [0, 2]
 
 
+@pytest.mark.slow
 def test_measuring_can_be_disabled_and_does_not_change_colors(tiny_weights: BackboneWeights) -> None:
     nothing, everything, least = (
         make(tiny_weights, measure=0.0),

@@ -6,7 +6,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -411,6 +411,7 @@ def test_too_many_intersections_error_has_figures() -> None:
         check_intersections(MAX_INTERSECTIONS + 1, 5, camera())
 
 
+@pytest.mark.slow
 def test_kernels_run_without_a_writable_folder(tmp_path: Path) -> None:
     """If no folder is writable, machine code is kept in memory only; Numba itself would raise an error at import."""
     package = Path(__file__).resolve().parents[3]
@@ -429,18 +430,6 @@ def test_kernels_run_without_a_writable_folder(tmp_path: Path) -> None:
         [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False
     )
     assert finished.returncode == 0, finished.stderr
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Run PyTorch on one thread within the test.
-
-    The reference makes thousands of small operations, for which waking threads costs more than the work.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 REAL = [("snowmiku_plush", 160), ("broche", 120), ("playbot_synthetic_sh2", 120)]
@@ -474,6 +463,7 @@ def test_real_scene_looks_like_its_photo(shared_data: Path) -> None:
     assert psnr > 25
 
 
+@pytest.mark.slow
 def test_kernels_do_not_change_the_number_of_torch_threads() -> None:
     """In a fresh process, Numba's first kernel sets an OpenMP library that PyTorch may share to all cores."""
     code = (

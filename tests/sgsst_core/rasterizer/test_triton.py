@@ -85,7 +85,11 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 }
 
 
-@pytest.fixture(params=CASES)
+#: Cases that the fast tests run; the kernels are slow in the interpreter.
+FAST = ("rotated", "opaque", "one pixel", "antialiased")
+
+
+@pytest.fixture(params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in CASES])
 def case(request: pytest.FixtureRequest) -> tuple[Scene, Camera]:
     return CASES[request.param]()
 
@@ -242,6 +246,7 @@ def test_steps_of_a_job_agree_with_the_cpu(tiny_weights: BackboneWeights, one_th
     assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_error_without_a_gpu_gives_advice() -> None:
     with pytest.raises(SettingsError, match="PyTorch sees no GPU"):

@@ -52,7 +52,9 @@ CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
 }
 
 
-@pytest.fixture(params=CASES)
+@pytest.fixture(
+    params=[name if name in ("opaque", "one pixel") else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+)
 def case(request: pytest.FixtureRequest) -> tuple[Scene, Camera]:
     return CASES[request.param]()
 

@@ -194,6 +194,7 @@ def test_content_weight_of_the_job_in_a_region_changes_nothing(tiny_weights: Bac
     assert [record.loss for record in actual.history] == [record.loss for record in wanted.history]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("treatment", [{"style": Style.of(style().flip(0, 2) ** 2)}])
 def test_only_the_protected_region_stays_near_its_content(
     tiny_weights: BackboneWeights, treatment: dict[str, Any]

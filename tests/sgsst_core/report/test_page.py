@@ -350,6 +350,7 @@ def test_novel_views_without_values_are_shown() -> None:
     parsed_without_figures(report)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("coarse", "sos"), [(1, 1), (0, 2)])
 def test_single_steps_are_drawn_as_markers(coarse: int, sos: int) -> None:
     page = parsed(losses_alone(coarse, sos))
@@ -367,6 +368,7 @@ def test_report_without_steps_has_no_figures() -> None:
     assert "No time was measured." in page.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "where"), [(math.nan, "one"), (-1.0, "all")])
 def test_losses_outside_of_logarithmic_axes_are_counted(wrong: float, where: str) -> None:
     report = losses_alone(scales=2)
@@ -379,6 +381,7 @@ def test_losses_outside_of_logarithmic_axes_are_counted(wrong: float, where: str
     assert f"Not shown: {count} of 30 values" in parsed(report).text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-320, 1e308])
 def test_extreme_losses_are_shown(size: float) -> None:
     report = losses_alone()
@@ -389,6 +392,7 @@ def test_extreme_losses_are_shown(size: float) -> None:
     parsed(report)
 
 
+@pytest.mark.slow
 def test_long_history_stays_small() -> None:
     page = parsed(losses_alone(5 * BINS, 5 * BINS, scales=3))
     assert len(page.html.encode()) < 1_500_000  # leaves as much again for the sheet

@@ -288,6 +288,7 @@ _PEAK = textwrap.dedent("""
 """)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is looked for in Linux's /proc")
 def test_neither_harmonics_nor_result_are_in_memory(tmp_path: Path) -> None:
     """A Gaussian takes 56 bytes, in the subset again, plus 12 for its color and 4 for its row; SH would take 180."""

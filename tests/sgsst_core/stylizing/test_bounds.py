@@ -126,6 +126,7 @@ def test_colors_stay_in_the_subspace(
     assert distance_from(image, free.stylized(), axes) > 0.02
 
 
+@pytest.mark.slow
 def test_several_styles_free_the_colors(tiny_weights: BackboneWeights) -> None:
     scene, image = wall(), gray(style())
     right = (scene.means[:, 0] > 0).to(torch.uint8)

@@ -76,6 +76,7 @@ def test_resumed_job_caches_the_same_views(form: str, views_per_step: int, tiny_
     assert cached_views(early) == cached_views(late) == cached_views(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [3, 33])
 def test_job_resumed_in_either_phase_caches_the_same_views(before: int, tiny_weights: BackboneWeights) -> None:
     whole, rest = (job(tiny_weights, "auto", **PHASES) for _ in range(2))

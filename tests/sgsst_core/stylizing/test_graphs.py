@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
-from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall
 
 pytest.importorskip("triton")
@@ -32,12 +30,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 #: Maximum number of launches of a step outside its graph, with views, style and intersections cached.
 MOST_LAUNCHES = 60
-
-
-@pytest.fixture
-def counts() -> Iterator[Counts]:
-    with pretend_cuda() as counts:
-        yield counts
 
 
 def test_kernels_run_on_the_device_of_their_data(counts: Counts, tiny_weights: BackboneWeights) -> None:
@@ -130,6 +122,7 @@ def test_one_graph_serves_every_background_color(
     assert launches["drawn"][-1][0] == 1
 
 
+@pytest.mark.slow
 def test_graphs_support_several_views_per_step_and_resuming(
     counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
 ) -> None:

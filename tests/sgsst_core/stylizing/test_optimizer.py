@@ -57,6 +57,7 @@ def test_steps_from_loaded_moments_are_bit_identical() -> None:
     assert torch.equal(half.detach(), colors.detach())
 
 
+@pytest.mark.slow
 def test_step_does_not_import_pytorchs_compiler() -> None:
     """The compiler would take two seconds and 140 MB in every process that optimizes."""
     code = (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.device import DEVICE, PretendTensor
-from tests.pretend_cuda.runtime import pretend_cuda
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import cameras, style, wall
 
@@ -84,12 +82,6 @@ class Photos:
         """Wait until `count` photos have been read in total."""
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.asked) >= count, STUCK), f"{self.asked} were read"
-
-
-@pytest.fixture
-def counts() -> Iterator[Counts]:
-    with pretend_cuda() as counts:
-        yield counts
 
 
 def make(weights: BackboneWeights, photos: Photos, *, cached: bool = False, **values: Any) -> Stylizer:

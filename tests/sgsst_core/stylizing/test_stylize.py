@@ -57,7 +57,10 @@ def copied(scene: Scene) -> Scene:
     return Scene(*(held(getattr(scene, name)).clone() for name in TENSORS))
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    "form",
+    [form if form in ("ply", "numpy", "gsplat") else pytest.param(form, marks=pytest.mark.slow) for form in FORMS],
+)
 def test_result_has_the_form_of_the_scene_and_new_colors(
     tiny_weights: BackboneWeights, tmp_path: Path, form: str
 ) -> None:

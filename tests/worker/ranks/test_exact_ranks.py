@@ -339,6 +339,7 @@ def test_slow_rank_gets_less_work_and_gradient_is_unchanged() -> None:
     assert torch.equal(first["after"], second["after"])
 
 
+@pytest.mark.slow
 def test_work_is_not_redistributed_without_rebalance() -> None:
     first, _ = on_ranks(2, run_with_a_slow_rank, False)
     assert first["speeds"] == (1.0, 1.0)

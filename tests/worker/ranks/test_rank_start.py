@@ -37,6 +37,7 @@ print(os.environ["OMP_NUM_THREADS"])
 """
 
 
+@pytest.mark.slow
 def test_thread_count_can_be_set_after_kernels_ran() -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     ended = subprocess.run(

@@ -1,0 +1,37 @@
+"""Fixtures for tests of the dispatcher: a database with one blob, and the lease of a job that reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.settings import ServiceSettings
+from service.store import Store
+from service.store.jobs import NewJob
+from service.store.leases import Lease
+from tests.service.store.helpers import SHA
+from tests.stores import new_store
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> ServiceSettings:
+    return ServiceSettings(data=tmp_path / "data", poll_seconds=0.05)
+
+
+@pytest.fixture
+def store(settings: ServiceSettings) -> Iterator[Store]:
+    opened = new_store(settings)
+    opened.inputs.add_blob(SHA, "aa/blob", 3)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def lease(store: Store) -> Lease:
+    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
+    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
+    taken = store.leases.take("one")
+    assert taken is not None
+    return taken
