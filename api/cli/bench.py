@@ -19,7 +19,7 @@ from sgsst_core.files.atomic import ensure_writable_folder, write_json
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.stylized_ply import write_stylized
-from sgsst_core.report.machine import machine
+from sgsst_core.report.document import machine
 from sgsst_core.scene.camera import Camera
 from worker.inputs import read_scene_and_capture
 from worker.job import SceneRequest, check_choice

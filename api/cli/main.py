@@ -91,9 +91,9 @@ app.add_typer(operator_commands.keys_app, name="keys")
 def program(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     """Style transfer for 3D Gaussian Splatting scenes (SGSST)."""
     if version:
-        from sgsst_core.report.machine import program_version
+        from sgsst_core.stylizing.checkpoint import versions
 
-        out_console.print(f"sgsst {program_version()}")
+        out_console.print(f"sgsst {versions()['program']}")
         raise typer.Exit()
 
 

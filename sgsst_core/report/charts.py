@@ -61,9 +61,6 @@ def draw_loss(figure: Figure, against: Against, history: History, moments: Seque
     """Draw the loss of each scale and their mean, relative to the start, and the Gram distance of novel views.
 
     Lines are running means over one round of views, with the range of the values shaded behind.
-
-    Args:
-        against: Quantity of the x axis.
     """
     axes = figure.subplots()
     mark_phases(axes, history, against)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -9,16 +11,18 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
+import psutil
+import torch
+
 from sgsst_core.budget import device_peak, peak_memory
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import ratio, smoothed
 from sgsst_core.loss.scale_weights import ScaleWeights
-from sgsst_core.loss.terms import LossTerms
 from sgsst_core.parallel.collectives import TRAFFIC
 from sgsst_core.planning.measurement_choice import allowed_seconds
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
-from sgsst_core.report.machine import machine, program_version
+from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, relative_loss
 from sgsst_core.stylizing.loop import Stopped
 from sgsst_core.stylizing.schedule import StepRecord
@@ -85,9 +89,10 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
     """Return program, time, losses and measurements of a job."""
     coarse = sum(record.stage == "coarse" for record in stylizer.history)
     weights = stylizer.job.loss.weights
+    errors = [entry["approximation"] for entry in stylizer.measured if entry["approximation"]]
     return {
         "version": REPORT_VERSION,
-        "program": {"name": "sgsst-service", "version": program_version()},
+        "program": {"name": "sgsst-service", "version": versions()["program"]},
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "stopped": stopped,
         "steps": {
@@ -107,36 +112,49 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
         },
         "loss_over_time": loss_over_time(stylizer, before),
         "measuring": _measuring_json(stylizer),
-        "novel_views": novel_views_json(stylizer.measured),
-        "approximations": approximations_json(stylizer.measured),
+        "novel_views": _novel_views_json(stylizer.measured),
+        "approximations": {"what": stylizer.measured[0]["approximated"], "moments": errors} if errors else None,
     }
 
 
 def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
     """Return settings and inputs of a job."""
-    backbone, styles = sources.backbone, _styles_json(stylizer, sources)
+    job, backbone, styles = stylizer.job, sources.backbone, _styles_json(stylizer, sources)
+    refined: dict[str, Any] | None = None
+    if (refinement := job.plan.refinement) is not None:
+        names = ("gaussians", "split", "reverted", "size", "psnr", "lowest_psnr")
+        refined = {"gaussians_before": len(refinement.pieces)} | {name: getattr(refinement, name) for name in names}
+    cameras, covered = job.views.cameras, set(job.views.covered)
     return {
-        "settings": stylizer.job.settings.model_dump(mode="json"),
+        "settings": job.settings.model_dump(mode="json"),
         "backbone": {
             "name": backbone.name,
             "source": backbone.source,
             "sha256": backbone.sha256,
-            "scales": stylizer.job.weights.scales,
+            "scales": job.weights.scales,
         },
         "scene": {
             "path": str(sources.scene),
-            "gaussians": len(stylizer.job.scene),
-            "sh_degree": stylizer.job.sh_degree,
+            "gaussians": len(job.scene),
+            "sh_degree": job.sh_degree,
             "dropped": sources.dropped,
-            "refined": _refined_json(stylizer.job.plan),
+            "refined": refined,
         },
         "style": {name: styles[0][name] for name in ("path", "width", "height")},
         "styles": styles,
         "regions": _regions_json(stylizer),
-        "cameras": _cameras_json(stylizer, sources),
+        "cameras": {
+            "path": str(sources.cameras) if sources.cameras else None,
+            "source": "file" if sources.cameras else "orbit",
+            "content": str(sources.photos) if sources.photos else "unstylized renders",
+            "count": len(cameras),
+            "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in cameras})],
+            "names": [camera.name for camera in cameras],
+            "seeing_nothing": [camera.name for index, camera in enumerate(cameras) if index not in covered],
+        },
         "position_weights": {
-            "used": stylizer.job.view_targets.weighted,
-            "uncovered_fraction": round(stylizer.job.plan.survey.uncovered_fraction, 6),
+            "used": job.view_targets.weighted,
+            "uncovered_fraction": round(job.plan.survey.uncovered_fraction, 6),
         },
     }
 
@@ -172,22 +190,6 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
         }
         for index, region in enumerate(regions.every)
     ]
-
-
-def _refined_json(plan: Plan) -> dict[str, Any] | None:
-    """Return how Gaussians were split, with the effect on unstylized renders; None if refinement was not requested."""
-    refinement = plan.refinement
-    if refinement is None:
-        return None
-    return {
-        "gaussians_before": len(refinement.pieces),
-        "gaussians": refinement.gaussians,
-        "split": refinement.split,
-        "reverted": refinement.reverted,
-        "size": refinement.size,
-        "psnr": refinement.psnr,
-        "lowest_psnr": refinement.lowest_psnr,
-    }
 
 
 def plan_json(plan: Plan) -> dict[str, Any]:
@@ -308,43 +310,18 @@ def loss_over_time(stylizer: Stylizer, before: Evaluation) -> dict[str, Any] | N
     return {"relative": relative[-1], "reached": reached, "last_tenth": last}
 
 
-def novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+def _novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the quality on novel views at each moment; None if no novel view was measured."""
     moments = [entry["novel_views"] for entry in measured if entry["novel_views"]]
     if not moments:
         return None
-    first = measured[0]
-    judged = measured[-1].get("judged")
-    return {"views": first["novel_view_names"], "lpips": first["lpips"], "moments": moments, "judged": judged}
-
-
-def approximations_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the gradient's error at each moment; None if nothing is approximated."""
-    moments = [entry["approximation"] for entry in measured if entry["approximation"]]
-    return {"what": measured[0]["approximated"], "moments": moments} if moments else None
-
-
-def _cameras_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:
-    cameras = stylizer.job.views.cameras
-    covered = set(stylizer.job.views.covered)
-    return {
-        "path": str(sources.cameras) if sources.cameras else None,
-        "source": "file" if sources.cameras else "orbit",
-        "content": str(sources.photos) if sources.photos else "unstylized renders",
-        "count": len(cameras),
-        "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in cameras})],
-        "names": [camera.name for camera in cameras],
-        "seeing_nothing": [camera.name for index, camera in enumerate(cameras) if index not in covered],
-    }
+    views, lpips = measured[0]["novel_view_names"], measured[0]["lpips"]
+    return {"views": views, "lpips": lpips, "moments": moments, "judged": measured[-1].get("judged")}
 
 
 def _evaluation_json(evaluation: Evaluation, weights: ScaleWeights) -> dict[str, Any]:
-    scales = {str(scale): _terms_json(terms) for scale, terms in evaluation.items()}
+    scales = {str(scale): {**terms, "total": terms.total} for scale, terms in evaluation.items()}
     return {"total": mean_loss(evaluation, weights), "scales": scales}
-
-
-def _terms_json(terms: LossTerms) -> dict[str, float]:
-    return {**terms, "total": terms.total}
 
 
 def _record_json(record: StepRecord, before: Evaluation, weights: ScaleWeights) -> dict[str, Any]:
@@ -356,8 +333,30 @@ def _record_json(record: StepRecord, before: Evaluation, weights: ScaleWeights) 
         "view": record.view,
         "loss": record.loss,
         "relative": ratio(record.loss, start),
-        "scales": {str(scale): _terms_json(terms) for scale, terms in record.terms.items()},
+        "scales": _evaluation_json(record.terms, weights)["scales"],
         "parts": {name: round(seconds, 4) for name, seconds in record.parts.items()},
         "memory_bytes": record.memory,
         "device_memory_bytes": record.device_memory,
     }
+
+
+def machine(device: torch.device) -> dict[str, Any]:
+    """Describe the machine that ran the job."""
+    return {
+        "system": platform.platform(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "memory_bytes": psutil.virtual_memory().total,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):  # not Linux, or a processor that does not name itself
+        return platform.processor() or platform.machine()

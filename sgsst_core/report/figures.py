@@ -35,6 +35,7 @@ from sgsst_core.report.history import (
     AGAINST,
     X_MARGIN,
     Against,
+    Floats,
     History,
     column,
     consistency_at,
@@ -76,22 +77,15 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
     history = history_of(report)
     moments = novel_view_moments(report)
     probes = (report.get("approximations") or {}).get("moments") or []
-    figures = [
-        _figure(
-            "loss",
-            "Loss, relative to the start",
-            "Loss, divided by that of the unstylized scene." + _undrawn(report),
-            partial(draw_loss, history=history, moments=moments),
-        ),
-        _figure(
-            "split",
-            "Terms of the loss",
-            "The loss of a scale is the sum of these terms.",
-            partial(_draw_split, history=history),
-            rows=math.ceil(len(history.terms) / 2),
-        ),
-    ]
-    if any(_known(_consistency(moments, reach, metric)[1:]) for reach in _REACHES for metric in _METRICS):
+    losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
+    undrawn, caption = int((~drawable(losses)).sum()), "Loss, divided by that of the unstylized scene."
+    if undrawn:  # a logarithmic axis cannot show them
+        caption += f" Not shown: {undrawn:,} of {len(losses):,} values, which are zero or not finite."
+    draw: Callable[[Figure, Against], None] = partial(draw_loss, history=history, moments=moments)
+    figures = [_figure("loss", "Loss, relative to the start", caption, draw)]
+    caption, draw = "The loss of a scale is the sum of these terms.", partial(_draw_split, history=history)
+    figures.append(_figure("split", "Terms of the loss", caption, draw, rows=math.ceil(len(history.terms) / 2)))
+    if any(np.isfinite(_consistency(moments, reach, metric)[1:]).any() for reach in _REACHES for metric in _METRICS):
         caption = (
             "Difference between a view and another one that is warped into it. Dashed: the unstylized scene, "
             "whose views also differ, by highlights."
@@ -111,26 +105,10 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
     return figures
 
 
-# --- the report's values -------------------------------------------------------------------------------------------
-
-
-def _consistency(moments: Sequence[dict[str, Any]], reach: str, metric: str) -> list[float | None]:
-    consistencies = [consistency_at(moment, reach).get(metric) for moment in moments]
-    return [value if value is None or math.isfinite(value) else None for value in consistencies]
-
-
-def _known(values: Sequence[float | None]) -> bool:
-    return any(value is not None for value in values)
-
-
-def _undrawn(report: dict[str, Any]) -> str:
-    """Return a sentence about losses that a logarithmic axis cannot show; empty if there are none."""
-    losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
-    count = int((~drawable(losses)).sum())
-    return f" Not shown: {count:,} of {len(losses):,} values, which are zero or not finite." if count else ""
-
-
-# --- drawing -------------------------------------------------------------------------------------------------------
+def _consistency(moments: Sequence[dict[str, Any]], reach: str, metric: str) -> Floats:
+    """Return a metric at each moment [n], with NaN for missing and infinite values."""
+    values = column([consistency_at(moment, reach).get(metric) for moment in moments])
+    return np.where(np.isfinite(values), values, math.nan)
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[Figure, Against], None], rows: int = 1) -> PageFigure:
@@ -169,14 +147,17 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
 
 
 def _draw_consistency(figure: Figure, against: Against, history: History, moments: Sequence[dict[str, Any]]) -> None:
-    metrics = [metric for metric in _METRICS if any(_known(_consistency(moments, reach, metric)) for reach in _REACHES)]
+    known = {name: [np.isfinite(_consistency(moments, reach, name)).any() for reach in _REACHES] for name in _METRICS}
+    metrics = [metric for metric in _METRICS if any(known[metric])]
     x = moment_positions(moments, against)
     panels = figure.subplots(1, len(metrics), squeeze=False)[0]
     for axes, metric in zip(panels, metrics, strict=True):
         for reach, color in _REACHES.items():
-            values = column(_consistency(moments, reach, metric))
+            values = _consistency(moments, reach, metric)
             shown = drawable(x) & np.isfinite(values)
-            options = {"marker": "o", "markersize": 4, "color": color, "label": _reach_name(moments, reach)}
+            gap = next(filter(None, (consistency_at(moment, reach).get("gap") for moment in moments)), None)
+            label = f"{reach} range" if gap is None else f"{reach} range ({gap} view{'s' if gap > 1 else ''} apart)"
+            options = {"marker": "o", "markersize": 4, "color": color, "label": label}
             draw_points(axes, x[shown], values[shown], **options)
             if moments[0].get("step") == 0 and np.isfinite(values[0]):
                 axes.axhline(values[0], color=color, linestyle="--", linewidth=1)
@@ -218,12 +199,6 @@ def _draw_memory(figure: Figure, against: Against, history: History, predicted: 
     mark_phases(axes, history, against)
     set_log_x(axes, history.limits[against], against)
     draw_legend(figure)
-
-
-def _reach_name(moments: Sequence[dict[str, Any]], reach: str) -> str:
-    gaps = [consistency_at(moment, reach).get("gap") for moment in moments]
-    gap = next((gap for gap in gaps if gap is not None), None)
-    return f"{reach} range" if gap is None else f"{reach} range ({gap} view{'s' if gap > 1 else ''} apart)"
 
 
 # --- SVG that can share a page with other figures ------------------------------------------------------------------

@@ -81,9 +81,17 @@ def history_of(report: dict[str, Any]) -> History:
     x: dict[Against, Floats] = {"seconds": column([record["seconds"] for record in records])}
     x["steps"] = column([record["step"] for record in records])
     starts = {scale: column([(before.get(str(scale)) or {}).get("total")]) for scale in scales}
+    phases: list[tuple[str, slice]] = []
+    for stage, run in groupby(record["stage"] for record in records):
+        start = phases[-1][1].stop if phases else 0
+        phases.append((stage, slice(start, start + len(list(run)))))
+
+    def of_scale(scale: int, term: str) -> Floats:
+        return column([record["scales"].get(str(scale), {}).get(term) for record in records])
+
     several = [len(record["scales"]) > 1 for record in records]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        relative = {scale: _of_scale(records, scale, "total") / starts[scale] for scale in scales}
+        relative = {scale: of_scale(scale, "total") / starts[scale] for scale in scales}
     moments = novel_view_moments(report)
     split = [terms for record in records for terms in record["scales"].values()]
     terms = [term for term in TERMS if any(own.get(term) for own in split)] or list(TERMS)  # those that are not 0
@@ -93,8 +101,8 @@ def history_of(report: dict[str, Any]) -> History:
             against: log_limits(np.append(x[against], moment_positions(moments, against)), X_MARGIN)
             for against in AGAINST
         },
-        phases=_phases([record["stage"] for record in records]),
-        terms={scale: {term: _of_scale(records, scale, term) for term in terms} for scale in scales},
+        phases=phases,
+        terms={scale: {term: of_scale(scale, term) for term in terms} for scale in scales},
         relative=relative,
         mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
         memory=column([record.get("memory_bytes") for record in records]),
@@ -135,19 +143,6 @@ def moment_positions(moments: Sequence[dict[str, Any]], against: Against) -> Flo
     return column([moment.get("seconds" if against == "seconds" else "step") for moment in moments])
 
 
-def _of_scale(records: Sequence[dict[str, Any]], scale: int, term: str) -> Floats:
-    return column([record["scales"].get(str(scale), {}).get(term) for record in records])
-
-
-def _phases(stages: Sequence[str]) -> list[tuple[str, slice]]:
-    phases, start = [], 0
-    for stage, run in groupby(stages):
-        end = start + sum(1 for _ in run)
-        phases.append((stage, slice(start, end)))
-        start = end
-    return phases
-
-
 # --- logarithmic axes ----------------------------------------------------------------------------------------------
 
 
@@ -171,7 +166,6 @@ def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
 
     Args:
         x: Positions [n] in ascending order.
-        values: Values [n].
         window: Length of the running mean in steps.
         width: Width of a bin, as a difference of natural logarithms.
     """

@@ -17,15 +17,7 @@ from sgsst_core.number_format import NOTHING, byte_count, duration, number, perc
 from sgsst_core.report.figures import draw_figures
 from sgsst_core.report.history import AGAINST, BINS, round_length
 from sgsst_core.report.palette import ON_DARK, PAGE
-from sgsst_core.report.tables import (
-    approximation_table,
-    decision_table,
-    finding_table,
-    judged_table,
-    loss_table,
-    novel_views_table,
-    prediction_table,
-)
+from sgsst_core.report.tables import TABLES
 from sgsst_core.stylizing.schedule import BEFORE_STEPS
 
 #: Maximum number of list members shown in the collapsed section, followed by their total number.
@@ -68,6 +60,7 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
+_ENVIRONMENT.filters |= {"number": number, "percent": percent, "duration": duration, "thousands": "{:,}".format}
 
 
 def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None = None) -> str:
@@ -77,38 +70,26 @@ def render_page(report: dict[str, Any], sheet: bytes | None, views: bytes | None
         sheet: Contact sheet as JPEG; None omits it.
         views: Sheet of all views as JPEG; None omits it.
     """
-    figures, approximations = draw_figures(report), report.get("approximations")
+    sheets = {
+        name: base64.b64encode(each).decode("ascii") if each else None
+        for name, each in (("sheet", sheet), ("views", views))
+    }
     return _ENVIRONMENT.get_template("report.html").render(
+        report=report,
         scene=PurePath(report["scene"]["path"]).name,
         style=_style_names(report),
-        facts=_facts(report),
-        result=_result(report),
-        loss_over_time=_loss_over_time(report),
-        sheet=base64.b64encode(sheet).decode("ascii") if sheet else None,
-        views=base64.b64encode(views).decode("ascii") if views else None,
+        stopped=_STOPPED.get(report["stopped"], report["stopped"]),
         colors=PAGE,
         on_dark=ON_DARK,
         against=AGAINST,
         bins=BINS,
         round_length=round_length(report),
         # All text in the figures is constant or escaped by the XML writer, so the SVGs are safe as markup.
-        figures=[(figure, {against: Markup(figure.svg[against]) for against in AGAINST}) for figure in figures],
-        losses=loss_table(report),
-        novel_views=novel_views_table(report),
-        judged=judged_table(report),
-        seconds=duration(report["seconds"]),
+        figures=[(each, {name: Markup(each.svg[name]) for name in AGAINST}) for each in draw_figures(report)],
+        tables={name: table(report) for name, table in TABLES.items()},
         parts=_time_split(report),
-        decisions=decision_table(report),
-        predictions=prediction_table(report),
-        findings=finding_table(report),
-        approximations=approximations
-        and {
-            "what": ", ".join(approximations.get("what") or []),
-            "table": approximation_table(report),
-        },
         everything=_everything(report),
-        program=f"{report['program']['name']} {report['program']['version']}",
-        created=report["created"],
+        **sheets,
     )
 
 
@@ -147,77 +128,16 @@ def _sheet_bytes(path: Path | None) -> bytes | None:
         ) from error
 
 
-# --- heading -------------------------------------------------------------------------------------------------------
-
-
-def _facts(report: dict[str, Any]) -> list[str]:
-    """Return short facts about the job's inputs."""
-    count = report["cameras"]["count"]
-    sizes = report["cameras"]["sizes"]
-    size = f", up to {' × '.join(str(side) for side in max(sizes))} pixels" if sizes else ""
-    return [
-        f"{report['backbone']['name'].upper()}",
-        f"preset {report['settings']['preset']}",
-        f"{report['scene']['gaussians']:,} Gaussians",
-        f"{count:,} view{'' if count == 1 else 's'}{size}",
-    ]
-
-
-def _result(report: dict[str, Any]) -> dict[str, str]:
-    steps = report["steps"].values()
-    done, planned = sum(part["done"] for part in steps), sum(part["planned"] for part in steps)
-    return {
-        "relative": number(report["loss"]["relative"]),
-        "seconds": duration(report["seconds"]),
-        "steps": f"{done:,}" if done == planned else f"{done:,} of {planned:,}",
-        "stopped": _STOPPED.get(report["stopped"], report["stopped"]),
-    }
-
-
-def _loss_over_time(report: dict[str, Any]) -> dict[str, Any] | None:
-    """Format when each relative loss was reached, and how the loss changed in the last tenth of the time."""
-    loss_over_time = report.get("loss_over_time")
-    if not loss_over_time:
-        return None
-    total = report["seconds"]
-    reached = [
-        {
-            "relative": percent(entry["relative"]),
-            "seconds": duration(entry["seconds"]),
-            "step": f"{entry['step']:,}",
-            "share": percent(entry["seconds"] / total) if total else NOTHING,
-        }
-        for entry in loss_over_time.get("reached") or []
-    ]
-    last = loss_over_time.get("last_tenth")
-    tenth = None
-    if last:
-        tenth = {
-            "seconds": duration(last["seconds"]),
-            "before": percent(last["from"], 3),
-            "after": percent(last["to"], 3),
-        }
-    return {"relative": percent(loss_over_time["relative"], 3), "reached": reached, "last_tenth": tenth}
-
-
-# --- other parts ---------------------------------------------------------------------------------------------------
-
-
-def _time_split(report: dict[str, Any]) -> list[dict[str, str]]:
-    """Return each kind of time with its seconds and percentage, longest first."""
+def _time_split(report: dict[str, Any]) -> list[tuple[str, float, float]]:
+    """Return the name, the seconds and the percentage of each kind of time, longest first."""
     by_part = report.get("seconds_by_part") or {}
     parts = {_PARTS.get(name, name): seconds for name, seconds in by_part.items()}
     measured = sum(parts.values())
     total = max(report["seconds"] + sum(by_part.get(name, 0.0) for name in _BESIDE), measured)
-    if not total:
-        return []
     ordered = sorted(parts.items(), key=lambda part: -part[1])
     if total - measured > 0.001 * total:
         ordered.append(("everything else", total - measured))
-    return [
-        {"name": name, "seconds": duration(seconds), "share": f"{100 * seconds / total:.1f}"}
-        for name, seconds in ordered
-    ]
+    return [(name, seconds, 100 * seconds / total) for name, seconds in ordered] if total else []
 
 
 def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -15,8 +15,6 @@ class Table:
     """Table of text, with one cell per column in each row.
 
     Attributes:
-        columns: Titles of the columns.
-        rows: Cells of each row.
         texts: Titles of the columns of text; all others hold numbers, which are right-aligned.
     """
 
@@ -93,66 +91,51 @@ def decision_table(report: dict[str, Any]) -> Table:
     return Table([*texts[:3], "saves per step", "saves memory", "error"], rows, texts)
 
 
-#: Titles of rows about first visits. The other rows apply to views visited before.
-_VISITS = {"first_visit": "first visit of a view, in addition", "first_visit_coarse": "the same in phase 1"}
-
-
 def prediction_table(report: dict[str, Any]) -> Table:
     """Return the plan's predictions beside the measured values."""
     predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
-    rows = [
-        _beside("step on all scales", predicted.get("seconds"), measured.get("seconds"), duration),
-        *(
-            _beside(text, predicted.get(name), measured[name], duration)
-            for name, text in _VISITS.items()
-            if measured.get(name) is not None
-        ),
-        _beside("peak memory", predicted.get("peak_bytes"), measured.get("peak_bytes"), byte_count),
-    ]
-    if predicted.get("measuring") and measured.get("measuring") is not None:
-        rows.append(_beside("measuring, total", predicted["measuring"], measured["measuring"], duration))
-        planned = _fraction(predicted["measuring"], predicted["job"] - predicted["measuring"])
-        rows.append(
-            _beside(
-                "measuring, relative to the steps' time",
-                planned,
-                _fraction(measured["measuring"], report["seconds"]),
-                percent,
-            )
-        )
-    on_device = predicted.get("device_bytes"), measured.get("device_bytes")
-    if any(value is not None for value in on_device):
-        rows.append(_beside("peak memory of the GPU", *on_device, byte_count))
+    rows: list[list[str]] = []
+
+    def add(title: str, text: Callable[[float | None], str], before: float | None, after: float | None) -> None:
+        ratio = after / before if before and after is not None else None
+        rows.append([title, text(before), text(after), number(ratio)])
+
+    def add_value(title: str, text: Callable[[float | None], str], name: str) -> None:
+        add(title, text, predicted.get(name), measured.get(name))
+
+    add_value("step on all scales", duration, "seconds")
+    # The other rows apply to views visited before.
+    if measured.get("first_visit") is not None:
+        add_value("first visit of a view, in addition", duration, "first_visit")
+    if measured.get("first_visit_coarse") is not None:
+        add_value("the same in phase 1", duration, "first_visit_coarse")
+    add_value("peak memory", byte_count, "peak_bytes")
+    measuring = predicted.get("measuring"), measured.get("measuring")
+    if measuring[0] and measuring[1] is not None:
+        add("measuring, total", duration, *measuring)
+        wholes = predicted["job"] - measuring[0], report["seconds"]
+        parts = [part / whole if whole else None for part, whole in zip(measuring, wholes, strict=True)]
+        add("measuring, relative to the steps' time", percent, *parts)
+    if any(values.get("device_bytes") is not None for values in (predicted, measured)):
+        add_value("peak memory of the GPU", byte_count, "device_bytes")
     one_rank, seconds = predicted.get("seconds_one_rank"), predicted.get("seconds")
     if one_rank and seconds:
-        waiting = predicted["communication"], measured.get("communication")
-        rows.append(_beside("waiting for other ranks, per step", *waiting, duration))
-        rows.append(_beside("speedup over one rank", one_rank / seconds, measured.get("speed_up"), number))
+        add("waiting for other ranks, per step", duration, predicted["communication"], measured.get("communication"))
+        add("speedup over one rank", number, one_rank / seconds, measured.get("speed_up"))
     return Table(["", "predicted", "measured", "measured / predicted"], rows)
-
-
-def _fraction(part: float, whole: float) -> float | None:
-    """Return a part as a fraction of the whole; None if the whole is 0."""
-    return part / whole if whole else None
-
-
-def _beside(name: str, before: float | None, after: float | None, text: Callable[[float | None], str]) -> list[str]:
-    """Return a row with a prediction, its measured value and their ratio."""
-    return [name, text(before), text(after), number(after / before if before and after is not None else None)]
 
 
 def finding_table(report: dict[str, Any]) -> Table | None:
     """Return the findings about scene, views and style; None if there are none."""
-    findings = report.get("findings") or []
     rows = [
         [
-            entry["subject"],
-            entry["what"],
-            f"{entry['count']:,} of {entry['total']:,}",
-            entry["worst"] or NOTHING,
-            entry["done"],
+            each["subject"],
+            each["what"],
+            f"{each['count']:,} of {each['total']:,}",
+            each["worst"] or NOTHING,
+            each["done"],
         ]
-        for entry in findings
+        for each in report.get("findings") or []
     ]
     texts = ["input", "finding", "worst", "consequence"]
     return Table(["input", "finding", "count", "worst", "consequence"], rows, texts) if rows else None
@@ -160,22 +143,23 @@ def finding_table(report: dict[str, Any]) -> Table | None:
 
 def approximation_table(report: dict[str, Any]) -> Table | None:
     """Return all comparisons of the job's gradient with the exact one; None if there are none."""
-    moments = (report.get("approximations") or {}).get("moments") or []
-    names = report["cameras"]["names"]
-    rows = []
-    for entry in moments:
-        view = entry["view"]
-        taken, exact = entry.get("seconds"), entry.get("seconds_exact")
-        rows.append(
-            [
-                f"{entry['step']:,}",
-                names[view] if isinstance(view, int) and 0 <= view < len(names) else str(view),
-                number(entry.get("relative_error")),
-                number(entry.get("cosine"), 6),
-                duration(taken),
-                duration(exact),
-                number(exact / taken if taken and exact is not None else None),
-            ]
-        )
+    names, rows = report["cameras"]["names"], []
+    for entry in (report.get("approximations") or {}).get("moments") or []:
+        view, taken, exact = entry["view"], entry.get("seconds"), entry.get("seconds_exact")
+        row = [f"{entry['step']:,}", names[view] if isinstance(view, int) and 0 <= view < len(names) else str(view)]
+        row += [number(entry.get("relative_error")), number(entry.get("cosine"), 6), duration(taken), duration(exact)]
+        rows.append([*row, number(exact / taken if taken and exact is not None else None)])
     errors = ["relative error of the gradient", "cosine to the exact gradient"]
     return Table(["step", "view", *errors, "time", "exact time", "speedup"], rows, ["view"]) if rows else None
+
+
+#: Tables of the page by their name in its template.
+TABLES: dict[str, Callable[[dict[str, Any]], Table | None]] = {
+    "losses": loss_table,
+    "novel_views": novel_views_table,
+    "judged": judged_table,
+    "decisions": decision_table,
+    "predictions": prediction_table,
+    "findings": finding_table,
+    "approximations": approximation_table,
+}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -58,14 +58,23 @@ def write_frames(
 
     Args:
         write: Function that appends a frame to the video; see `sgsst_core.files.video.video_writer`.
-        layer: Scene to show.
         cameras: Cameras of one size, one per frame.
         unstylized: Scene at the start of the transition; None for no transition.
         progress: Callback that receives the numbers of completed and of all frames.
     """
-    for done, frame in enumerate(_frames(layer, cameras, unstylized, transition, alpha), start=1):
-        write(frame)
-        progress(done, len(cameras))
+    for index, camera in enumerate(cameras):
+        fraction = 1.0 if unstylized is None else shown_fraction(index / max(len(cameras) - 1, 1))
+        if unstylized is None or fraction == 1:
+            image = layer.image(camera, alpha=alpha)
+        elif fraction == 0:
+            image = unstylized.image(camera, alpha=alpha)
+        else:
+            before, after = unstylized.image(camera, alpha=alpha), layer.image(camera, alpha=alpha)
+            line = round(fraction * before.shape[1])
+            wiped = torch.cat([after[:, :line], before[:, line:]], dim=1)
+            image = wiped if transition == "wipe" else torch.lerp(before, after, fraction)
+        write(_to_bytes(image))
+        progress(index + 1, len(cameras))
 
 
 def shown_fraction(time: float) -> float:
@@ -75,29 +84,6 @@ def shown_fraction(time: float) -> float:
     """
     x = min(max((time - _HOLD) / (1 - 2 * _HOLD), 0.0), 1.0)
     return x * x * (3 - 2 * x)
-
-
-def _frames(
-    layer: Layer, cameras: Sequence[Camera], unstylized: Layer | None, transition: Transition, alpha: bool
-) -> Iterator[VideoFrame]:
-    for index, camera in enumerate(cameras):
-        fraction = 1.0 if unstylized is None else shown_fraction(index / max(len(cameras) - 1, 1))
-        if unstylized is None or fraction == 1:
-            image = layer.image(camera, alpha=alpha)
-        elif fraction == 0:
-            image = unstylized.image(camera, alpha=alpha)
-        else:
-            ends = unstylized.image(camera, alpha=alpha), layer.image(camera, alpha=alpha)
-            image = _mixed(*ends, fraction, transition)
-        yield _to_bytes(image)
-
-
-def _mixed(before: Tensor, after: Tensor, fraction: float, transition: Transition) -> Tensor:
-    """Return an image between two: `after` to the left of a line, or a weighted mean."""
-    if transition == "fade":
-        return torch.lerp(before, after, fraction)
-    line = round(fraction * before.shape[1])
-    return torch.cat([after[:, :line], before[:, line:]], dim=1)
 
 
 def _to_bytes(image: Tensor) -> VideoFrame:
