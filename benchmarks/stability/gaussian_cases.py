@@ -26,7 +26,7 @@ from sgsst_core.constants import ALPHA_MIN, NEAR, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.projection import Outcome, project
+from sgsst_core.rasterizer.projection import project
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_directions
 from sgsst_core.scene.stored_harmonics import held
@@ -301,7 +301,7 @@ def _no_direction(full: bool) -> CaseResult:
     lengths = directions.norm(dim=1)
     error = float((lengths - torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64)).abs().max())
     colors = rest_colors(scene.sh_rest, means, camera())
-    drawn = project(scene, camera()).outcomes[Outcome.VISIBLE]
+    drawn = len(project(scene, camera()).gaussians)
     finite = bool(torch.isfinite(colors).all()) and drawn == 0
     return CaseResult(
         error if finite else math.inf, 1e-12, "the zero vector: finite colors, nearer than the near plane"

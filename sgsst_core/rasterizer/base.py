@@ -83,7 +83,6 @@ class Rasterizer(ABC):
     Args:
         scene: Scene, whose geometry must not change during the rasterizer's lifetime.
         background: RGB color behind pixels that Gaussians leave uncovered.
-        near: Near plane in world units.
         device: Device of the results; None for the rasterizer's default.
         options: Other arguments of the subclass's constructor, which `for_scene` passes on.
 

@@ -153,10 +153,6 @@ class CachedRasterizer(Rasterizer):
         finally:
             self._temporary.pop(key, None)
 
-    def is_cached(self, camera: Camera) -> bool:
-        """Return whether the view has cached weights."""
-        return self._serving(camera_key(camera)) is not None
-
     def survey(self, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return coverage [h, w], and each Gaussian's blend weight summed over all pixels [N].
 

@@ -60,23 +60,6 @@ class Column(IntEnum):
     EXTENT_Y = 7
 
 
-class Outcome(IntEnum):
-    """Outcome of projecting a Gaussian."""
-
-    VISIBLE = 0
-    #: Depth below the near plane; a Gaussian exactly on the plane is visible.
-    NEAR = 1
-    #: Zero quaternion, or overflow of float64, unless the center is far outside the image.
-    INVALID = 2
-    #: Opacity in the view below ALPHA_MIN, so it contributes to no pixel.
-    FAINT = 3
-    #: No pixel center of the image within its extents.
-    OUTSIDE = 4
-
-
-_VISIBLE, _NEAR, _INVALID, _FAINT, _OUTSIDE = (int(outcome) for outcome in Outcome)
-
-
 @dataclass(frozen=True)
 class Projection:
     """Gaussians of a scene that can be visible in a view, front to back.
@@ -84,12 +67,10 @@ class Projection:
     Attributes:
         gaussians: [V] int32, indices into the scene, sorted by depth along the viewing axis and then by index.
         values: [V, 8] float64, see `Column`.
-        outcomes: Number of Gaussians of the scene with each `Outcome`; for a subset, only the visible ones.
     """
 
     gaussians: NDArray[np.int32]
     values: NDArray[np.float64]
-    outcomes: dict[Outcome, int]
 
 
 @dataclass(frozen=True)
@@ -138,9 +119,6 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
     """Project a scene onto a camera. The scene may be empty.
 
     Args:
-        scene: Scene with N Gaussians.
-        camera: Camera to project onto.
-        near: Near plane in world units.
         shapes: Shapes of the scene from an earlier view; None to compute them.
 
     Raises:
@@ -159,7 +137,7 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
     with kernel_threads():
         threads = numba.get_num_threads()
         chunks = np.linspace(0, count, threads * _CHUNKS + 1).astype(np.int64)
-        tallies = np.zeros((len(chunks) - 1, len(Outcome)), dtype=np.int64)
+        counts = np.zeros(len(chunks) - 1, dtype=np.int64)
         _project_chunks(
             *(np.ascontiguousarray(t.numpy()) for t in (scene.means, scene.quats)),
             shapes.deviations,
@@ -173,16 +151,11 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
             values,
             depths,
             gaussians,
-            tallies,
+            counts,
         )
-        ends = chunks[:-1] + tallies[:, Outcome.VISIBLE]
-        visible = [np.arange(start, end) for start, end in zip(chunks[:-1], ends, strict=True)]
+        visible = [np.arange(start, start + own) for start, own in zip(chunks[:-1], counts, strict=True)]
         order = depth_order(depths, np.concatenate(visible))
-        projection = Projection(
-            gaussians=np.empty(len(order), dtype=np.int32),
-            values=np.empty((len(order), len(Column))),
-            outcomes={outcome: int(tallies[:, outcome].sum()) for outcome in Outcome},
-        )
+        projection = Projection(np.empty(len(order), dtype=np.int32), np.empty((len(order), len(Column))))
         take_elements(gaussians, order, projection.gaussians)
         take_rows(values, order, projection.values)
     return projection
@@ -255,26 +228,29 @@ def _covariance(m0, m1, blur):
 
 @compiled()
 def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, blur, value):
-    """Fill one row of `Projection.values`, and return the outcome and the depth."""
+    """Fill one row of `Projection.values`, and return the depth; 0 if the Gaussian contributes to no pixel.
+
+    A Gaussian exactly on the near plane is visible. Those with a zero quaternion, or that overflow float64, are not.
+    """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     width, height = intrinsics[4], intrinsics[5]
     x = pose[0, 0] * mean[0] + pose[0, 1] * mean[1] + pose[0, 2] * mean[2] + pose[0, 3]
     y = pose[1, 0] * mean[0] + pose[1, 1] * mean[1] + pose[1, 2] * mean[2] + pose[1, 3]
     z = pose[2, 0] * mean[0] + pose[2, 1] * mean[1] + pose[2, 2] * mean[2] + pose[2, 3]
     if z < near:
-        return _NEAR, z
+        return 0.0
     support = opacity - LOG2_ALPHA_MIN
     if support < 0:
-        return _FAINT, z
+        return 0.0
     slope_x = min(intrinsics[7], max(intrinsics[6], x / z))
     slope_y = min(intrinsics[9], max(intrinsics[8], y / z))
     row0 = _row(fx / z, slope_x, pose[0], pose[2])
     row1 = _row(fy / z, slope_y, pose[1], pose[2])
     u, v = fx * (x / z) + cx, fy * (y / z) + cy
     if _surely_outside(u, width, row0, deviation, support, blur):
-        return _OUTSIDE, z
+        return 0.0
     if _surely_outside(v, height, row1, deviation, support, blur):
-        return _OUTSIDE, z
+        return 0.0
     rotation = _rotation(quat)
     m0 = _factor_row(row0, rotation, deviation)
     m1 = _factor_row(row1, rotation, deviation)
@@ -283,19 +259,19 @@ def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, blur, v
         opacity += 0.5 * np.log2(unblurred / det)
         support = opacity - LOG2_ALPHA_MIN
         if support < 0:
-            return _FAINT, z
+            return 0.0
     u_scale = TO_POWER_OF_TWO * math.sqrt(r / det)
     reach = math.sqrt(support) / TO_POWER_OF_TWO
     extent_x, extent_y = reach * math.sqrt(p), reach * math.sqrt(r)
     if not math.isfinite(u + v + q / r + u_scale + extent_x + extent_y + det):
-        return _INVALID, z
+        return 0.0
     if np.ceil(u - extent_x - 0.5) > min(np.floor(u + extent_x - 0.5), width - 1) or u + extent_x < 0.5:
-        return _OUTSIDE, z
+        return 0.0
     if np.ceil(v - extent_y - 0.5) > min(np.floor(v + extent_y - 0.5), height - 1) or v + extent_y < 0.5:
-        return _OUTSIDE, z
+        return 0.0
     value[0], value[1], value[2], value[3] = u, v, q / r, u_scale
     value[4], value[5], value[6], value[7] = TO_POWER_OF_TWO / math.sqrt(r), opacity, extent_x, extent_y
-    return _VISIBLE, z
+    return z
 
 
 @compiled(parallel=True)
@@ -310,9 +286,9 @@ def _compute_shapes(scales, logits, deviations, log2_opacities):
 @compiled(parallel=True)
 def _project_chunks(
     means, quats, deviations, opacities, pose, intrinsics, near, blur, chunks, threads, values, depths, gaussians,
-    tallies,
+    counts,
 ):  # fmt: skip
-    """Project each chunk of the scene, and count the outcomes.
+    """Project each chunk of the scene, and count its visible Gaussians.
 
     Results of visible Gaussians are written contiguously from the start of each chunk.
     """
@@ -320,13 +296,13 @@ def _project_chunks(
         chunk = step % _CHUNKS * threads + step // _CHUNKS  # gives every thread chunks from all over the scene
         position = chunks[chunk]
         for i in range(chunks[chunk], chunks[chunk + 1]):
-            outcome, depth = _project_one(
+            depth = _project_one(
                 means[i], quats[i], deviations[i], opacities[i], pose, intrinsics, near, blur, values[position]
             )
-            tallies[chunk, outcome] += 1
-            if outcome == _VISIBLE:
+            if depth > 0:
                 depths[position], gaussians[position] = depth, i
                 position += 1
+        counts[chunk] = position - chunks[chunk]
 
 
 @compiled(parallel=True)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import LOG2_ALPHA_MIN, NEAR, RASTER_TILE
 from sgsst_core.errors import TooManyIntersectionsError
-from sgsst_core.rasterizer.projection import Outcome, Projection, Shapes, project, take_elements, take_rows
+from sgsst_core.rasterizer.projection import Projection, Shapes, project, take_elements, take_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -72,7 +72,6 @@ def build_tile_intersections(
     """Project a scene, sort its Gaussians by depth, and compute the tile intersections.
 
     Args:
-        near: Near plane in world units.
         shapes: Shapes of the scene from an earlier view; None to compute them.
 
     Raises:
@@ -124,7 +123,7 @@ def intersections_of_subset(isects: TileIntersections, indices: NDArray[np.int32
         take_rows(projection.values, np.flatnonzero(remains), values)
         subset_ranks, subset_slots = np.empty(starts[-1], dtype=np.int32), np.empty(starts[-1], dtype=np.int32)
         _copy_remaining(isects.ranks, isects.slots, isects.starts, ranks, shifts, starts, subset_ranks, subset_slots)
-    subset = Projection(gaussians[remains], values, {Outcome.VISIBLE: len(values)})
+    subset = Projection(gaussians[remains], values)
     return TileIntersections(
         subset, starts, subset_ranks, subset_slots, np.append(first_slots[:-1][remains], first_slots[-1])
     )

@@ -66,10 +66,6 @@ class TiledRasterizer(Rasterizer, Generic[L]):
         """
         return self._intersections.get(camera_key(camera), lambda: self._build(camera))
 
-    def has_intersections(self, camera: Camera) -> bool:
-        """Return whether the view's tile intersections are cached, so it needs no projection and no sorting."""
-        return camera_key(camera) in self._intersections
-
     def release_view(self, camera: Camera, budget: int) -> None:
         """Drop the view's tile intersections, and set the budget for those of all other views to `budget` bytes."""
         self._intersections.take(camera_key(camera))

@@ -97,7 +97,6 @@ def project(
         values: Output [N, 8] float64, see `projection.Column`; rows of invisible Gaussians are not written.
         depths: Output [N] float64, infinite for invisible Gaussians.
         counts: Output [N] int32, 0 for invisible Gaussians.
-        total: N.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = i < total
@@ -204,7 +203,6 @@ def list_tiles(
         first_slots: [V + 1] int64, first slot of each rank.
         tiles: Output [E] int32.
         ranks: Output [E] int32.
-        visible: V.
     """
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = rank < visible
@@ -266,7 +264,6 @@ def blend(
     """Return the weights [8, 32] of a pair in a tile, and the updated `left` and `final`.
 
     Args:
-        pairs: Result of `load_pairs`.
         lane: [32] int32, index of the pair in all elements, so that each gather is one shuffle.
         x, y: Columns and rows of the pixels relative to the center of the tile.
         left: Transmittance, 0 once a pixel is finished.

@@ -19,7 +19,6 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
 from sgsst_core.constants import LOG2_ALPHA_MIN, RASTER_TILE, TRANSMITTANCE_MIN
 
@@ -91,13 +90,6 @@ def _load_weights(builder: Any, array_type: types.Array, pointer: Any) -> Any:
 
 def _is_weights(array: Any) -> bool:
     return isinstance(array, types.Array) and array.layout == "C" and array.dtype in (types.float32, types.uint16)
-
-
-def as_float(weights: NDArray[Any]) -> NDArray[np.float32]:
-    """Convert weights stored by `store_vector` (float32, or half-precision bits in uint16) to float32 in NumPy."""
-    if weights.dtype == np.float32:
-        return weights
-    return (weights.astype(np.uint32) << HALF_SHIFT).view(np.float32) * np.float32(2.0 ** (HALF_BIAS - HALF_EXPONENT))
 
 
 @intrinsic

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from sgsst_core.rasterizer import Rasterizer
+from sgsst_core.rasterizer.base import camera_key
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -89,3 +91,13 @@ def colors_of(scene: Scene, seed: int = 5) -> Tensor:
 def pixels_like(view: Camera, seed: int = 6) -> Tensor:
     """Return a random image gradient [h, w, 3], float32."""
     return torch.randn(view.height, view.width, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def is_cached(rasterizer: Rasterizer, view: Camera) -> bool:
+    """Return whether a view has cached blend weights."""
+    return camera_key(view) in rasterizer.caches["weights"]
+
+
+def has_intersections(rasterizer: Rasterizer, view: Camera) -> bool:
+    """Return whether a view's tile intersections are cached."""
+    return camera_key(view) in rasterizer.caches["intersections"]

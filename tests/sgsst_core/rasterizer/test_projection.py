@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sgsst_core.constants import ALPHA_MIN, EPS2D
-from sgsst_core.rasterizer.projection import Column, Outcome, project
+from sgsst_core.rasterizer.projection import Column, project
 from sgsst_core.rasterizer.reference import splat
 from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, rotated_pose, single, together
 
@@ -40,9 +40,7 @@ def test_projection_agrees_with_plain_pytorch() -> None:
         (Column.EXTENT_Y, plain.extent_y[rows]),
     ):
         assert torch.allclose(values[:, column], expected, rtol=1e-9, atol=1e-9), column.name
-    assert fast.outcomes[Outcome.VISIBLE] == len(fast.gaussians)
-    assert sum(fast.outcomes.values()) == len(scene)
-    assert all(fast.outcomes[o] > 0 for o in (Outcome.NEAR, Outcome.FAINT, Outcome.OUTSIDE))
+    assert 0 < len(fast.gaussians) < len(scene)
 
 
 @pytest.mark.parametrize("length", [1.0, 1e3, 1e6])
@@ -74,7 +72,6 @@ def test_gaussian_on_the_near_plane_is_visible() -> None:
     scene.means[1, 2] = float(np.nextafter(np.float32(0.5), np.float32(0)))
     projection = project(scene, camera(), near=0.5)
     assert projection.gaussians.tolist() == [0]
-    assert projection.outcomes[Outcome.NEAR] == 2
     assert splat(scene, camera(), near=0.5).gaussians.tolist() == [0]
     with pytest.raises(ValueError, match="must be positive"):
         project(scene, camera(), near=0.0)
@@ -86,7 +83,6 @@ def test_opacities_below_the_cutoff_are_dropped() -> None:
     scene.opacities[:] = torch.tensor([logit - 1e-3, logit + 1e-3, -200.0, 200.0, -1e4])
     projection = project(scene, camera())
     assert projection.gaussians.tolist() == [1, 3]
-    assert projection.outcomes[Outcome.FAINT] == 3
     assert projection.values[0, Column.EXTENT_X] < 0.1 * projection.values[1, Column.EXTENT_X]
     assert projection.values[1, Column.LOG2_OPACITY] == pytest.approx(0, abs=1e-80)
 
@@ -97,20 +93,19 @@ def test_equal_depths_stay_in_file_order() -> None:
     assert splat(scene, camera()).gaussians.tolist() == [3, 0, 1, 2, 4, 5]
 
 
-def test_gaussians_without_a_projection_are_dropped_and_counted() -> None:
+def test_gaussians_without_a_projection_are_dropped() -> None:
     scene = together([((0, 0, 4), 0.5, (0.1,) * 3, (1, 0, 0, 0))] * 4)
     scene.quats[1] = 0
     scene.quats[2] = 1e-30  # short, but still a direction
     scene.scales[3] = 500  # e^500 squared overflows
     projection = project(scene, camera())
     assert projection.gaussians.tolist() == [0, 2]
-    assert projection.outcomes[Outcome.INVALID] == 2
     assert splat(scene, camera()).gaussians.tolist() == [0, 2]
 
 
 def test_huge_gaussians_and_empty_scenes_are_projected() -> None:
     projection = project(single((0, 0, 4), scales=(1e12, 1e12, 1e12)), camera())
-    assert projection.outcomes[Outcome.VISIBLE] == 1
+    assert projection.gaussians.tolist() == [0]
     assert np.isfinite(projection.values).all()
     assert len(project(empty_scene(), camera()).gaussians) == 0
 

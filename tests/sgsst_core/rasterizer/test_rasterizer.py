@@ -10,10 +10,12 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -27,7 +29,7 @@ from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
 from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, build_tile_intersections, check_intersections
-from sgsst_core.rasterizer.vectors import as_float
+from sgsst_core.rasterizer.vectors import HALF_BIAS, HALF_EXPONENT, HALF_SHIFT
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
@@ -39,6 +41,8 @@ from tests.sgsst_core.splat_scenes import (
     cloud,
     colors_of,
     empty_scene,
+    has_intersections,
+    is_cached,
     pixels_like,
     rotated_pose,
     single,
@@ -206,9 +210,9 @@ def test_crops_have_tile_intersections_of_their_own(name: str) -> None:
     assert isinstance(cpu, CpuRasterizer)
     assert cpu.intersections(crop).nbytes == part.nbytes
     rasterizer.forget_views()
-    assert not cpu.has_intersections(crop)
+    assert not has_intersections(cpu, crop)
     if isinstance(rasterizer, CachedRasterizer):
-        assert not rasterizer.is_cached(crop)
+        assert not is_cached(rasterizer, crop)
 
 
 @pytest.mark.parametrize("name", REPRODUCIBLE)
@@ -314,16 +318,23 @@ def test_scene_far_from_origin_renders_alike() -> None:
     assert_close_outside_band(CpuRasterizer(moved).render(colors_of(scene), elsewhere), image, band, tolerance=1e-4)
 
 
+def as_float(weights: NDArray[Any]) -> NDArray[np.float32]:
+    """Convert weights stored by `store_vector` (float32, or half-precision bits in uint16) to float32 in NumPy."""
+    if weights.dtype == np.float32:
+        return weights
+    return (weights.astype(np.uint32) << HALF_SHIFT).view(np.float32) * np.float32(2.0 ** (HALF_BIAS - HALF_EXPONENT))
+
+
 def test_cached_weights_equal_recomputed_ones() -> None:
     scene, view = cloud(1500, seed=18), camera(130, 70)
     colors, pixels = colors_of(scene), pixels_like(view)
     cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
-    assert not cached.is_cached(view)
+    assert not is_cached(cached, view)
     assert torch.equal(cached.render(colors, view), cpu.render(colors, view))
     assert torch.equal(cached.coverage(view), cpu.coverage(view))
     assert relative_error(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
-    assert cached.is_cached(view)
-    assert cached.is_cached(replace(view, name="another name"))
+    assert is_cached(cached, view)
+    assert is_cached(cached, replace(view, name="another name"))
 
 
 def test_half_precision_weights_are_rounded_to_float16() -> None:
@@ -352,7 +363,7 @@ def test_weights_beyond_the_budget_are_recomputed() -> None:
         for view in views:
             assert torch.equal(cached.render(colors, view), cpu.render(colors, view))
             assert relative_error(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
-    assert [cached.is_cached(view) for view in views] == [True, True, False]
+    assert [is_cached(cached, view) for view in views] == [True, True, False]
     assert cached.cached_bytes == budget
     weights = cached._cached.values.values()
     real = sum(array.nbytes for each in weights for array in each.strips)  # type: ignore[attr-defined]
@@ -382,8 +393,8 @@ def test_weights_and_tile_intersections_share_a_budget() -> None:
         cpu.intersections(view)
     for view in views:
         cached.render(colors, view)
-    assert [cached.is_cached(view) for view in views] == [True, True, False, False]
-    assert [cpu.has_intersections(view) for view in views] == [False, False, True, False]
+    assert [is_cached(cached, view) for view in views] == [True, True, False, False]
+    assert [has_intersections(cpu, view) for view in views] == [False, False, True, False]
     assert cached.cached_bytes + cpu._intersections.used <= sum(weights[:2]) + isects[2]
 
 

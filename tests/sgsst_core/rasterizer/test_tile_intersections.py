@@ -20,7 +20,7 @@ from sgsst_core.rasterizer.tile_intersections import (
 )
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, has_intersections, rotated_pose
 
 _RANDOM = np.random.default_rng(0)
 DEPTHS: dict[str, NDArray[np.float64]] = {
@@ -124,12 +124,12 @@ def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
         whole.intersections(view)
     budget = sum(sizes[:3])
     part = whole.for_subset(scene.subset(chosen), chosen, budget)
-    assert [part.has_intersections(view) for view in views] == [True, True, True, False]
+    assert [has_intersections(part, view) for view in views] == [True, True, True, False]
     for done, view in enumerate(views):
         check_same(part.intersections(view), build_tile_intersections(scene.subset(chosen), view))
         assert part._intersections.used <= budget
-        assert not whole.has_intersections(view)
-        assert [whole.has_intersections(other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
+        assert not has_intersections(whole, view)
+        assert [has_intersections(whole, other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
     assert part.intersections(views[1]) is part.intersections(views[1])
     with pytest.raises(ValueError, match="450 Gaussians are not the 600 chosen ones of 600"):
         whole.for_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool), budget)
@@ -141,7 +141,7 @@ def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
     cpu = CpuRasterizer(scene)
     sizes = [cpu.intersections(view).nbytes for view in views]
     cpu.release_view(views[0], sizes[1])
-    assert [cpu.has_intersections(view) for view in views] == [False, True, False]
+    assert [has_intersections(cpu, view) for view in views] == [False, True, False]
 
 
 def test_guests_use_the_rest_of_the_budget_for_tile_intersections() -> None:
@@ -152,7 +152,7 @@ def test_guests_use_the_rest_of_the_budget_for_tile_intersections() -> None:
     guests = [host.beside(scene) for _ in range(2)]
 
     def cached_by_view() -> list[list[bool]]:
-        return [[one.has_intersections(view) for view in views] for one in (host, *guests)]
+        return [[has_intersections(one, view) for view in views] for one in (host, *guests)]
 
     host.intersections(views[0])
     guests[0].intersections(views[1])

@@ -30,7 +30,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, rotated_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, is_cached, pixels_like, rotated_pose
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -205,7 +205,7 @@ def test_weights_and_tile_intersections_share_a_budget() -> None:
     assert rasterizer._intersections.used == sum(isects)
     for done, view in enumerate(views, start=1):
         cached.render(colors_of(scene), view)
-        assert cached.is_cached(view) is (sum(weights[:done]) <= budget)
+        assert is_cached(cached, view) is (sum(weights[:done]) <= budget)
         assert cached.cached_bytes + rasterizer._intersections.used <= budget
     assert cached.cached_bytes > 0
 

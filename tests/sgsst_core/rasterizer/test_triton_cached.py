@@ -27,7 +27,7 @@ from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, pixels_like, rotated_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, is_cached, pixels_like, rotated_pose
 from tests.small_scenes import ball, cameras, style
 
 pytest.importorskip("triton")
@@ -80,7 +80,7 @@ def test_images_and_gradients_agree_with_reference(case: tuple[Scene, Camera]) -
         assert_close_outside_band(cached.render(colors, view).cpu(), image, band, tolerance=2 * error + 1e-5)
         assert_close_outside_band(cached.coverage(view).cpu(), coverage, band, tolerance=1e-5)
         assert relative_error(cached.color_gradient(pixels, view).cpu(), gradient) < error + 5e-6
-        assert cached.is_cached(view)
+        assert is_cached(cached, view)
 
 
 def test_half_precision_weights_are_within_rounding_error() -> None:
@@ -145,7 +145,7 @@ def test_weights_beyond_the_budget_are_recomputed_on_the_device() -> None:
         cached = CachedRasterizer(scene, precision=precision, uncached=uncached, max_bytes=budget)
         for view in views:
             cached.coverage(view)
-        assert [cached.is_cached(view) for view in views] == [True, True, False]
+        assert [is_cached(cached, view) for view in views] == [True, True, False]
         assert cached.cached_bytes == budget
     assert torch.equal(cached.render(colors, views[2]), uncached.render(colors, views[2]))
     gradient = cached.color_gradient(pixels_like(views[2]), views[2])

@@ -13,6 +13,7 @@ from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.sgsst_core.splat_scenes import is_cached
 from tests.small_scenes import cameras, style, wall
 
 VIEWS = cameras(6)
@@ -35,7 +36,7 @@ def job(weights: BackboneWeights, form: Any, **settings: Any) -> Stylizer:
 
 def cached_views(stylizer: Stylizer) -> list[bool]:
     rasterizer: Any = stylizer.job.views.rasterizer
-    return [rasterizer.is_cached(camera) for camera in stylizer.job.views.cameras]
+    return [is_cached(rasterizer, camera) for camera in stylizer.job.views.cameras]
 
 
 def steps(stylizer: Stylizer, count: int) -> Stylizer:
@@ -91,10 +92,10 @@ def test_caller_decides_which_views_are_cached() -> None:
     cached, cpu = CachedRasterizer(scene, at_first_use=False), CpuRasterizer(scene)
     pixels = torch.ones(view.height, view.width, 3)
     assert torch.equal(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view))
-    assert (cached.is_cached(view), cached.cached_bytes) == (False, 0)
+    assert (is_cached(cached, view), cached.cached_bytes) == (False, 0)
     assert cached.cache_weights(view)
-    assert cached.is_cached(view)
-    assert not cached.is_cached(VIEWS[1])
+    assert is_cached(cached, view)
+    assert not is_cached(cached, VIEWS[1])
     assert not CachedRasterizer(scene, at_first_use=False, max_bytes=10).cache_weights(view)
 
 
@@ -113,4 +114,4 @@ def test_temporary_weights_match_cached_weights() -> None:
         assert torch.equal(small.color_gradient(pixels, view), uncached)
     with keeper.temporary_weights(view):
         pass
-    assert keeper.is_cached(view)
+    assert is_cached(keeper, view)

@@ -25,6 +25,7 @@ from sgsst_core.stylizing.prediction import completed_plan
 from sgsst_core.stylizing.schedule import drawn_views
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.trial import StepCost, Trial, run_trial
+from tests.sgsst_core.splat_scenes import is_cached
 from tests.small_scenes import ball, cameras, style, wall
 
 GIGABYTE = 10**9
@@ -69,7 +70,7 @@ def test_trial_measures_steps_and_memory(tiny_weights: BackboneWeights) -> None:
     job = plan_job(wall(sh_degree=1), cameras(3), Style.of(style()), settings, weights=tiny_weights)
     first = next(drawn_views(job.views.covered, settings.seed))
     assert all(cache.costs for name, cache in job.caches.items() if name in ("weights", "content", "colors"))
-    assert job.views.rasterizer.is_cached(job.views.cameras[first])  # type: ignore[attr-defined]
+    assert is_cached(job.views.rasterizer, job.views.cameras[first])
     again = run_trial(job)
     assert again.views == 2
     assert 0 < again.coarse.seconds < again.sos.seconds
