@@ -8,11 +8,13 @@ differs.
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from torch import Tensor
 
 from sgsst_core.features.partition import PartitionTile, Rectangle
-from sgsst_core.features.statistics import layer_statistics, merge_all
+from sgsst_core.features.statistics import layer_statistics, merge
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.content import ContentDifference, content_factor
 from sgsst_core.loss.statistics_terms import style_loss
@@ -58,7 +60,7 @@ def _scale(network: FeatureNetwork, image: Tensor, style: StyleTarget, content: 
         features = network.forward(image[tile.outer.slices], cache=False).features
         for layer in STYLE_LAYERS:
             parts[layer].append(layer_statistics(features[layer][tile.owned_cells(layer, size)[1].slices]))
-    maps = {layer: style_loss(merge_all(parts[layer]), style.layers[layer])[1] for layer in STYLE_LAYERS}
+    maps = {layer: style_loss(reduce(merge, parts[layer]), style.layers[layer])[1] for layer in STYLE_LAYERS}
     cells = torch.tensor(float((size[0] // 8) * (size[1] // 8)), dtype=torch.float64)
     result = torch.zeros_like(image)
     for tile in tiles:

@@ -63,7 +63,7 @@ def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor, Tens
         rasterizer=None if device().type == "cuda" else "triton",
         collectives=collectives,
     )
-    gradient = stylizer.gradient(0, range(stylizer.job.scale_count(0)))[0].cpu()
+    gradient = stylizer.gradient(0, stylizer.job.scales(0))[0].cpu()
     start = stylizer.sh_dc.detach().cpu().clone()
     for _ in range(sizes.rank_steps):
         stylizer.run_step()

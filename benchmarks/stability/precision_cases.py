@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 import torch
@@ -17,7 +17,6 @@ from sgsst_core.features.statistics import (
     layer_statistics,
     layer_statistics_reference,
     merge,
-    merge_all,
 )
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.gradient_error import Difference
@@ -137,7 +136,7 @@ def _split(height: int, width: int, tiles: int) -> list[tuple[slice, slice]]:
 
 def _agreement(features: torch.Tensor, parts: dict[str, list[LayerStatistics]], target: LayerTarget) -> CaseResult:
     """Return the largest difference of loss and feature gradient between ways to sum up statistics of one layer."""
-    results = {name: style_loss(merge_all(statistics), target) for name, statistics in parts.items()}
+    results = {name: style_loss(reduce(merge, statistics), target) for name, statistics in parts.items()}
     losses = [float(terms.sum()) for terms, _ in results.values()]
     gradients = [gradient.apply(features) for _, gradient in results.values()]
     error = max(abs(loss / losses[0] - 1) for loss in losses)

@@ -42,7 +42,6 @@ class Check:
     Attributes:
         name: Compared quantity.
         error: Error, or the number of results that differ.
-        bound: Largest acceptable error.
     """
 
     name: str
@@ -134,12 +133,7 @@ def leave_nan(device: torch.device) -> None:
 
 @dataclass(frozen=True)
 class Step:
-    """Render of a view, its loss, and the color gradient, whose results are compared bit by bit.
-
-    Attributes:
-        style: Style targets of the view's size.
-        colors: [N, 3], colors of the Gaussians.
-    """
+    """Render of a view, its loss, and the color gradient, whose results are compared bit by bit."""
 
     rasterizer: Rasterizer
     camera: Camera

@@ -120,7 +120,6 @@ class Point:
     """Evaluation of a variant.
 
     Attributes:
-        seconds: Seconds of optimization.
         relative: Loss relative to the unstylized scene, mean over scales; None if the latter is 0.
         by_scale: Relative loss of each scale; None where that of the unstylized scene is 0.
         judgment: Judgment on the novel views; None if AlexNet is not installed, or if no view can be judged.
@@ -171,7 +170,6 @@ def error_time(
 
     Args:
         seconds: Seconds of optimization per variant.
-        weights: Weights of the feature network; None loads the default ones.
         progress: Function called after each evaluation, with the curve so far.
         settings: Settings for all variants that override the standard preset.
     """
@@ -228,7 +226,7 @@ def _prepared(
         stylizer.job.style_targets(stylizer.job.views.cameras[index])
         scales = sorted({scale for phase in stylizer.job.schedule for scale in phase.scales(chosen)})
         stylizer.job.view_targets.target(index, scales, stylizer.drawn_background(index))
-        stylizer.cache_weights(index)
+        stylizer.job.views.cache_weights(index)
         stylizer.job.views.render(index, stylizer.job.views.colors(index, stylizer.sh_dc.detach()))
     return Curve(variant, [], preparation=time.perf_counter() - started), stylizer
 

@@ -49,7 +49,6 @@ class VariantResult:
         sh_dc: Colors [N, 3].
         short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
         loss: Remaining loss, relative to the unstylized scene; None if it was not measured.
-        seconds: Seconds of optimization.
     """
 
     name: str
@@ -126,7 +125,6 @@ def compare_quality(
     Args:
         style: Style image [H, W, 3] in 0 to 1.
         seconds: Seconds of optimization per variant.
-        weights: Weights of the feature network; None loads the default ones.
         progress: Function called after each evaluation of the loss, with the curve so far.
         settings: Settings for all variants that override the standard preset.
 

@@ -102,7 +102,6 @@ def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
 
     Args:
         name: Set of weights, as in `expected_shapes`.
-        where: Path for messages.
 
     Raises:
         WeightsError: If a tensor is missing, unknown or invalid.

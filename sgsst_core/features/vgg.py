@@ -85,7 +85,6 @@ class Activations:
         features: Features [h, w, c] by layer, in the network's dtype (an NHWC view); `PIXELS` is float32 or float64.
         outputs: ReLU output [1, c, h, w] of each convolution. The entry of a pooling layer is an empty tensor [0],
             since the positions of its maxima are recomputed.
-        size: (height, width) of the input.
     """
 
     features: dict[str, Tensor]

@@ -40,9 +40,6 @@ def weights_file(folder: Path, name: str) -> Path:
 def damaged_weights(folder: Path | None = None) -> list[str]:
     """Verify all installed weights. A process reads each file only once, unless it changes.
 
-    Args:
-        folder: Folder of the weights; None for `cache_folder()`.
-
     Returns:
         Error message for each damaged file, with the command that installs it again; empty if there are none.
     """
@@ -82,7 +79,6 @@ def verify(stream: BinaryIO, name: str, where: str) -> dict[str, str]:
 
     Args:
         name: Set of weights that the file must contain.
-        where: Path for messages.
 
     Returns:
         Metadata of the file: `name`, `source`, `source_sha256`, `sha256`.

@@ -18,12 +18,7 @@ from torch import Tensor
 
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.vgg import CONTENT_LAYER
-from sgsst_core.loss.position_term import (
-    Objective,
-    PositionTerm,
-    ScaledView,
-    TermInputs,
-)
+from sgsst_core.loss.position_term import Objective, PositionTerm, ScaledView, TermInputs
 from sgsst_core.loss.targets import ContentFeatures, PositionWeights
 
 
@@ -60,7 +55,6 @@ class ContentDifference:
         Args:
             features: [h, w, c].
             content: [h, w, c].
-            factor: Result of `content_factor`.
             position_weights: [h, w]; None for equal weights.
         """
         precision = torch.promote_types(features.dtype, torch.float32)
@@ -80,12 +74,7 @@ class ContentDifference:
 
 @dataclass(frozen=True)
 class ContentTerm(PositionTerm):
-    """Content term of one scale of a view.
-
-    Attributes:
-        position_weights: Coverage, or v.
-        factor: Result of `content_factor`.
-    """
+    """Content term of one scale of a view."""
 
     name = "content"
     label = "content"

@@ -56,9 +56,10 @@ _SIDE = 512
 def at_scale(weights: BackboneWeights, scale: FeatureScale) -> BackboneWeights:
     """Return the network with its features scaled as requested.
 
-    Networks that are already scaled, and `vgg_conv.pth`, which is the paper's own network, are returned unchanged.
+    Networks that are already scaled, and `vgg_conv.pth`, which is the paper's own network and has an input range of 0
+    to 255 without normalization, are returned unchanged.
     """
-    if weights.scales or is_original(weights):
+    if weights.scales or bool((weights.input_scale == 255).all()):
         return weights
     return with_scales(weights, paper_scales(weights) if scale == "paper" else even_scales(weights))
 
@@ -79,14 +80,6 @@ def even_scales(weights: BackboneWeights) -> dict[str, float]:
     """
     layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
     return {**dict.fromkeys(layers, EVEN_SCALE), layers[0]: EVEN_COLOR_SCALE, PIXELS: EVEN_PIXEL_SCALE}
-
-
-def is_original(weights: BackboneWeights) -> bool:
-    """Return whether the weights are those of the original network.
-
-    They are identified by their input range, 0 to 255 without normalization.
-    """
-    return bool((weights.input_scale == 255).all())
 
 
 def paper_scales(weights: BackboneWeights) -> dict[str, float]:

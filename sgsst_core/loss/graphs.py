@@ -98,7 +98,6 @@ class LossGraphs:
 
     Args:
         loss: Loss of a single rank, on a device that supports CUDA graphs (`graphs_problem`).
-        most: Maximum number of cached graphs.
 
     Attributes:
         problem: Reason why capturing failed; None if it has not failed.
@@ -128,13 +127,7 @@ class LossGraphs:
         self._static.clear()
         self._visited.clear()
 
-    def evaluate(
-        self,
-        image: Tensor,
-        style: StyleTargets,
-        view: ViewTarget,
-        scales: Sequence[int],
-    ) -> SosResult:
+    def evaluate(self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: Sequence[int]) -> SosResult:
         """Evaluate the loss and its gradient, as `SosLoss.evaluate` does.
 
         The next evaluation overwrites the image gradient of the result. `style` must never be changed in place.
@@ -143,7 +136,12 @@ class LossGraphs:
         graph = self._graphs.get(key) if key else None
         if graph is None and key in self._visited and self.problem is None and len(self._graphs) < self._most:
             assert key is not None
-            graph = self._captured(key, image, style, view)
+            try:
+                graph = self._graphs[key] = self._capture(key, image, style, view)
+            except Exception as error:  # any failure falls back to eager mode
+                self.problem = f"{type(error).__name__}: {error}"
+                self._graphs.clear()
+                self._static.clear()
         if graph is None:
             if key and len(self._visited) < self._most:
                 self._visited[key] = style
@@ -151,13 +149,7 @@ class LossGraphs:
         with self.loss.timer("network"):
             return graph.replay(image, view)
 
-    def _key(
-        self,
-        image: Tensor,
-        style: StyleTargets,
-        view: ViewTarget,
-        scales: Sequence[int],
-    ) -> _Key | None:
+    def _key(self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: Sequence[int]) -> _Key | None:
         """Return the graph key of an evaluation; None if the evaluation cannot be captured."""
         division = view.division
         if division is None or division.tiles.keys() != set(scales):
@@ -174,17 +166,6 @@ class LossGraphs:
         return _Key(
             tuple(image.shape), image.dtype, tiles, coverage, regions, view.content_weights is not None, id(style)
         )
-
-    def _captured(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph | None:
-        """Capture, cache and return the graph for a key; return None if capturing fails."""
-        try:
-            graph = self._graphs[key] = self._capture(key, image, style, view)
-        except Exception as error:  # any failure falls back to eager mode
-            self.problem = f"{type(error).__name__}: {error}"
-            self._graphs.clear()
-            self._static.clear()
-            return None
-        return graph
 
     def _capture(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph:
         loss, device = self.loss, self.loss.network.device

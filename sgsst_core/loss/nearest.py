@@ -25,12 +25,7 @@ from torch import Tensor
 
 from sgsst_core.features.network_sources import BLOCKS, KAPPA
 from sgsst_core.features.partition import PartitionTile, Rectangle
-from sgsst_core.loss.position_term import (
-    Objective,
-    PositionTerm,
-    ScaledView,
-    TermInputs,
-)
+from sgsst_core.loss.position_term import Objective, PositionTerm, ScaledView, TermInputs
 from sgsst_core.loss.targets import PositionWeights, StyleVectors, at_least_float32
 from sgsst_core.settings import StyleLossName
 from sgsst_core.timing import Timer

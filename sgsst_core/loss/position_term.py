@@ -24,7 +24,6 @@ class ScaledView:
 
     Attributes:
         image: [h, w, 3], pixels of `area` on the network's device.
-        scale: Scale; 0 is full size.
         size: (height, width) of the whole scaled view.
         area: Rectangle of the scaled view; empty if the rank needs no pixels.
     """
@@ -66,9 +65,7 @@ class Objective:
 
     Attributes:
         network: Feature network, "vgg16" or "vgg19".
-        style_loss: Style loss; see `terms`.
         content_weight: lambda_c; 0 for no content term.
-        settings: Settings with the weights of other terms.
     """
 
     network: str

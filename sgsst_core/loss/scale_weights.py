@@ -67,9 +67,6 @@ def band_count(cameras: Sequence[Camera], settings: Settings) -> int:
 def check_stroke_depth(settings: Settings, cameras: Sequence[Camera], *, regions: bool) -> None:
     """Check that `stroke_depth` has scales to choose from, and no other weights to share positions with.
 
-    Args:
-        cameras: Cameras at the sizes used for stylization.
-
     Raises:
         SettingsError: If every view has one scale, or the job has regions or weights of scales.
     """
@@ -90,7 +87,6 @@ def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: 
 
     Args:
         weights: Weights from the finest scale to coarser ones, at least one of them positive; empty for equal weights.
-        cameras: Cameras at the sizes used for stylization.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
 
     Raises:

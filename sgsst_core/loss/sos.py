@@ -42,7 +42,6 @@ class SosResult:
         values: [scales, terms] float64, the loss of each scale split into `TERMS`, still on the device.
         image_gradient: This rank's summand of dE/dimage, [h, w, 3], with respect to the pixels that it was given; the
             sum over all ranks is the gradient. None if only the loss was requested.
-        weights: Weights of the scales in the loss.
     """
 
     scales: tuple[int, ...]
@@ -69,9 +68,6 @@ class SosLoss:
         network: Feature network. It must report the layers of `terms.layers_of`; statistics of style layers and
             `PIXELS` are compared only if the network reports them.
         content_weight: lambda_c; 0 disables the content term.
-        style_loss: Style loss; see `terms`.
-        settings: Settings with the weights of other terms; None for the defaults.
-        memory: Memory budget for activations in bytes.
         tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         style_scale: Magnification of the style image relative to its default size.
@@ -149,8 +145,6 @@ class SosLoss:
 
         Args:
             image: Image of the view at full size, or of the rectangle that this rank renders (`Division.shares`).
-            style: Style targets, from `targets.of_style`.
-            view: View targets, from `targets.of_view`.
             scales: Scales to evaluate, each with a positive weight; phase 1 passes only the coarsest. None for the full
                 SOS loss.
         """
@@ -285,7 +279,6 @@ class _ScalePass:
     """Evaluation of one scale.
 
     Attributes:
-        terms: Terms that are sums over positions.
         values: [terms] float64, value of each of `TERMS`; set after the first pass.
     """
 
@@ -308,10 +301,7 @@ def make_loss(
     """Create the loss of a job.
 
     Args:
-        memory: Memory budget for activations in bytes.
         content_weight: Largest content weight of a region; None for that of the settings.
-        timer: Timer; see `SosLoss`.
-        collectives: Collectives; see `SosLoss`.
     """
     return SosLoss(
         network,

@@ -175,7 +175,6 @@ def style_loss(
     positions, loss and gradient are 0.
 
     Args:
-        target: Target from the style.
         feature_eps: Relative rounding error of the features (2^-23 for float32, 2^-52 for float64).
 
     Returns:
@@ -291,13 +290,7 @@ def fused_style_loss(
 ) -> tuple[Tensor, StyleGradient]:
     """Compute `style_loss` on a GPU.
 
-    Args:
-        target: Gram matrix, mean and standard deviation of the style, float64.
-        weights: c^2 w_G, w_m and w_s.
-        feature_eps: Relative rounding error of the features, as in `style_loss`.
-
-    Returns:
-        Terms [3] float64, and the gradient in float32.
+    `target` is the style's Gram matrix, mean and standard deviation in float64. The gradient is float32.
     """
     from sgsst_core.loss import statistics_terms_kernels as kernels
 
@@ -322,14 +315,7 @@ def fused_style_loss(
 def fused_add_style_gradient(
     gradient: Tensor, features: Tensor, style: StyleGradient, position_weights: Tensor | None = None
 ) -> None:
-    """Add the gradient of the style loss in place.
-
-    Args:
-        gradient: [h, w, c].
-        features: [h, w, c], same dtype as the gradient.
-        style: Gradient in float32.
-        position_weights: [h, w]; None for equal weights.
-    """
+    """Compute `StyleGradient.add_to` on a GPU, for a gradient and features [h, w, c] of the same dtype."""
     from sgsst_core.loss import statistics_terms_kernels as kernels
 
     height, width, channels = features.shape

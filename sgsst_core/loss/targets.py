@@ -36,7 +36,6 @@ class LayerTarget:
             G = sum_i w_i G_i,  mu = sum_i w_i mu_i,  sigma^2 = sum_i w_i (sigma_i^2 + (mu_i - mu)^2)
 
         Args:
-            targets: Target of each image.
             weights: Weights w_i, which need not add up to 1.
         """
         if len(targets) == 1:
@@ -107,12 +106,7 @@ StyleTargets = dict[int, tuple[StyleTarget, ...]]
 
 
 def combined(targets: Sequence[StyleTargets], weights: Sequence[float]) -> StyleTargets:
-    """Combine the targets of the styles of several regions.
-
-    Args:
-        targets: Targets of each region, from `TargetBuilder.of_style`.
-        weights: Factor of each region's style loss.
-    """
+    """Combine the targets of the styles of several regions, and the factors of their style losses."""
     return {
         scale: tuple(replace(own[scale][0], weight=weight) for own, weight in zip(targets, weights, strict=True))
         for scale in targets[0]
@@ -124,10 +118,6 @@ def by_band(targets: StyleTargets, bands: int) -> StyleTargets:
 
     Each scale is compared in its own depth band alone; the coarsest one also in the bands of scales that the view does
     not have.
-
-    Args:
-        targets: Targets of the style, from `TargetBuilder.of_style`.
-        bands: Number of depth bands.
     """
     coarsest = max(targets)
     return {

@@ -7,7 +7,6 @@ and the halo of this piece. Each rank's pixels of coarser scales are put togethe
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -16,7 +15,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.position_term import ScaledView
 from sgsst_core.loss.tiling import Division
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.parallel.division import ImageExchange, Shares
+from sgsst_core.parallel.division import ImageExchange
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.timing import Timer
 
@@ -29,7 +28,6 @@ class ViewImages:
     Args:
         image: [h, w, 3], image of the view, or of this rank's window of `division.shares`.
         background: Color of the pixels that no rank renders.
-        timer: Timer for `communication`.
     """
 
     def __init__(
@@ -40,16 +38,34 @@ class ViewImages:
         collectives: Collectives,
         timer: Timer,
     ) -> None:
+        self._collectives, self._timer = collectives, timer
         shares = division.shares
         whole = Rectangle(0, 0, image.shape[0], image.shape[1])
         self._own = _Pixels(image, 0, whole if shares is None else shares.windows[collectives.rank])
         self._size = whole.shape if shares is None else shares.size
         self._shares = shares
-        self._exchange: _Exchange | None = None
+        #: Rectangles of each image that ranks exchange, by scale, and the pixels of it that this rank needs.
+        self._exchanges: dict[int, ImageExchange] = {}
         self._coarse: dict[int, _Pixels] = {}
         if shares is not None and any(scale != shares.scale for scale in division.pieces):
-            self._exchange = _Exchange.of(shares, division, collectives, timer)
-            self._coarse = self._exchange.gathered(self._own, background)
+            by_rank = [list(itertools.chain(*own)) for own in zip(*division.pieces.values(), strict=True)]
+            self._exchanges = shares.exchanges(by_rank, division.halo)
+            #: This rank's part of the view, relative to its window.
+            self._part = shares.parts[collectives.rank].within(self._own.area)
+            self._gather(background)
+
+    def _gather(self, background: tuple[float, float, float]) -> None:
+        """Exchange the coarser images between ranks."""
+        own = [downscale(self._own.image[self._part.slices], scale) for scale in self._exchanges]
+        for scale, exchange in self._exchanges.items():
+            area = exchange.windows[self._collectives.rank]
+            image = self._own.image.new_empty((*area.shape, 3))
+            for channel, color in zip(image.unbind(-1), background, strict=True):
+                channel.fill_(color)  # scalars are kernel arguments, so the host does not wait for a copy to the device
+            self._coarse[scale] = _Pixels(image, scale, area)
+        with self._timer("communication"):
+            windows = [pixels.image for pixels in self._coarse.values()]
+            self._collectives.gather_parts([*self._exchanges.values()], own, windows)
 
     def scaled(self, scale: int) -> ScaledView:
         """Return the pixels of a scale that this rank needs."""
@@ -61,8 +77,12 @@ class ViewImages:
 
     def gradient(self) -> Tensor:
         """Return this rank's summand of the gradient with respect to the image, [h, w, 3]."""
-        if self._exchange is not None:
-            self._exchange.add_gradient(self._coarse, self._own)
+        if self._exchanges:
+            gradients = [image.gradient for image in self._coarse.values() if image.gradient is not None]
+            with self._timer("communication"):
+                own = self._collectives.reduce_parts([*self._exchanges.values()], gradients)
+            for scale, gradient in zip(self._exchanges, own, strict=True):
+                self._own.add_gradient(scale, gradient, area=self._part)
         assert self._own.gradient is not None
         return self._own.gradient
 
@@ -78,7 +98,6 @@ class _Pixels:
     """Rectangle of a scaled view, and the gradient with respect to it.
 
     Attributes:
-        image: [h, w, 3].
         area: Rectangle of the scaled view.
         gradient: [h, w, 3]; None before the first `add_gradient`.
     """
@@ -99,48 +118,3 @@ class _Pixels:
             self.gradient = gradient.new_zeros(self.image.shape)
         target = self.gradient if area is None else self.gradient[area.slices]
         add_upscaled_(target, gradient, scale - self.scale, factor)
-
-
-@dataclass(frozen=True)
-class _Exchange:
-    """Exchange of coarser images between ranks.
-
-    Attributes:
-        own: This rank's part of the view, relative to its window.
-        images: Rectangles of each exchanged image by scale.
-        timer: Timer for `communication`.
-    """
-
-    own: Rectangle
-    images: dict[int, ImageExchange]
-    collectives: Collectives
-    timer: Timer
-
-    @staticmethod
-    def of(shares: Shares, division: Division, collectives: Collectives, timer: Timer) -> _Exchange:
-        rank = collectives.rank
-        by_rank = [list(itertools.chain(*own)) for own in zip(*division.pieces.values(), strict=True)]
-        own = shares.parts[rank].within(shares.windows[rank])
-        return _Exchange(own, shares.exchanges(by_rank, division.halo), collectives, timer)
-
-    def gathered(self, pixels: _Pixels, background: tuple[float, float, float]) -> dict[int, _Pixels]:
-        """Return the pixels of each image that this rank needs, given those that it renders."""
-        own = [downscale(pixels.image[self.own.slices], scale) for scale in self.images]
-        areas = [exchange.windows[self.collectives.rank] for exchange in self.images.values()]
-        images = [pixels.image.new_empty((*area.shape, 3)) for area in areas]
-        for image in images:
-            for channel, color in zip(image.unbind(-1), background, strict=True):
-                channel.fill_(color)  # scalars are kernel arguments, so the host does not wait for a copy to the device
-        with self.timer("communication"):
-            self.collectives.gather_parts([*self.images.values()], own, images)
-        return {
-            scale: _Pixels(image, scale, area) for scale, image, area in zip(self.images, images, areas, strict=True)
-        }
-
-    def add_gradient(self, coarse: Mapping[int, _Pixels], pixels: _Pixels) -> None:
-        """Add the sums of all ranks' gradients of the images to the gradient of the pixels that this rank renders."""
-        gradients = [image.gradient for image in coarse.values() if image.gradient is not None]
-        with self.timer("communication"):
-            own = self.collectives.reduce_parts([*self.images.values()], gradients)
-        for scale, gradient in zip(self.images, own, strict=True):
-            pixels.add_gradient(scale, gradient, area=self.own)

@@ -26,7 +26,6 @@ class Collectives:
     """Collective operations of one rank in a group of ranks; this class implements them for a single rank.
 
     Attributes:
-        rank: Index of this rank in the group.
         local_size: Number of ranks on this machine, including this one.
         gpu_sharing: Largest number of ranks on one GPU; 1 without GPUs.
         sent: Bytes of tensors sent by this rank so far, assuming ring algorithms; other messages are negligible. The

@@ -23,8 +23,6 @@ class Piece:
     """Rectangle of one scale of a view, as a unit of work: one rank owns it and computes its features.
 
     Attributes:
-        scale: Scale; 0 is full size.
-        size: Size of the whole scaled view.
         region: Rectangle; its edges are at multiples of 16 or at the border of the view.
     """
 
@@ -109,12 +107,7 @@ class Shares:
         return min(scale, self.scale + ALIGNMENT.bit_length() - 1)
 
     def exchanges(self, by_rank: Sequence[Sequence[Piece]], halo: int) -> dict[int, ImageExchange]:
-        """Return the exchange of each image, by its scale, that gives ranks their pieces of coarser scales.
-
-        Args:
-            by_rank: Pieces of each rank.
-            halo: Width in pixels of the halo around a tile.
-        """
+        """Return the exchange of each image, by its scale, that gives ranks their pieces of coarser scales."""
         coarser = [[piece for piece in pieces if piece.scale != self.scale] for pieces in by_rank]
         scales = sorted({self.exchanged_scale(piece.scale) for pieces in coarser for piece in pieces})
         return {
@@ -160,7 +153,6 @@ def divide(
 
     Args:
         pieces: One piece per scale.
-        halo: Width in pixels of the halo around a tile.
         rendering: Cost of a rendered pixel, relative to that of a pixel in the network. A rank renders its piece of the
             finest scale; 0 if what it renders does not depend on this division.
 

@@ -27,10 +27,6 @@ class ShownGaussians:
 
     Args:
         mask: [N] bool, on any device; the bits are stored on the same device.
-
-    Attributes:
-        count: Number of Gaussians in the set.
-        total: N.
     """
 
     def __init__(self, mask: Tensor) -> None:

@@ -109,11 +109,9 @@ def consistency(
     warp: Callable[[int, int], Warp],
     lpips: Lpips | None = None,
 ) -> Consistency:
-    """Compute the consistency of pairs of views.
+    """Compute the consistency of pairs of views `gap` apart.
 
     Args:
-        gap: Index difference of the views of a pair.
-        pairs: Indices of the views of each pair.
         image: Function that returns the image [H, W, 3] of a view as a screen shows it (`shown`).
         warp: Function that returns the warp of a pair's second view into the first one.
         lpips: LPIPS network; None skips LPIPS.
@@ -190,7 +188,6 @@ class Warp:
     A warp depends only on geometry, so it can be reused when the colors of the scene change.
 
     Attributes:
-        size: (H, W) of the view.
         pixels: Row-major indices [P] of the view's pixels with a match in the other view, int64.
         sources: Row-major indices [4, P] of the four surrounding pixels in the other view, int32.
         weights: Interpolation weights [4, P] that sum to 1 for each pixel, float32.

@@ -76,7 +76,6 @@ class Finding:
     """One extreme property of the input.
 
     Attributes:
-        subject: Part of the input.
         count, total: Number of affected items, and of all items.
         worst: Worst item and its value as text; may be empty.
     """

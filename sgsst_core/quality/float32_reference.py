@@ -51,7 +51,6 @@ class GradientError(Difference):
 
     Attributes:
         step: Number of steps before the measurement.
-        view: Name of the camera.
         seconds: Seconds to compute the gradient with the job's approximations.
         seconds_exact: Seconds to compute the exact gradient.
     """
@@ -74,23 +73,16 @@ class ExactLoss:
         self._stylizer = stylizer
         settings = stylizer.job.settings
         settings = settings.model_copy(update={"style_loss": style_loss or settings.style_loss})
-        layers = layers_of(
-            settings.style_loss, stylizer.job.weights, content=settings.content_weight > 0, settings=settings
-        )
-        network = FeatureNetwork(stylizer.job.weights, layers, torch.float32, stylizer.job.network.device)
+        with_content, weights = settings.content_weight > 0, stylizer.job.weights
+        layers = layers_of(settings.style_loss, weights, content=with_content, settings=settings)
+        network = FeatureNetwork(weights, layers, torch.float32, stylizer.job.network.device)
         own = stylizer.job.loss
         self.loss = make_loss(network, settings, own.memory, content_weight=own.content_weight)
         self.style_targets = StyleTargetCache(stylizer.job.styles.to(network.device), self.loss)
 
 
 class Float32Reference(ExactLoss):
-    """Exact loss and gradient of a job's colors.
-
-    Args:
-        stylizer: Job to evaluate; not modified.
-        memory: Memory budget in bytes for view targets.
-        style_loss: Style loss to evaluate; see `ExactLoss`.
-    """
+    """Exact loss and gradient of a job's colors; `memory` is the budget in bytes for view targets."""
 
     def __init__(self, stylizer: Stylizer, memory: int = 1 << 30, *, style_loss: StyleLossName | None = None) -> None:
         super().__init__(stylizer, style_loss)

@@ -86,7 +86,6 @@ class Judge:
             statistics are averaged; or the styles of the scene's regions. For regions, `Judgment.style` and
             `Judgment.color_distance` are averaged over regions, weighted by their fraction of a view, and frozen
             regions are ignored.
-        scene: Unstylized scene.
         cameras: Cameras of the views. Views larger than `JUDGED_SIDE` are judged at that size. Views that see almost
             nothing, or are too small for AlexNet (a side below 31 pixels), are skipped.
         background: Background color [3] of the rasterizer.
@@ -111,12 +110,12 @@ class Judge:
         self._maps = replace(styles, bands=0).maps(rasterizer)
         self._background = torch.tensor(background, dtype=rasterizer.dtype, device=rasterizer.device)
         self._sh_rest, self._means = scene.sh_rest.to(rasterizer.device), scene.means.to(rasterizer.device)
-        small = [resized(camera, min(JUDGED_SIDE, camera.side)) for camera in cameras]
-        self.cameras = [
-            camera
-            for camera in small
-            if min(camera.width, camera.height) >= MIN_SIDE and self._covered(camera) >= _MIN_COVERAGE
-        ]
+        self.cameras = []
+        for camera in (resized(camera, min(JUDGED_SIDE, camera.side)) for camera in cameras):
+            if min(camera.width, camera.height) >= MIN_SIDE:
+                judged = rasterizer.coverage(camera) if self._maps is None else self._maps.render(camera).sum(dim=2)
+                if float(judged.mean()) >= _MIN_COVERAGE:
+                    self.cameras.append(camera)
 
     @torch.no_grad()
     def judge(self, sh_dc: Tensor) -> Judgment | None:
@@ -166,12 +165,6 @@ class Judge:
             )
         return measures
 
-    def _covered(self, camera: Camera) -> float:
-        """Return the fraction of a view that is judged."""
-        if self._maps is not None:
-            return float(self._maps.render(camera).sum(dim=2).mean())
-        return float(self._rasterizer.coverage(camera).mean())
-
     def _render(self, sh_dc: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
         """Return the image [H, W, 3] over the rasterizer's background, and the coverage [H, W]."""
         rest = torch.zeros((), dtype=sh_dc.dtype, device=sh_dc.device)
@@ -205,9 +198,7 @@ def _interior(
 ) -> tuple[float | None, float | None]:
     """Return `interior_style` and `sliced_features` of an image, averaged over the regions that have interior features.
 
-    Args:
-        features: Features [h, w, c] of the image, by layer.
-        parts: Judge, position weights [H, W] and fraction of the area of each region.
+    `parts` has the judge, the position weights [H, W] and the fraction of the area of each region.
     """
     distances = [(judge.interior(features, part), fraction) for judge, part, fraction in parts]
     known = [(pair, fraction) for pair, fraction in distances if pair is not None]
@@ -237,11 +228,9 @@ class _StyleJudge:
         return frechet_distance(color_moments(image.reshape(-1, 3), weights.reshape(-1)), self._colors)
 
     def distance(self, features: list[Tensor], weights: Tensor) -> float:
-        """Return the mean relative distance of Gram matrices over the layers of an image.
+        """Return the mean relative distance of Gram matrices over the layers [h, w, c] of an image.
 
-        Args:
-            features: Features [h, w, c] of the image, by layer.
-            weights: Position weights [H, W].
+        Positions of the image have weights [H, W].
         """
         targets = self._layers((int(weights.shape[0]), int(weights.shape[1])))
         return fmean(
@@ -252,9 +241,7 @@ class _StyleJudge:
     def interior(self, features: list[Tensor], coverage: Tensor) -> tuple[float, float] | None:
         """Return the Gram and the sliced Wasserstein distance over interior features; None if there are too few.
 
-        Args:
-            features: Features [h, w, c] of the image, by layer.
-            coverage: Coverage [H, W] of the object or of the region.
+        Features [h, w, c] are those of the layers, and coverage [H, W] that of the object or of the region.
         """
         targets = self._layers((int(coverage.shape[0]), int(coverage.shape[1])))
         distances = []
@@ -272,15 +259,14 @@ class _StyleJudge:
     def _layers(self, view: tuple[int, int]) -> list[_LayerTarget]:
         """Return the style's features of each layer for a view size."""
         if view not in self._targets:
-            every = [self._features(image, view) for image in self._style.images]
+            every = []
+            for image in self._style.images:  # resized as in the loss, but not below AlexNet's minimum size
+                height, width = style_size((image.shape[0], image.shape[1]), view)
+                enlarged = max(1.0, MIN_SIDE / min(height, width))
+                resized_image = resize_area(image, (round(height * enlarged), round(width * enlarged)))
+                every.append(self._lpips.features(resized_image))
             self._targets[view] = [self._target(layers) for layers in zip(*every, strict=True)]
         return self._targets[view]
-
-    def _features(self, image: Tensor, view: tuple[int, int]) -> list[Tensor]:
-        """Return the features of one style image, resized as in the loss, but not below AlexNet's minimum size."""
-        height, width = style_size((image.shape[0], image.shape[1]), view)
-        enlarged = max(1.0, MIN_SIDE / min(height, width))
-        return self._lpips.features(resize_area(image, (round(height * enlarged), round(width * enlarged))))
 
     def _target(self, layers: tuple[Tensor, ...]) -> _LayerTarget:
         """Return the weighted mean of the style images' features [h, w, c] of one layer."""
@@ -301,12 +287,7 @@ def saturated(sh_dc: Tensor) -> float:
 
 
 def frechet_distance(first: Moments, second: Moments) -> float:
-    """Return the Frechet distance of two normal distributions of colors, in 8-bit levels.
-
-    Args:
-        first: Mean [3] and covariance [3, 3] of colors in 0 to 1.
-        second: Mean and covariance of the other distribution.
-    """
+    """Return the Frechet distance of two normal distributions of colors in 0 to 1, in 8-bit levels."""
     (mean, covariance), (other_mean, other) = first, second
     other_mean, other = other_mean.to(mean), other.to(covariance)
     root = square_root(covariance)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, replace
-from functools import partial
+from functools import cached_property, partial
 from statistics import median
 from typing import Any
 
@@ -51,16 +51,18 @@ class Measurements:
     def __init__(self, stylizer: Stylizer, show: ShowViews = show_nothing) -> None:
         self._stylizer, self._show = stylizer, show
         self.approximated = approximations(stylizer)
-        self._exact: Float32Reference | None = None
         self._novel_views: NovelViews | None = None
-        self._seen_by: tuple[Scene, Rasterizer] | None = None
 
-    @property
+    @cached_property
     def exact(self) -> Float32Reference:
         """Exact loss and gradient of the job."""
-        if self._exact is None:
-            self._exact = Float32Reference(self._stylizer, measuring_memory(self._stylizer.job.memory))
-        return self._exact
+        return Float32Reference(self._stylizer, measuring_memory(self._stylizer.job.memory))
+
+    @cached_property
+    def _seen_by(self) -> tuple[Scene, Rasterizer]:
+        """Scene of the novel views, and its rasterizer."""
+        scene = self._stylizer.job.scene.without_zero_bands()
+        return scene, rasterizer_beside(self._stylizer, scene)
 
     @property
     def level(self) -> Level:
@@ -165,10 +167,9 @@ class Measurements:
         stylizer.measured.append(entry)
 
     def _moment(self, colors: Tensor, own: dict[str, Any], *, start: bool) -> dict[str, Any] | None:
-        """Measure the novel views with the given colors; return None if there are no views.
+        """Measure the novel views with colors [N, 3]; return None if there are no views.
 
         Args:
-            colors: Colors `sh_dc` [N, 3].
             own: Additional fields of the first entry, extended in place; empty for later entries.
             start: Whether the colors are those of the unstylized scene.
         """
@@ -180,18 +181,14 @@ class Measurements:
         if not novel_views.views:
             return None
         measured = novel_views.measure(colors.to(novel_views.rasterizer.device), self._show)
-        if not start and (
-            not stylizer.measured or stylizer.measured[0]["step"]
-        ):  # relative values require a measured start
-            measured = replace(measured, gram_relative=None)
+        if not start and (not stylizer.measured or stylizer.measured[0]["step"]):
+            measured = replace(measured, gram_relative=None)  # relative values require a measured start
         return measured.as_dict(0, 0.0) if start else measured.as_dict(stylizer.step, stylizer.seconds)
 
     def _first(self, colors: Tensor, seconds: float) -> dict[str, Any]:
-        """Choose the level by timing one view; return the fields "level" and "again" of the first entry.
+        """Choose the level by timing one view with colors [N, 3]; return "level" and "again" of the first entry.
 
-        Args:
-            colors: Colors `sh_dc` [N, 3] to measure with.
-            seconds: Time of a moment apart from its views.
+        `seconds` is the time of a moment apart from its views.
         """
         stylizer, index = self._stylizer, self._stylizer.job.plan.measuring
         again = 0.0
@@ -207,15 +204,12 @@ class Measurements:
         return {"level": index, "again": again}
 
     def _trial(self, colors: Tensor, seconds: float) -> tuple[NovelViews, Prices]:
-        """Measure one novel view; return it with the measured times.
+        """Measure one novel view with colors [N, 3]; return it with the measured times.
 
-        Args:
-            colors: Colors `sh_dc` [N, 3] to measure with.
-            seconds: Time of a moment apart from its views.
+        `seconds` is the time of a moment apart from its views.
         """
-        lpips = load_lpips_or_none(
-            self._stylizer.job.network.device
-        )  # loaded before the clock starts: not a cost per view
+        # Loaded before the clock starts, because it is not a cost per view.
+        lpips = load_lpips_or_none(self._stylizer.job.network.device)
         clock = [time.perf_counter()]
         novel_views = self._make(1, lpips)
         for _ in range(2 if novel_views.views else 0):  # the first pass includes intersections, depth and warps
@@ -237,15 +231,6 @@ class Measurements:
         # One view is already prepared, so measuring it at the end is always affordable.
         return min(choose_level(prices, allowed, stylizer.job.total_steps, index), NOTHING - 1)
 
-    def _source_of_statistics(self) -> StylizationJob | ExactLoss:
-        """Return the object whose loss and style targets define Gram distances.
-
-        Its features are float32, and it has Gram statistics even if the job optimizes another loss.
-        """
-        if not has_statistics(self._stylizer.job.settings.style_loss):
-            return ExactLoss(self._stylizer, "sos")
-        return self.exact if self._stylizer.job.network.precision != "float32" else self._stylizer.job
-
     def _novel_views_of_job(self) -> NovelViews:
         if self._novel_views is None:
             self._novel_views = self._make(self.level.views)
@@ -253,12 +238,14 @@ class Measurements:
 
     def _make(self, views: int, lpips: Lpips | None = None) -> NovelViews:
         """Create the novel views of the job, at most `views` of them."""
-        stylizer = self._stylizer
-        if self._seen_by is None:
-            scene = stylizer.job.scene.without_zero_bands()
-            self._seen_by = scene, rasterizer_beside(stylizer, scene)
-        scene, rasterizer = self._seen_by
-        source = self._source_of_statistics()
+        stylizer, (scene, rasterizer) = self._stylizer, self._seen_by
+        # Features that define Gram distances are float32, and have Gram statistics even if the job optimizes another
+        # loss.
+        source: StylizationJob | ExactLoss = stylizer.job
+        if not has_statistics(stylizer.job.settings.style_loss):
+            source = ExactLoss(stylizer, "sos")
+        elif stylizer.job.network.precision != "float32":
+            source = self.exact
         first = stylizer.measured[0]["novel_views"] if stylizer.measured else None
         return NovelViews(
             stylizer.job.views.cameras,

@@ -30,6 +30,10 @@ _OUTLOOK_SIDE = 160
 _OUTLOOK_GAUSSIANS = 250_000
 
 
+#: Mean coverage of a view (0 if it sees nothing), and its median depth (None if unknown).
+Outlook = tuple[float, float | None]
+
+
 def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
     """Return the pairs of neighboring cameras between which novel cameras are placed.
 
@@ -91,9 +95,12 @@ def choose_novel_cameras(
     outlooks: dict[CameraKey, Outlook] = {}  # by camera, because a camera is a neighbor of two views
 
     def outlook(camera: Camera) -> Outlook:
-        key = camera_key(camera)
+        key, small = camera_key(camera), resized(camera, min(_OUTLOOK_SIDE, camera.side))
         if key not in outlooks:
-            outlooks[key] = _outlook(camera, scene, rasterizer)
+            coverage, depth = rasterizer.coverage(small), expected_depth(scene, small, rasterizer)
+            known = depth.depth[depth.known]
+            covered = float(coverage.mean()) if sees_something(coverage) else 0.0
+            outlooks[key] = covered, float(known.median()) if len(known) else None
         return outlooks[key]
 
     clear = {index for index in used if _is_clear(novel[index], parents[index], outlook)}
@@ -104,10 +111,6 @@ def choose_novel_cameras(
     )
 
 
-#: Mean coverage of a view (0 if it sees nothing), and its median depth (None if unknown).
-Outlook = tuple[float, float | None]
-
-
 def _is_clear(camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[[Camera], Outlook]) -> bool:
     """Return whether depth and coverage of a novel view resemble its neighbors', unlike inside an object."""
     (covered, depth), *others = (outlook(view) for view in (camera, *parents))
@@ -116,16 +119,6 @@ def _is_clear(camera: Camera, parents: tuple[Camera, Camera], outlook: Callable[
         and _alike(covered, [other[0] for other in others])
         and (depth is None or _alike(depth, [other[1] for other in others if other[1] is not None]))
     )
-
-
-def _outlook(camera: Camera, scene: Scene, rasterizer: Rasterizer) -> Outlook:
-    """Return a view's mean coverage (0 if it sees nothing) and its median depth (None if unknown)."""
-    small = resized(camera, min(_OUTLOOK_SIDE, camera.side))
-    coverage = rasterizer.coverage(small)
-    seen = sees_something(coverage)
-    depth = expected_depth(scene, small, rasterizer)
-    known = depth.depth[depth.known]
-    return float(coverage.mean()) if seen else 0.0, float(known.median()) if len(known) else None
 
 
 def _alike(value: float, others: list[float]) -> bool:

@@ -146,8 +146,12 @@ class NovelViews:
         images: Cache[int, Tensor] = Cache(self._image_memory, tensor_bytes)
         sh_dc = sh_dc.detach().to(self.rasterizer.device)
 
+        def rendered(index: int) -> Tensor:
+            camera, colors = self.cameras[index], self._colors(index, sh_dc)
+            return shown(self.rasterizer.render(colors, camera), camera, self.rasterizer.device)
+
         def image(index: int) -> Tensor:
-            return images.get(index, lambda: self._image(index, sh_dc))
+            return images.get(index, partial(rendered, index))
 
         gram = self._gram(image, show)
         self.first = self.first or gram
@@ -158,11 +162,6 @@ class NovelViews:
             self._consistency(SHORT_RANGE, image),
             self._consistency(LONG_RANGE, image),
         )
-
-    def _image(self, index: int, sh_dc: Tensor) -> Tensor:
-        """Render a novel view as a screen shows it, [H, W, 3]."""
-        camera = self.cameras[index]
-        return shown(self.rasterizer.render(self._colors(index, sh_dc), camera), camera, self.rasterizer.device)
 
     def _gram(self, image: Callable[[int], Tensor], show: ShowViews) -> dict[int, float]:
         """Compute the Gram distance by scale, as the mean over the views that have the scale."""

@@ -56,7 +56,6 @@ class Key(_File):
     """Key of a study: what its tokens stand for.
 
     Attributes:
-        study: Random name of the study.
         variants: Names of the variants, in the order in which they were given.
         views: Token of each variant's image, by view, in the order of `variants`.
     """
@@ -66,12 +65,7 @@ class Key(_File):
 
 
 class Vote(BaseModel):
-    """One choice.
-
-    Attributes:
-        view: Index of the view.
-        chosen: Token of the chosen image.
-    """
+    """One choice."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -97,10 +91,7 @@ class VoteShare:
     """Fraction of the votes that one variant received.
 
     Attributes:
-        votes: Number of its votes.
-        total: Number of all votes.
         low: Lower end of the 95 % Wilson interval of the fraction.
-        high: Upper end of this interval.
     """
 
     variant: str

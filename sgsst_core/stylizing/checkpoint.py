@@ -50,11 +50,9 @@ class Checkpoint:
     """State from which an unfinished job resumes.
 
     Attributes:
-        state: State of the stylizer.
         plan: Plan of the job, which saves a resumed run from surveying the views again.
         ranks: Number of ranks when the plan was made.
         run: Identifier of the program run that wrote it.
-        written_by: Versions of the program and of PyTorch.
     """
 
     state: StylizerState
@@ -95,7 +93,6 @@ class Checkpoints:
         """Return the newest usable checkpoint of the job with this fingerprint.
 
         Args:
-            job: Fingerprint of the job.
             warn: Callback for the reason why a checkpoint was skipped.
             run: Program run whose checkpoints are accepted; None for any.
 
@@ -143,13 +140,8 @@ def fingerprint(
     """Return a SHA-256 digest of everything that determines the course of a job.
 
     Args:
-        scene: Scene to stylize.
-        cameras: Cameras of the views.
-        style: Style of the job.
-        settings: Settings of the job.
         weights: Digest of the feature network's weights.
         photos: Identifier of the content images; empty for unstylized renders.
-        regions: Regions of the scene; None if there are none.
     """
     digest = hashlib.sha256(repr((weights, photos)).encode())
     arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh_dc, scene.sh_rest)
@@ -211,8 +203,6 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
     """Read a checkpoint of the job with this fingerprint.
 
     Args:
-        path: File of the checkpoint.
-        job: Fingerprint of the job.
         run: Program run that must have written it; None for any run.
 
     Raises:

@@ -6,9 +6,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.loss.convergence import log_loss, ratio, smoothed
@@ -79,57 +77,39 @@ def round_evaluation(history: Sequence[StepRecord], round_length: int, weights: 
 
 
 class RunningRound:
-    """Running sums over the last round of views; adding a step takes the same time for any number of views.
+    """Losses of the last round of views, step by step.
 
     Args:
         round_length: Number of steps of a round.
-        weights: Weights of the scales.
-        history: Records of earlier steps.
     """
 
     def __init__(self, round_length: int, weights: ScaleWeights, history: Sequence[StepRecord] = ()) -> None:
-        self._length = round_length
         self._weights = weights
         self._stage = ""
-        self._logs = 0.0
-        self._sums: dict[int, NDArray[np.float64]] = {}
-        self._records: deque[tuple[float, dict[int, NDArray[np.float64]]]] = deque()
-        self._added = 0
+        #: Logarithm of the loss, and total of each scale.
+        self._steps: deque[tuple[float, dict[int, float]]] = deque(maxlen=round_length)
         for record in history[-round_length:]:
             self.add(record)
 
     def add(self, record: StepRecord) -> None:
-        """Add a step, and remove the one that is a round older."""
+        """Add a step, and drop the one that is a round older."""
         if record.stage != self._stage:
-            self._stage, self._added = record.stage, 0
-            self._records.clear()
-        terms = {scale: np.array([*terms.values(), 1.0]) for scale, terms in record.terms.items()}
-        self._records.append((log_loss(record.loss), terms))
-        old = self._records.popleft() if len(self._records) > self._length else None
-        if self._added % self._length == 0:  # rounding errors of the running sums last one round at most
-            self._logs = sum(log for log, _ in self._records)
-            self._sums = {}
-            for _, terms in self._records:
-                self._accumulate(terms)
-        else:
-            self._logs += self._records[-1][0] - (old[0] if old else 0.0)
-            self._accumulate(terms)
-            for scale, values in old[1].items() if old else ():
-                self._sums[scale] = self._sums[scale] - values
-        self._added += 1
-
-    def _accumulate(self, terms: dict[int, NDArray[np.float64]]) -> None:
-        for scale, values in terms.items():
-            self._sums[scale] = self._sums.get(scale, 0.0) + values
+            self._stage = record.stage
+            self._steps.clear()
+        self._steps.append((log_loss(record.loss), {scale: terms.total for scale, terms in record.terms.items()}))
 
     @property
     def loss(self) -> float:
         """The `round_loss` of the steps."""
-        return math.exp(self._logs / len(self._records))
+        return math.exp(sum(log for log, _ in self._steps) / len(self._steps))
 
     def scales(self) -> dict[int, float]:
         """Return the total of each scale in the `round_evaluation` of the steps."""
-        means = {scale: float(sums[:-1].sum() / sums[-1]) for scale, sums in self._sums.items() if sums[-1] > 0.5}
+        totals: dict[int, list[float]] = {}
+        for _, step in self._steps:
+            for scale, total in step.items():
+                totals.setdefault(scale, []).append(total)
+        means = {scale: sum(own) / len(own) for scale, own in totals.items()}
         mean = self._weights.mean(means)
         factor = self.loss / mean if mean > 0 else 1.0
         return {scale: factor * total for scale, total in means.items()}

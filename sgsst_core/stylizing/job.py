@@ -50,7 +50,6 @@ class StyleTargetCache:
 
     Args:
         styles: Styles of the job, on the network's device.
-        loss: Loss that computes the targets.
 
     Attributes:
         seconds: Time in seconds spent on computing targets.
@@ -77,22 +76,12 @@ class StylizationJob:
     """Context of a stylization, which steps only read; `prepare_job` creates it.
 
     Attributes:
-        plan: Plan of the job.
-        settings: Settings of the job.
         scene: Scene with the SH attenuation of the settings applied.
         sh_degree: SH degree of the scene before the attenuation.
-        styles: Styles of the job, on the CPU.
-        weights: Weights of the feature network.
-        network: Feature network.
-        loss: SOS loss of one view.
         graphs: Replacement for `loss` in steps; None if the plan uses no graphs.
-        views: Views of the Gaussians that the views show.
         view_targets: Targets of the views, except the style's.
-        team: Ranks that take part.
         memory_limit: Memory budget in bytes of all ranks on one machine together. It determines the partition, and
             thereby rounding, so it is identical on all ranks.
-        memory: Memory budget in bytes of this rank.
-        style_targets: Targets of the styles by view size.
     """
 
     plan: Plan
@@ -160,11 +149,6 @@ class StylizationJob:
         return spread(self.views.covered, self.plan.loss_views)
 
     @property
-    def stops_early(self) -> bool:
-        """Whether the run ends when its losses stop falling; this requires a constant background."""
-        return self.settings.early_stop and self.plan.training_background == "background"
-
-    @property
     def transfers_last(self) -> bool:
         """Whether the style's colors are transferred to results once more: see `ends_with_transfer`."""
         return ends_with_transfer(self.settings, warm=self.plan.warm_start)
@@ -191,11 +175,7 @@ class StylizationJob:
         """Return dE/dsh_dc [n, 3] of one view for colors [n, 3], and the loss.
 
         Args:
-            index: Index of the view.
             sh_dc: Colors of the rendered Gaussians.
-            style: Targets of the style.
-            target: Targets of the view.
-            scales: Scales to evaluate.
             background: Background color; None for that of the settings.
         """
         with self.timer("render"), torch.no_grad():
@@ -209,11 +189,6 @@ class StylizationJob:
         with self.timer("raster_backward"):
             assert result.image_gradient is not None
             return self.views.gradient(index, result.image_gradient.to(colors.device), colors), result
-
-    def scale_count(self, index: int) -> int:
-        """Return n_s of a view."""
-        camera = self.views.cameras[index]
-        return self.loss.tiling.scale_count((camera.height, camera.width))
 
     def scales(self, index: int) -> list[int]:
         """Return the scales of a view with a positive weight, finest first."""
@@ -240,9 +215,6 @@ def prepare_job(
         plan: Plan for this scene, these cameras and settings, such as that of an earlier run of the same job.
         scene: Scene to stylize, refined if the plan says so.
         cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
-        style: Style of the job.
-        settings: Settings of the job.
-        weights: Weights of the feature network.
         photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
             for unstylized renders.
         collectives: Ranks that stylize the scene together.
@@ -277,7 +249,30 @@ def prepare_job(
     rasterizer = _make_rasterizer(plan, settings, rendered, memory, planning_context)
     if team.group.size > 1:  # the survey's tile intersections are those of whole views
         rasterizer.forget_views()
-    views = _make_views(plan, settings, rendered, fitted, rasterizer, loss, memory)
+    views = Views(
+        rendered,
+        fitted,
+        rasterizer,
+        covered=list(plan.covered),
+        memory=view_memory(plan, memory),
+        clamp_aware_gradient=settings.clamp_aware_gradient,
+        regions=plan.survey.regions if plan.weighted else None,
+        divider=loss.divider,
+        timer=loss.timer,
+    )
+    repeatable = rasterizer.repeatable
+    view_targets = ViewTargets(
+        views,
+        loss,
+        weighted=plan.weighted,
+        photos=photos,
+        memory=view_memory(plan, memory),
+        regions=plan.survey.regions if plan.weighted else None,
+        background=settings.background,
+        drawn=plan.training_background != "background",
+        maps=styles.maps(repeatable, plan.seen),
+        content_maps=styles.content_maps(repeatable, plan.seen),
+    )
     return StylizationJob(
         plan=plan,
         settings=settings,
@@ -289,7 +284,7 @@ def prepare_job(
         loss=loss,
         graphs=LossGraphs(loss) if plan.graphs and team.group.size == 1 else None,
         views=views,
-        view_targets=_make_view_targets(plan, settings, styles, views, loss, memory, photos),
+        view_targets=view_targets,
         team=team,
         memory_limit=memory_limit,
         memory=memory,
@@ -324,54 +319,6 @@ def _job_styles(
     return replace(styles, bands=band_count(cameras, settings), mean_level=level)
 
 
-def _make_views(
-    plan: Plan,
-    settings: Settings,
-    rendered: Scene,
-    cameras: list[Camera],
-    rasterizer: Rasterizer,
-    loss: SosLoss,
-    memory: int,
-) -> Views:
-    """Return the views of the rendered Gaussians."""
-    return Views(
-        rendered,
-        cameras,
-        rasterizer,
-        covered=list(plan.covered),
-        memory=view_memory(plan, memory),
-        clamp_aware_gradient=settings.clamp_aware_gradient,
-        regions=plan.survey.regions if plan.weighted else None,
-        divider=loss.divider,
-        timer=loss.timer,
-    )
-
-
-def _make_view_targets(
-    plan: Plan,
-    settings: Settings,
-    styles: JobStyles,
-    views: Views,
-    loss: SosLoss,
-    memory: int,
-    photos: PhotoLoader | None,
-) -> ViewTargets:
-    """Return the targets of the views: content, and maps of regions and content weights."""
-    repeatable = views.rasterizer.repeatable
-    return ViewTargets(
-        views,
-        loss,
-        weighted=plan.weighted,
-        photos=photos,
-        memory=view_memory(plan, memory),
-        regions=plan.survey.regions if plan.weighted else None,
-        background=settings.background,
-        drawn=plan.training_background != "background",
-        maps=styles.maps(repeatable, plan.seen),
-        content_maps=styles.content_maps(repeatable, plan.seen),
-    )
-
-
 def _make_rasterizer(
     plan: Plan, settings: Settings, rendered: Scene, memory: int, planning_context: PlanningContext | None
 ) -> Rasterizer:
@@ -399,12 +346,7 @@ def _make_rasterizer(
 
 
 def view_memory(plan: Plan, memory: int) -> int:
-    """Return the budget in bytes for data of the views: what other caches leave of it, and `Plan.spare`.
-
-    Args:
-        plan: Plan of the job.
-        memory: Memory limit of a rank in bytes.
-    """
+    """Return the budget in bytes for data of the views: what other caches leave of it, and `Plan.spare`."""
     left = memory_for("views", memory) + plan.spare
     if plan.cached_weights != "none":
         left -= least_intersection_memory(memory)
@@ -428,20 +370,15 @@ def with_second_attempt(job: StylizationJob, work: Callable[[], T]) -> T:
         if job.collectives.size > 1:
             raise _not_enough(job, "") from None
     # Outside of the handler, because the exception refers to the tensors of the first attempt.
-    _halve_activations(job)
-    try:
-        return work()
-    except torch.OutOfMemoryError:
-        raise _not_enough(job, ", not even with half of the activations in memory") from None
-
-
-def _halve_activations(job: StylizationJob) -> None:
-    """Clear what depends on the partition, and halve the memory budget for activations."""
     job.loss.halve_memory(max(camera.height * camera.width for camera in job.views.cameras))
     job.view_targets.forget_division()
     if job.graphs is not None:
         job.graphs.clear()
     torch.cuda.empty_cache()
+    try:
+        return work()
+    except torch.OutOfMemoryError:
+        raise _not_enough(job, ", not even with half of the activations in memory") from None
 
 
 def _not_enough(job: StylizationJob, attempt: str) -> DeviceMemoryError:

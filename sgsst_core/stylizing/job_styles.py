@@ -32,7 +32,6 @@ class JobStyles:
 
     Attributes:
         own: Default style; if one region contains everything that the views show, the style of that region.
-        regions: Regions of the scene; None if there are none.
         each: Style of each region in `Regions.active`; empty if views need no region maps.
         bands: Number of depth bands, which is that of the scales of the largest view; 0 for strokes that have the same
             size on the whole screen.
@@ -54,9 +53,7 @@ class JobStyles:
         """Prepare styles as the settings require; see `prepared_style`.
 
         Args:
-            style: Style of the job.
             regions: Result of `Regions.resolved`; None if there are no regions.
-            settings: Settings of the job.
             sh_dc: [N, 3], colors of the scene. A region's style may be matched to the colors of the region's own
                 Gaussians.
             weights: [N] float64, total blend weights.
@@ -139,7 +136,6 @@ class JobStyles:
         """Return the renderer of the maps of regions or depth bands; None if the views need none.
 
         Args:
-            rasterizer: Rasterizer of the maps.
             rows: [N] bool, Gaussians that the rasterizer contains; None for all.
         """
         if self.bands:
@@ -162,7 +158,6 @@ def prepared_style(style: Style, settings: Settings, sh_dc: Tensor, weights: Ten
 
     Args:
         style: Images [H, W, 3] in 0..1.
-        settings: Settings of the job.
         sh_dc: [N, 3], colors of the scene.
         weights: [N] float64, total blend weights, at least one positive.
     """
@@ -179,11 +174,6 @@ def prepared_style(style: Style, settings: Settings, sh_dc: Tensor, weights: Ten
 
 def check_style_size(style: Style, cameras: Sequence[Camera], scale: float) -> None:
     """Check that no view requires a style image with a longer side of more than `MAX_RESOLUTION` pixels.
-
-    Args:
-        style: Style.
-        cameras: Cameras at the sizes used for stylization.
-        scale: Scale of the strokes.
 
     Raises:
         SettingsError: If an image would be larger.

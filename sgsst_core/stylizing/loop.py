@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, Protocol
 
 from sgsst_core.loss.convergence import has_converged, has_reached, window_length
@@ -81,40 +82,36 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
         >>> run(stylizer)
         'finished'
     """
+    callbacks = callbacks or Callbacks()
     try:
-        return _iterate(stylizer, callbacks or Callbacks())
+        last_checkpoint = last_preview = time.perf_counter()
+        pace, ended = _pace(stylizer), partial(_end_requested, stylizer, callbacks)
+        running = RunningRound(stylizer.job.round_length, stylizer.job.loss.weights, stylizer.history)
+        if callbacks.preview and not stylizer.step:
+            callbacks.preview(stylizer)
+        _measure(stylizer, callbacks)  # a resumed job may have been stopped before this measurement
+        while stylizer.step < stylizer.job.total_steps:
+            reason = stylizer.job.collectives.broadcast(ended) or _enough(stylizer)
+            if reason:
+                if callbacks.checkpoint:
+                    _checkpoint(stylizer, callbacks.checkpoint)
+                return reason
+            _step(stylizer, pace)
+            now = time.perf_counter()
+            if callbacks.progress:
+                running.add(stylizer.history[-1])
+                callbacks.progress(_progress(stylizer, callbacks, pace, running))
+            if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
+                _checkpoint(stylizer, callbacks.checkpoint)
+                last_checkpoint = time.perf_counter()
+            if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
+                callbacks.preview(stylizer)
+                last_preview = time.perf_counter()
+            pace.add_beside(time.perf_counter() - now)
+            _measure(stylizer, callbacks)
+        return "finished"
     finally:
         stylizer.job.view_targets.end_prefetch()
-
-
-def _iterate(stylizer: Stylizer, callbacks: Callbacks) -> Stopped:
-    """Do the work of `run`, without its cleanup."""
-    last_checkpoint = last_preview = time.perf_counter()
-    pace = _pace(stylizer)
-    running = RunningRound(stylizer.job.round_length, stylizer.job.loss.weights, stylizer.history)
-    if callbacks.preview and not stylizer.step:
-        callbacks.preview(stylizer)
-    _measure(stylizer, callbacks)  # a resumed job may have been stopped before this measurement
-    while stylizer.step < stylizer.job.total_steps:
-        reason = stylizer.job.collectives.broadcast(lambda: _end_requested(stylizer, callbacks)) or _enough(stylizer)
-        if reason:
-            if callbacks.checkpoint:
-                _checkpoint(stylizer, callbacks.checkpoint)
-            return reason
-        _step(stylizer, pace)
-        now = time.perf_counter()
-        if callbacks.progress:
-            running.add(stylizer.history[-1])
-            callbacks.progress(_progress(stylizer, callbacks, pace, running))
-        if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
-            _checkpoint(stylizer, callbacks.checkpoint)
-            last_checkpoint = time.perf_counter()
-        if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
-            callbacks.preview(stylizer)
-            last_preview = time.perf_counter()
-        pace.add_beside(time.perf_counter() - now)
-        _measure(stylizer, callbacks)
-    return "finished"
 
 
 def _end_requested(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
@@ -137,24 +134,17 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
     if settings.target_loss and len(losses) >= stylizer.job.round_length:  # all views have been visited at this point
         target = settings.target_loss * mean_loss(stylizer.start(), stylizer.job.loss.weights)
         if stylizer.job.plan.training_background != "background":
-            losses = _losses_on_background(stylizer)
+            # Losses of steps with different backgrounds are not comparable, so the loss over the settings' background
+            # is evaluated at the end of each round, in the same way as the initial loss.
+            losses = []
+            if not stylizer.step % stylizer.job.round_length:
+                with stylizer.measuring():
+                    loss = mean_loss(stylizer.evaluate(stylizer.job.evaluation_views), stylizer.job.loss.weights)
+                losses = [loss] * stylizer.job.round_length
         if has_reached(losses, target, stylizer.job.round_length):
             return "target-loss"
-    return "converged" if stylizer.job.stops_early and has_converged(losses, stylizer.job.round_length) else None
-
-
-def _losses_on_background(stylizer: Stylizer) -> list[float]:
-    """Return the current loss over the settings' background color, once per step of a round; empty within a round.
-
-    Losses of steps with different backgrounds are not comparable, so the loss is evaluated at the end of each round, in
-    the same way as the initial loss.
-    """
-    if stylizer.step % stylizer.job.round_length:
-        return []
-    with stylizer.measuring():
-        return [
-            mean_loss(stylizer.evaluate(stylizer.job.evaluation_views), stylizer.job.loss.weights)
-        ] * stylizer.job.round_length
+    stops_early = settings.early_stop and stylizer.job.plan.training_background == "background"
+    return "converged" if stops_early and has_converged(losses, stylizer.job.round_length) else None
 
 
 def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:

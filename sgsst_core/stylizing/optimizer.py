@@ -80,7 +80,13 @@ class ColorOptimizer:
             self._step(learning_rate)
         else:
             return largest
-        self._constrain(largest)
+        if self._bounded or self._chroma_of is not None or self._subspace is not None:
+            with torch.no_grad():
+                projected = constrained(self._colors, self._chroma_of, self._subspace, bounded=self._bounded)
+                unchanged = ~(largest <= LARGEST_GRADIENT)  # the step was skipped
+                if self._frozen is not None:
+                    unchanged = unchanged | self._frozen
+                self._colors.copy_(torch.where(unchanged, self._colors, projected))
         return largest
 
     @torch.no_grad()
@@ -104,20 +110,6 @@ class ColorOptimizer:
             eps=ADAM_EPS,
             maximize=False,
         )
-
-    @torch.no_grad()
-    def _constrain(self, largest: Tensor) -> None:
-        """Project colors onto their constraints: range, and chroma or subspace.
-
-        Frozen colors do not change. If the step was skipped, no color changes.
-        """
-        if not self._bounded and self._chroma_of is None and self._subspace is None:
-            return
-        constrained_colors = constrained(self._colors, self._chroma_of, self._subspace, bounded=self._bounded)
-        unchanged = ~(largest <= LARGEST_GRADIENT)
-        if self._frozen is not None:
-            unchanged = unchanged | self._frozen
-        self._colors.copy_(torch.where(unchanged, self._colors, constrained_colors))
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Return the first and second moment [n, 3] on the CPU; zeros before the first step."""

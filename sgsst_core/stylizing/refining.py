@@ -67,13 +67,7 @@ def refine(
     """Decide which Gaussians to split, and into how many. All ranks must call this, and get the same result.
 
     Args:
-        scene: Scene to refine.
-        cameras: Cameras of the views.
-        style: Style of the job.
-        settings: Settings of the job.
-        weights: Weights of the feature network.
         rasterizer: Name of the rasterizer, as in `plan_job`.
-        collectives: Ranks of the job.
         regions: Regions of the scene; frozen Gaussians are not split.
         show: Callback, called before each view that is surveyed, before each view whose gradient is computed, and
             before images are compared.
@@ -115,11 +109,8 @@ class _Refining:
     """Refinement of one scene.
 
     Args:
-        planning_context: Planning context of the scene.
         style: Style of the job as given; styles of regions are not considered.
-        collectives: Ranks of the job.
         frozen: [N] bool, frozen Gaussians, which are not split; None for none.
-        show: Progress callback.
     """
 
     def __init__(
@@ -145,7 +136,9 @@ class _Refining:
         if not covered or not self._collectives.broadcast(lambda: bool((lengths > finest).any())):
             return nothing
         cancels, magnitude = self._gradient_disagreement(spread_evenly(covered, GRADIENT_VIEWS))
-        allowed = candidates(self._footprints, self._may_be_split(), cancels, magnitude)
+        sane = can_be_split(self._scene)
+        sane = sane if self._frozen is None else sane & ~self._frozen
+        allowed = candidates(self._footprints, sane, cancels, magnitude)
         budget, most = math.floor(self._settings.growth * count), max_children(self._footprints.weights)
         pieces, size = self._collectives.broadcast(
             lambda: choose_pieces(lengths, allowed, cancels, most, budget, finest)
@@ -162,11 +155,6 @@ class _Refining:
         return Refinement(
             pieces, parents, int(counts.sum()), size, change.psnr, change.lowest, chosen - parents, change.sh_dc
         )
-
-    def _may_be_split(self) -> Tensor:
-        """Return the mask [N] bool of Gaussians that may be split."""
-        sane = can_be_split(self._scene)
-        return sane if self._frozen is None else sane & ~self._frozen
 
     def _undo_until_images_are_preserved(
         self, pieces: Tensor, fitted: Sequence[int], views: Sequence[int]

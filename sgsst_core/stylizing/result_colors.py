@@ -31,7 +31,6 @@ def transferred_colors(job: StylizationJob, colors: Tensor | None = None) -> Ten
     """Transfer the style's colors to the rendered Gaussians; see `warm_start`.
 
     Args:
-        job: Job of the scene.
         colors: [n, 3] on the CPU, colors before the transfer; None for the scene's, as before the first step.
 
     Returns:
@@ -49,15 +48,21 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     """Return the colors of the whole scene, in which unseen Gaussians follow their neighbors if the settings say so.
 
     Args:
-        job: Job of the scene.
         optimized: [n, 3] on the CPU, colors of the rendered Gaussians.
         transfer: Whether to transfer the style's colors to `optimized`.
 
     Returns:
         [N, 3] float32 on the CPU.
     """
-    colors = job.scene.sh_dc.clone()
-    colors[job.plan.seen] = _transferred_last(job, optimized) if transfer else optimized
+    colors, subspace = job.scene.sh_dc.clone(), job.styles.color_subspace(job.settings)
+    colors[job.plan.seen] = optimized
+    if transfer:
+        colors[job.plan.seen] = transferred = transferred_colors(job, optimized)
+        if job.preserves_chroma or subspace is not None:
+            chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
+            bounded = constrained(transferred, chroma_of, subspace, bounded=job.settings.bounded)
+            # Frozen colors remain bit-identical.
+            colors[job.plan.seen] = torch.where(transferred != optimized, bounded, optimized)
     if job.settings.unseen != "neighbors":
         return colors
     weights = torch.where(job.plan.optimized, job.plan.survey.total_blend_weights, 0.0)
@@ -70,18 +75,8 @@ def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> 
     change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
     original = job.scene.sh_dc[unseen]
     chroma_of = original if job.preserves_chroma else None
-    subspace = job.styles.color_subspace(job.settings)
     colors[unseen] = constrained(original + change, chroma_of, subspace, bounded=job.settings.bounded)
     return colors
-
-
-def _transferred_last(job: StylizationJob, optimized: Tensor) -> Tensor:
-    transferred, subspace = transferred_colors(job, optimized), job.styles.color_subspace(job.settings)
-    if not job.preserves_chroma and subspace is None:
-        return transferred
-    chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
-    bounded = constrained(transferred, chroma_of, subspace, bounded=job.settings.bounded)
-    return torch.where(transferred != optimized, bounded, optimized)  # frozen colors remain bit-identical
 
 
 def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
@@ -105,33 +100,18 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     tree = cKDTree(means[seen].double().numpy())
     weights, change, positions = weights[seen], change[seen], means[~seen]
     votes = torch.empty((len(positions), 3))
-    for part in _near_each_other(positions).split(_CHUNK):
-        _, nearest = tree.query(positions[part].double().numpy(), k=count, workers=torch.get_num_threads())
-        votes[part] = _votes(torch.as_tensor(nearest).reshape(-1, count), change, weights).float()
+    # Ordered by the cells of a coarse grid: consecutive searches then read the same part of the tree.
+    lowest = positions.double().amin(dim=0)
+    size = (positions.double().amax(dim=0) - lowest).clamp_min(1e-300)
+    x, y, z = ((positions.double() - lowest) / size * (_CELLS - 1)).long().unbind(1)
+    for part in torch.argsort((x * _CELLS + y) * _CELLS + z, stable=True).split(_CHUNK):
+        _, found = tree.query(positions[part].double().numpy(), k=count, workers=torch.get_num_threads())
+        nearest = torch.as_tensor(found).reshape(-1, count)
+        own = weights[nearest]
+        fraction = own / own.amax(dim=1, keepdim=True)  # so that tiny weights do not underflow
+        sums = (change[nearest].double() * fraction[:, :, None]).sum(dim=1)
+        votes[part] = (sums / fraction.sum(dim=1, keepdim=True)).float()
     return votes
-
-
-def _near_each_other(positions: Tensor) -> Tensor:
-    """Return the indices [U] that sort points [U, 3] by the cells of a coarse grid.
-
-    Consecutive neighbor searches then read the same part of the search tree.
-    """
-    positions = positions.double()
-    lowest = positions.amin(dim=0)
-    size = (positions.amax(dim=0) - lowest).clamp_min(1e-300)
-    cells = ((positions - lowest) / size * (_CELLS - 1)).long()
-    return torch.argsort((cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2], stable=True)
-
-
-def _votes(nearest: Tensor, change: Tensor, weights: Tensor) -> Tensor:
-    """Return weighted mean changes [U, 3] float64 of seen Gaussians.
-
-    `nearest` [U, K] are their indices into `change` [S, 3] and `weights` [S].
-    """
-    own = weights[nearest]
-    # Relative to the largest weight, so that tiny weights do not underflow.
-    fraction = own / own.amax(dim=1, keepdim=True)
-    return (change[nearest].double() * fraction[:, :, None]).sum(dim=1) / fraction.sum(dim=1, keepdim=True)
 
 
 def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:
@@ -143,7 +123,6 @@ def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, r
         means: [N, 3], see `neighbors_change`.
         change: [N, 3], see `neighbors_change`.
         weights: [N] float64, total blend weights of the optimized Gaussians; 0 for all others.
-        regions: Regions of the scene.
 
     Returns:
         [N, 3].
@@ -167,13 +146,6 @@ def render_first_view(
 
     For a job with this one view, these are the colors of its warm start. It runs on the CPU and shares nothing with the
     job, whose measurements it must not change.
-
-    Args:
-        scene: Scene as it was read.
-        camera: Camera of the view.
-        style: Style of the job.
-        settings: Settings of the job.
-        regions: Regions of the scene; None if there are none.
 
     Returns:
         Image [H, W, 3]; None if the view shows nothing that may change.

@@ -24,7 +24,6 @@ class Phase:
 
     Attributes:
         stage: Name of the phase: "coarse" (phase 1) or "sos" (phase 2) in every preset.
-        steps: Number of steps.
         scale: Single scale to optimize, counted from the coarsest (0) of those with a weight; None for the SOS loss on
             all scales.
     """
@@ -60,12 +59,7 @@ def drawn_round(covered: Sequence[int], generator: torch.Generator) -> list[int]
 class ViewOrder:
     """Random order of the views of a job, in which every view comes once before any comes again.
 
-    Args:
-        covered: Indices of the views.
-        seed: Seed of the order.
-
     Attributes:
-        generator: Random generator, part of checkpoints.
         left: Remaining views of this round, next one last; part of checkpoints.
     """
 
@@ -94,11 +88,9 @@ class StepRecord:
 
     Attributes:
         step: Step number, counted from 1 over both phases.
-        stage: Name of the phase: "coarse" or "sos".
         view: Index of the camera; of the first one if the step has several views.
         seconds: Wall-clock seconds of all iterations so far, in all sessions of a resumed job.
         loss: Loss before the step, mean over the step's views.
-        terms: Loss by scale, split into terms.
         parts: Time in seconds of this step by activity.
         memory: Physical memory of the process after the step, in bytes.
         sent: Bytes sent by this rank to others, by purpose (`collectives.Traffic`); empty for a single rank.

@@ -65,14 +65,8 @@ class Stylizer:
             single rank.
 
     Attributes:
-        job: Context of the stylization, which does not change.
         sh_dc: [n, 3], present colors of the rendered Gaussians, on the rasterizer's device.
-        step: Number of completed steps.
-        seconds: Time in seconds of all steps so far.
-        seconds_by_part: Time in seconds by activity.
-        history: Records of all steps.
         measured: Measurements between steps (`loop.Callbacks.measure`), JSON-serializable and preserved by a resume.
-        latest: Indices of the views of the latest step.
     """
 
     def __init__(self, job: StylizationJob) -> None:
@@ -167,10 +161,6 @@ class Stylizer:
         """Phase of the next step; the last phase if all steps are done."""
         return phase_at(self.job.schedule, self.step)
 
-    def fraction_done(self) -> float:
-        """Return the completed fraction of the schedule, 0 to 1, which determines the learning rate."""
-        return self.step / max(self.job.total_steps - 1, 1)
-
     def start(self, show: ShowViews = show_nothing) -> Evaluation:
         """Return the loss of the unstylized scene on the evaluation views; evaluated once, at the first call."""
         if self._start is None:
@@ -205,7 +195,8 @@ class Stylizer:
         self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
         gradient, results, cost = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
         with self.job.timer("optimizer"):
-            largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(self.fraction_done()))
+            done = self.step / max(self.job.total_steps - 1, 1)
+            largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(done))
         with self.job.timer("communication"):
             self.job.team.check_drift(self.step + 1, self.sh_dc)
         terms = self._read(largest, results)
@@ -246,7 +237,7 @@ class Stylizer:
             scales = phase.scales(self.job.scales(index))
             background = self.drawn_background(index)
             with self.job.timer("prepare", whole=True):
-                self.cache_weights(index)
+                self.job.views.cache_weights(index)
                 target = self.job.view_targets.target(index, scales, background)
                 self._prefetch(own_views[position + 1 :], phase)
                 style = self.job.style_targets(self.job.views.cameras[index])
@@ -280,7 +271,12 @@ class Stylizer:
         tensors = [first, *(result.values.flatten() for result in results)]
         magnitude, *values = torch.cat(tensors).cpu().split([len(tensor) for tensor in tensors])
         if is_too_large(float(magnitude)):
-            raise self._diverged(float(magnitude))
+            raise DivergedError(
+                f"Step {self.step + 1}: the color gradient has grown to {float(magnitude):.3g}, which cannot be "
+                f"optimized; the largest color coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a "
+                f"smaller --learning-rate than {self.job.settings.learning_rate:g}, or look for extreme coefficients "
+                "with `sgsst check`."
+            )
         evaluations = [
             replace(result, values=own.view_as(result.values)).terms
             for result, own in zip(results, values, strict=True)
@@ -291,14 +287,6 @@ class Stylizer:
             evaluations = [terms for part in every for terms in part]
         return mean_evaluation(evaluations)
 
-    def _diverged(self, largest: float) -> DivergedError:
-        return DivergedError(
-            f"Step {self.step + 1}: the color gradient has grown to {largest:.3g}, which cannot be optimized; the "
-            f"largest color coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a smaller "
-            f"--learning-rate than {self.job.settings.learning_rate:g}, or look for extreme coefficients with `sgsst "
-            "check`."
-        )
-
     def _prefetch(self, left: Sequence[int], phase: Phase) -> None:
         """Announce the view that this group processes next, so that its data can be read while the device works.
 
@@ -307,7 +295,6 @@ class Stylizer:
 
         Args:
             left: Remaining views of this group in the present step.
-            phase: Phase of the present step.
         """
         if left:
             index = left[0]
@@ -325,9 +312,7 @@ class Stylizer:
         This does not affect steps, and its time is not recorded.
 
         Args:
-            indices: Indices of the views.
             sh_dc: [n, 3], colors of the rendered Gaussians to evaluate; None for the present ones.
-            show: Callback that receives the number of completed and of all views.
         """
         self._cache_visited()
         values = (self.sh_dc.detach() if sh_dc is None else sh_dc).to(self.sh_dc.device)
@@ -349,14 +334,6 @@ class Stylizer:
             gradient = self.job.gradient(index, self.sh_dc.detach(), style, target, scales)[0]
             return gradient.cpu(), time.perf_counter() - started
 
-    def cache_weights(self, index: int) -> None:
-        """Cache a view's blend weights, if they fit, as its first step does.
-
-        Only steps cache weights. Renders between steps happen at varying times, and must not affect the results of
-        steps.
-        """
-        self.job.views.cache_weights(index)
-
     def _cache_visited(self) -> None:
         """Cache, once after a resume, the blend weights that previous steps cached.
 
@@ -370,7 +347,7 @@ class Stylizer:
             for _ in range(steps):
                 views = [next(order) for _ in range(self.job.settings.views_per_step)]
                 for index in views[self.job.team.own_group :: self.job.team.groups]:
-                    self.cache_weights(index)
+                    self.job.views.cache_weights(index)
 
     def stylized(self) -> Tensor:
         """Return sh_dc [N, 3] float32 of the whole scene on the CPU: optimized colors, and colors of unseen Gaussians.

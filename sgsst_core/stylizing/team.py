@@ -27,13 +27,7 @@ _NETWORK_PARTS = ("vgg_forward", "vgg_backward", "statistics", "matching")
 class Team:
     """Ranks that the plan uses, and the position of this rank among them.
 
-    Args:
-        plan: Plan of the job.
-        settings: Settings of the job.
-        collectives: All available ranks.
-
     Attributes:
-        everybody: Ranks that take part.
         groups: Number of groups that these ranks form; each group processes its own views.
         group: Ranks that process the same views as this one.
 

@@ -28,34 +28,22 @@ def drawn_color(kind: PlannedBackground, seed: int, step: int, view: int, style:
     Args:
         kind: "random" for a uniform color, "palette" for the color of a random style pixel.
         seed: Seed of the job, non-negative.
-        step: Number of completed steps.
-        view: Index of the view's camera.
         style: Image [H, W, 3] in 0..1 on the CPU, or a mixture, from which an image is drawn with probability equal to
             its weight.
     """
     if kind == "background":
         return None
-    red, green, blue = _uniform(seed, step, view)
+    # Three pseudorandom numbers in [0, 1), identical on every machine.
+    digest = hashlib.blake2b(f"{seed},{step},{view}".encode(), digest_size=24).digest()
+    red, green, blue = ((int.from_bytes(digest[at : at + 8], "big") >> 64 - _BITS) / 2**_BITS for at in (0, 8, 16))
     if kind == "palette":
-        pixels = _drawn_image(style, green).reshape(-1, 3)
+        index, left = 0, green - style.weights[0]
+        while left >= 0 and index + 1 < len(style.images):  # the sum of the weights may be rounded down
+            index += 1
+            left -= style.weights[index]
+        pixels = style.images[index].reshape(-1, 3)
         red, green, blue = pixels[int(red * len(pixels))].tolist()
     return red, green, blue
-
-
-def _drawn_image(style: Style, number: float) -> Tensor:
-    """Return the image of a mixture that a random number in [0, 1) selects, with probabilities equal to the weights."""
-    for image, weight in zip(style.images, style.weights, strict=True):
-        number -= weight
-        if number < 0:
-            return image
-    return style.images[-1]  # the sum of the weights may be rounded down
-
-
-def _uniform(*numbers: int) -> Color:
-    """Return three pseudorandom numbers in [0, 1), identical for the same arguments on every machine."""
-    digest = hashlib.blake2b(",".join(map(str, numbers)).encode(), digest_size=24).digest()
-    first, second, third = (int.from_bytes(digest[index : index + 8], "big") >> 64 - _BITS for index in (0, 8, 16))
-    return first / 2**_BITS, second / 2**_BITS, third / 2**_BITS
 
 
 def replace_background(image: Tensor, coverage: Tensor, color: Sequence[float], present: Sequence[float]) -> Tensor:

@@ -26,9 +26,6 @@ class ViewColors:
     """Function that computes a view's colors; their part from higher SH degrees never changes, and is cached.
 
     Args:
-        scene: Scene that provides this part.
-        cameras: One camera per view.
-        device: Device of the colors.
         memory: Memory budget of the cache in bytes.
     """
 
@@ -52,8 +49,6 @@ class Views:
 
     Args:
         scene: Scene that provides the frozen part of the colors.
-        cameras: One camera per view.
-        rasterizer: Rasterizer of the views.
         covered: Indices of the views that see anything.
         memory: See `limit`.
         clamp_aware_gradient: Whether to use the clamp-aware gradient (`view_colors_gradient`).
@@ -112,7 +107,6 @@ class Views:
         """Return the image of a view; with several ranks, of the rectangle [h, w, 3] that this rank renders.
 
         Args:
-            index: Index of the view.
             colors: [N, 3], colors of the view.
             rasterizer: Replacement for the views' own rasterizer.
         """
@@ -168,7 +162,6 @@ class Views:
         """Return dL/dsh_dc [N, 3].
 
         Args:
-            index: Index of the view.
             image_gradient: [h, w, 3], this rank's summand of dL/dimage in the rectangle that it renders.
             colors: [N, 3], colors that were rendered.
         """
@@ -182,7 +175,10 @@ class Views:
         return view_colors_gradient(gradient, colors, clamp_aware_gradient=self.clamp_aware_gradient)
 
     def cache_weights(self, index: int) -> None:
-        """Cache the blend weights of this rank's rectangle of a view, if the rasterizer supports it and they fit."""
+        """Cache the blend weights of this rank's rectangle of a view, if the rasterizer supports it and they fit.
+
+        Only steps do so: renders between steps happen at varying times, and must not affect the results of steps.
+        """
         camera = self._own_camera(index)
         if camera is not None:
             self.rasterizer.cache_weights(camera)

@@ -102,7 +102,7 @@ def test_steady_step_synchronizes_once_and_copies_scalars(
     """The first step of a view has one more wait, because it builds the tile intersections."""
     settings: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 4, "position_weights": "on" if scan else "off"}
     stylizer = prepare(request_(tmp_path, scan=scan, gray=gray, size=(64, 48), **settings)).stylizer
-    assert stylizer.job.scale_count(0) == 3
+    assert len(stylizer.job.scales(0)) == 3
     assert stylizer.job.plan.weighted == scan
     seen: set[int] = set()
     for _ in range(stylizer.job.total_steps):
@@ -154,7 +154,7 @@ def test_step_launches_fewer_than_500_kernels(counts: Counts, scan: bool) -> Non
     scene = ball(60) if scan else wall(14, 11, sh_degree=1)
     weights = networks.comparing_pixels(networks.tiny_weights("vgg19"))
     stylizer = Stylizer.planned(scene, cameras(1, 64, 64), style(), settings, weights=weights)
-    assert stylizer.job.scale_count(0) == 3
+    assert len(stylizer.job.scales(0)) == 3
     for _ in range(2):
         counts.clear()
         stylizer.run_step()

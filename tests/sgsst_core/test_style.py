@@ -1,6 +1,7 @@
 """Tests of mixing several style images into one style, and of images that callers pass as arrays."""
 
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from PIL import Image
 
 from sgsst_core.errors import ImageError, SettingsError
-from sgsst_core.features.statistics import layer_statistics_reference, merge_all
+from sgsst_core.features.statistics import layer_statistics_reference, merge
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.files.images import load_image
 from sgsst_core.loss.nearest import MAX_VECTORS, positions_per_image
@@ -38,7 +39,7 @@ def test_mixture_has_the_moments_of_all_positions():
     parts = [features(1, 40), features(2, 10, offset=0.3)]
     statistics = [layer_statistics_reference(part) for part in parts]
     mixed = LayerTarget.mixed([LayerTarget.of(part) for part in statistics], normalized([4, 1]))
-    assert_same(mixed, LayerTarget.of(merge_all(statistics)), rtol=1e-12, atol=1e-14)
+    assert_same(mixed, LayerTarget.of(reduce(merge, statistics)), rtol=1e-12, atol=1e-14)
 
 
 def test_mixture_is_precise_at_large_means():

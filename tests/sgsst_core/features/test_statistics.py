@@ -1,3 +1,4 @@
+from functools import reduce
 from itertools import pairwise
 
 import pytest
@@ -12,7 +13,6 @@ from sgsst_core.features.statistics import (
     layer_statistics,
     layer_statistics_reference,
     merge,
-    merge_all,
 )
 
 
@@ -45,7 +45,7 @@ def test_merge_does_not_depend_on_the_division(cuts, weighted):
     a = torch.rand(x.shape[:2], dtype=torch.float64) if weighted else None
     edges = [0, *sorted(cuts), 40]
     parts = [layer_statistics(x[top:bottom], None if a is None else a[top:bottom]) for top, bottom in pairwise(edges)]
-    assert_equal(merge_all(parts), layer_statistics_reference(x, a), 1e-11)
+    assert_equal(reduce(merge, parts), layer_statistics_reference(x, a), 1e-11)
 
 
 def test_standard_deviation_survives_large_means():

@@ -214,7 +214,7 @@ def test_only_the_protected_region_stays_near_its_content(
 
 def test_float32_reference_has_the_same_content_weights(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, protected(), warm_start=False)
-    scales = list(range(stylizer.job.scale_count(0)))
+    scales = stylizer.job.scales(0)
     colors = torch.roll(wall().sh_dc, 1, dims=0)
     with stylizer.with_colors(colors):
         own = stylizer.gradient(0, scales)[0]

@@ -78,7 +78,7 @@ def test_gradient_is_the_derivative_by_luminance(tiny_weights: BackboneWeights) 
     scene, view = wall(), cameras(1)[0]
     settings = make_settings(preserve_colors="luminance", coarsest_side=24, steps_coarse=0, clamp_aware_gradient=False)
     stylizer = Stylizer.planned(scene, [view], style(), settings, weights=tiny_weights)
-    actual, _ = stylizer.gradient(0, range(stylizer.job.scale_count(0)))
+    actual, _ = stylizer.gradient(0, stylizer.job.scales(0))
 
     rasterizer = ReferenceRasterizer(scene)
     colors = (COLOR_OFFSET + SH_C0 * scene.sh_dc.double()).clamp_min(0)

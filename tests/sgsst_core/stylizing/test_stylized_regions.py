@@ -178,7 +178,7 @@ def test_names_and_order_of_disjoint_regions_do_not_matter(tiny_weights: Backbon
     gradients = []
     for regions in (one, two):
         stylizer = make(tiny_weights, scene, regions)
-        gradients.append(stylizer.gradient(0, range(stylizer.job.scale_count(0)))[0])
+        gradients.append(stylizer.gradient(0, stylizer.job.scales(0))[0])
     assert relative_error(gradients[1], gradients[0]) < 1e-6
 
 
@@ -242,7 +242,7 @@ def test_float32_reference_has_the_same_regions(tiny_weights: BackboneWeights) -
     scene = wall()
     stylizer = make(tiny_weights, scene, halves(scene), warm_start=False)
     reference = Float32Reference(stylizer)
-    scales = list(range(stylizer.job.scale_count(0)))
+    scales = stylizer.job.scales(0)
     own, exact = stylizer.gradient(0, scales)[0], reference.gradient(0, scene.sh_dc, scales)[0]
     assert relative_error(own, exact[stylizer.job.plan.seen]) < 1e-6
 

@@ -275,7 +275,7 @@ def mean_gradient_by_hand(views: list[int]) -> Tensor:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40)
     stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
-    gradients = [stylizer.gradient(view, range(stylizer.job.scale_count(view)))[0] for view in views]
+    gradients = [stylizer.gradient(view, stylizer.job.scales(view))[0] for view in views]
     return torch.stack(gradients).mean(dim=0)
 
 

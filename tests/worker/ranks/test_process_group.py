@@ -154,7 +154,7 @@ def test_merged_statistics_match_one_rank(empty: int | None) -> None:
 
 def test_merged_empty_statistics_are_empty() -> None:
     for statistics in on_ranks(2, merge_empty):
-        assert statistics.empty
+        assert not float(statistics.count)
         assert not statistics.centered.any()
 
 

@@ -31,7 +31,7 @@ def gradient(collectives: Collectives, name: str) -> Tensor:
     stylizer = Stylizer.planned(
         scene, cameras(1, 320, 240), style(), settings, weights=load_network_weights("vgg16"), collectives=collectives
     )
-    return stylizer.gradient(0, range(stylizer.job.scale_count(0)))[0]
+    return stylizer.gradient(0, stylizer.job.scales(0))[0]
 
 
 @pytest.fixture

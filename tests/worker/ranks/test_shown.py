@@ -167,7 +167,7 @@ def run_two_steps(collectives: Collectives) -> dict[str, Any]:
     settings = make_settings("standard", steps_coarse=0, steps_sos=4, coarsest_side=40, rebalance=False)
     camera = cameras(1, WIDTH, HEIGHT)
     stylizer = Stylizer.planned(wall(), camera, style(), settings, weights=tiny_weights(), collectives=collectives)
-    scales = stylizer.job.scale_count(0)
+    scales = len(stylizer.job.scales(0))
     return {
         "steps": [stylizer.run_step().sent for _ in range(2)],
         "scales": scales,
