@@ -98,15 +98,15 @@ def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
         return torch.zeros((0, 3))
     count = min(NEIGHBORS, int(seen.sum()))
     tree = cKDTree(means[seen].double().numpy())
-    weights, change, positions = weights[seen], change[seen], means[~seen]
+    weights, change, positions = weights[seen], change[seen], means[~seen].double()
     votes = torch.empty((len(positions), 3))
     # Ordered by the cells of a coarse grid: consecutive searches then read the same part of the tree.
-    lowest = positions.double().amin(dim=0)
-    size = (positions.double().amax(dim=0) - lowest).clamp_min(1e-300)
-    x, y, z = ((positions.double() - lowest) / size * (_CELLS - 1)).long().unbind(1)
+    lowest = positions.amin(dim=0)
+    size = (positions.amax(dim=0) - lowest).clamp_min(1e-300)
+    x, y, z = ((positions - lowest) / size * (_CELLS - 1)).long().unbind(1)
     for part in torch.argsort((x * _CELLS + y) * _CELLS + z, stable=True).split(_CHUNK):
-        _, found = tree.query(positions[part].double().numpy(), k=count, workers=torch.get_num_threads())
-        nearest = torch.as_tensor(found).reshape(-1, count)
+        _, indices = tree.query(positions[part].numpy(), k=count, workers=torch.get_num_threads())
+        nearest = torch.as_tensor(indices).reshape(-1, count)
         own = weights[nearest]
         fraction = own / own.amax(dim=1, keepdim=True)  # so that tiny weights do not underflow
         sums = (change[nearest].double() * fraction[:, :, None]).sum(dim=1)
