@@ -18,6 +18,11 @@ _FIRST_BYTES = 8 * sum(c + 1 for c in _STYLE_CHANNELS)
 _SECOND_BYTES = 8 * sum(c * (c + 1) // 2 for c in _STYLE_CHANNELS)
 
 
+def loads(division: Sequence[Sequence[Piece]], halo: int) -> list[int]:
+    """Return the number of pixels that each rank passes through the network."""
+    return [sum(piece.cost(halo) for piece in own) for own in division]
+
+
 @dataclass(frozen=True)
 class Link:
     """Connection between ranks.

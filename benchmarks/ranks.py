@@ -19,12 +19,13 @@ from typing import Any
 import torch
 
 from benchmarks.inputs import input_parser, read_inputs, with_size
+from benchmarks.iteration_work import loads
 from benchmarks.machine import free_address, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import peak_memory
 from sgsst_core.features.partition import Rectangle, computed_twice
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.parallel.division import Piece, divide, loads
+from sgsst_core.parallel.division import Piece, divide
 from sgsst_core.scene.camera import Camera
 from worker.ranks.process_group import process_group
 

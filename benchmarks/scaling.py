@@ -16,11 +16,11 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from benchmarks.forecast import DEVICES, JOBS, LAUNCHES, LOSS_LAUNCHES, SHARES, Job, Part, step_parts
-from benchmarks.iteration_work import IterationWork, Link, proportional
+from benchmarks.iteration_work import IterationWork, Link, loads, proportional
 from benchmarks.machine import write_result
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO
-from sgsst_core.parallel.division import Piece, divide, loads
+from sgsst_core.parallel.division import Piece, divide
 from sgsst_core.scene.pyramid import scale_count
 
 RANKS = (1, 2, 4, 8, 16, 32, 64)

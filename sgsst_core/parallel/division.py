@@ -241,8 +241,3 @@ def rounds(scales: Sequence[int], ranks: int) -> list[list[int]]:
     would wait for each other.
     """
     return [[scale] for scale in scales] if ranks == 1 else [list(scales)]
-
-
-def loads(fractions: Sequence[Sequence[Piece]], halo: int) -> list[int]:
-    """Return the number of pixels that each rank passes through the network."""
-    return [sum(piece.cost(halo) for piece in fraction) for fraction in fractions]

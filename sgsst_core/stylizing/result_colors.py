@@ -119,13 +119,8 @@ def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, r
 
     If a region has no optimized Gaussians, neighbors in all regions count. The change of frozen Gaussians is 0.
 
-    Args:
-        means: [N, 3], see `neighbors_change`.
-        change: [N, 3], see `neighbors_change`.
-        weights: [N] float64, total blend weights of the optimized Gaussians; 0 for all others.
-
-    Returns:
-        [N, 3].
+    Arguments are as in `neighbors_change`, but all weights other than those of optimized Gaussians are 0. The result is
+    [N, 3].
     """
     result = torch.zeros_like(change)
     for region in regions.labels[~regions.frozen].unique().tolist():

@@ -74,12 +74,7 @@ def with_moments(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
 def in_colors_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
     """Match the mean and covariance of a style's colors to those of a scene, the inverse of `with_moments`.
 
-    Several images are mapped together, by the moments of their mixture.
-
-    Args:
-        style: Images [H, W, 3] in 0..1.
-        sh_dc: [N, 3], see `warm_start`.
-        weights: [N] float64, see `warm_start`.
+    Several images are mapped together, by the moments of their mixture. Arguments are as in `warm_start`.
     """
     colors = (COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)
     wanted_mean, wanted = color_moments(colors, weights.double() / weights.double().amax())
@@ -110,12 +105,7 @@ def luminance_start(sh_dc: Tensor, weights: Tensor, style: Style) -> Tensor:
 def in_luminance_of(style: Style, sh_dc: Tensor, weights: Tensor) -> Style:
     """Convert a style to gray, and match the mean and deviation of its luminance to those of a scene.
 
-    Several images are mapped together, by the moments of their mixture.
-
-    Args:
-        style: Images [H, W, 3] in 0..1.
-        sh_dc: [N, 3], see `warm_start`.
-        weights: [N] float64, see `warm_start`.
+    Several images are mapped together, by the moments of their mixture. Arguments are as in `warm_start`.
     """
     wanted = _luminance_moments(luminance((COLOR_OFFSET + SH_C0 * sh_dc.double()).clamp(0, 1)), weights.double())
     own = _style_luminance(style)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import pytest
 import torch
@@ -10,13 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.parallel.division import Piece, Shares, divide, loads, rounds
+from sgsst_core.parallel.division import Piece, Shares, divide, rounds
 
 HALO = 64
 
 
 def view(height: int, width: int, scales: int) -> tuple[Piece, ...]:
     return tuple(Piece(s, (height >> s, width >> s), Rectangle(0, 0, height >> s, width >> s)) for s in range(scales))
+
+
+def loads(division: Sequence[Sequence[Piece]], halo: int) -> list[int]:
+    """Return the number of pixels that each rank passes through the network."""
+    return [sum(piece.cost(halo) for piece in own) for own in division]
 
 
 @settings(max_examples=60, deadline=None)
