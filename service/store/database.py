@@ -177,7 +177,7 @@ class Database:
         try:
             with translated(), self._upgrading(engine):
                 if not self.is_up_to_date():
-                    _migrate(engine)
+                    self._migrate(engine)
         finally:
             engine.dispose()
 
@@ -211,6 +211,20 @@ class Database:
         except DBAPIError:  # a new database
             return None
 
+    def _migrate(self, engine: Engine) -> None:
+        """Create the tables of this version in a new database; otherwise migrate those of an earlier version."""
+        from alembic import command
+        from alembic.config import Config
+
+        config = Config()
+        config.set_main_option("script_location", str(MIGRATIONS))
+        config.attributes["engine"] = engine
+        if self._version() is None:
+            Base.metadata.create_all(engine.execution_options(sgsst_writes=True))
+            command.stamp(config, "head")
+        else:
+            command.upgrade(config, "head")
+
     @contextmanager
     def _upgrading(self, engine: Engine) -> Iterator[None]:
         if self.sqlite and self.url.database:
@@ -226,16 +240,6 @@ class Database:
                     yield
                 finally:
                     connection.execute(text("SELECT pg_advisory_unlock(:lock)"), {"lock": _LOCK})
-
-
-def _migrate(engine: Engine) -> None:
-    from alembic import command
-    from alembic.config import Config
-
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS))
-    config.attributes["engine"] = engine
-    command.upgrade(config, "head")
 
 
 def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:
