@@ -34,25 +34,22 @@ def local_path(text: str) -> Path:
     return path
 
 
-def file_to_write(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
-    """Check the file that an option names, before the command reads anything; see `check_file`."""
-    return _checked(check_file, parameter, path)
+def _checking(check: Callable[[Path], None]) -> Callable[[typer.CallbackParam, Path | None], Path | None]:
+    """Return the callback of an option that names a path to write; the message of an error names the option."""
+
+    def checked(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
+        try:
+            if path is not None:
+                check(path)
+        except OutputError as error:
+            raise OutputError(f"{parameter.metavar or parameter.opts[0]}: {error}") from error
+        return path
+
+    return checked
 
 
-def folder_to_write(parameter: typer.CallbackParam, path: Path | None) -> Path | None:
-    """Check the folder that an option names, before the command reads anything; see `check_folder`."""
-    return _checked(check_folder, parameter, path)
-
-
-def _checked(check: Callable[[Path], None], parameter: typer.CallbackParam, path: Path | None) -> Path | None:
-    """Check a path to write; the message names the option."""
-    try:
-        if path is not None:
-            check(path)
-    except OutputError as error:
-        raise OutputError(f"{parameter.metavar or parameter.opts[0]}: {error}") from error
-    return path
-
+#: Callbacks that check the file or the folder that an option names, before the command reads anything.
+file_to_write, folder_to_write = _checking(check_file), _checking(check_folder)
 
 _SCENE: dict[str, Any] = {"metavar": "SCENE", "help": f"3DGS scene: {SUFFIXES}.", "show_default": False}
 _CAMERAS: dict[str, Any] = {
@@ -115,9 +112,7 @@ class JobInputs:
     region_weight: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=WEIGHT",
-            help="Weight of a region's style in the loss. [default: 1]",
-            rich_help_panel=REGIONS,
+            metavar="NAME=WEIGHT", help="Weight of a region's style in the loss. [default: 1]", rich_help_panel=REGIONS
         ),
     ] = None
     region_freeze: Annotated[

@@ -32,8 +32,6 @@ class VariantsRequest:
     """Request of `sgsst bench error-time` or `sgsst bench quality`.
 
     Attributes:
-        source: Scene and cameras.
-        style: Style image.
         out: Folder for table, plot, JSON and scenes.
         variants: Names of variants; empty for all.
         seconds: Seconds of optimization per variant.
@@ -151,15 +149,7 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 def quality_table(quality: Quality) -> Table:
     """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
     figures = ("style", "interior_style", "sliced_features", "color_distance", "content", "features")
-    columns = (
-        *figures,
-        "background_sensitivity",
-        "saturated",
-        "short RMSE",
-        "long RMSE",
-        "remaining loss",
-        "steps",
-    )
+    columns = (*figures, "background_sensitivity", "saturated", "short RMSE", "long RMSE", "remaining loss", "steps")
     table = Table(
         Column("", no_wrap=True),
         *columns,

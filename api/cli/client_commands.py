@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -28,23 +27,17 @@ from api.cli.console import (
 )
 from api.cli.options import with_arguments, with_options
 from api.client.inputs import different_names, path_or_url
+from service.files.cache import file_digest
 from service.parameters import JobParameters
 from service.states import ACTIONS, STEPPING, Transition
 from sgsst_core.errors import OutputError, SettingsError
-from sgsst_core.files.formats import (
-    EXTRA_FORMATS,
-    RESULT_SUFFIXES,
-    ExtraName,
-    by_name,
-    format_of_name,
-    result_name,
-)
+from sgsst_core.files.formats import EXTRA_FORMATS, RESULT_SUFFIXES, ExtraName, by_name, format_of_name, result_name
 from sgsst_core.number_format import duration
 from sgsst_core.progress import Progress
 from sgsst_core.stylizing.progress_bar import live_bar, set_total
 from worker.options import ESSENTIALS
 from worker.outputs import check_file, check_folder, check_is_not_input, result_format
-from worker.region_requests import RegionOptions, RegionRequest, region_requests
+from worker.region_requests import RegionOptions, region_requests
 from worker.styles import parse_styles, split_weight
 
 if TYPE_CHECKING:
@@ -90,8 +83,8 @@ def submit(
     if out is not None:
         result_format(out)
         check_is_not_input(out, Path(inputs.scene))
-    styles, settings = _styles_and_parameters(inputs, options, parameters)
-    files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": _masks(inputs.regions)}
+    styles, masks, settings = _styles_masks_and_parameters(inputs, options, parameters)
+    files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": masks}
     with _client(url, key) as client:
         if dry_run:
             with _sending_and_planning() as (progress, planning):
@@ -110,10 +103,10 @@ def submit(
         _conclude(client, _follow(client, job.id, as_json), out, as_json)
 
 
-def _styles_and_parameters(
+def _styles_masks_and_parameters(
     inputs: JobInputs, options: JobParameters, parameters: str
-) -> tuple[list[Path | str], dict[str, Any]]:
-    """Return the style images to send or their URLs, those of regions last, and the parameters of the job."""
+) -> tuple[list[Path | str], dict[str, Path], dict[str, Any]]:
+    """Return the style images to send or their URLs, those of regions last, the masks, and the job's parameters."""
     values = options.model_dump(mode="json", exclude_unset=True)
     styles = parse_styles(inputs.style)
     if len(styles) > 1:
@@ -123,38 +116,32 @@ def _styles_and_parameters(
     if urls := [text for region in regions for text in region.style_texts if isinstance(path_or_url(text), str)]:
         raise SettingsError(f"--region-style {urls[0]}: cannot be a URL. Download the image, and give its path.")
     of_regions = [file.path for region in region_requests(regions) for file in region.styles]
+    masks: dict[str, Path] = {}
     if regions:
         local = [image for image in images if isinstance(image, Path)]
-        values["regions"] = _regions_to_send(regions, different_names([*local, *of_regions])[len(local) :])
-    return [*images, *of_regions], values | _parse_parameters(parameters)
+        names = different_names([*local, *of_regions])[len(local) :]
+        values["regions"], masks = _regions_to_send(regions, names)
+    return [*images, *of_regions], masks, values | _parse_parameters(parameters)
 
 
-def _masks(regions: Sequence[RegionOptions]) -> dict[str, Path]:
-    """Return the mask file or folder of each region that has one, by the name under which it is sent."""
-    numbered = enumerate(region_requests(regions))
-    return {_mask_name(i, each): each.selection.path for i, each in numbered if each.selection and each.selection.path}
-
-
-def _mask_name(number: int, region: RegionRequest) -> str:
-    """Return the name under which the mask of a region is sent; its suffix determines the format."""
-    suffix = region.selection.path.suffix if region.selection and region.selection.path else ""
-    return f"region_{number}{suffix}"
-
-
-def _regions_to_send(regions: Sequence[RegionOptions], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return regions as JSON objects for the API.
+def _regions_to_send(
+    regions: Sequence[RegionOptions], names: Sequence[str]
+) -> tuple[list[dict[str, Any]], dict[str, Path]]:
+    """Return regions as JSON objects for the API, and their mask files or folders by the names of these there.
 
     Args:
         names: Names under which the style images of the regions are sent, in the order of `region_requests`.
     """
     objects = {region.name: region.model_dump(mode="json", exclude_defaults=True) for region in regions}
-    unused_names = iter(names)
+    unused_names, masks = iter(names), {}
     for number, request in enumerate(region_requests(regions)):
         if request.selection and request.selection.path:
-            objects[request.name]["select"] = f"{request.selection.kind}={_mask_name(number, request)}"
+            name = f"region_{number}{request.selection.path.suffix}"  # the suffix determines the format
+            objects[request.name]["select"] = f"{request.selection.kind}={name}"
+            masks[name] = request.selection.path
         if request.styles:
             objects[request.name]["style"] = [f"{next(unused_names)}:{file.weight!r}" for file in request.styles]
-    return list(objects.values())
+    return list(objects.values()), masks
 
 
 def status(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
@@ -251,15 +238,10 @@ def _check_target(target: Path, sha256: str | None) -> None:
     Args:
         sha256: SHA-256 of the artifact; None if it does not exist yet.
     """
-    if target.is_file() and sha256 != _sha256(target):
+    if target.is_file() and sha256 != file_digest(target):
         raise OutputError(
             f"{target}: exists, and is not this job's file. Write to another file with --out, or pass --overwrite."
         )
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _command_of(action: Transition) -> Callable[..., None]:

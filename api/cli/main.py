@@ -109,21 +109,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _UsageError as error:
         error.message = error.message.removeprefix("Value error, ")  # typer validates words with pydantic
         if "--json" in arguments:
-            _print_json("usage", error.format_message())
+            _print_error(arguments, "usage", error.format_message())
         else:
             error.show()
         return BAD_INPUT
     except SgsstError as error:
-        if "--json" in arguments:
-            _print_json(error.code, str(error), getattr(error, "problem", None))
-        else:
-            error_console.print(f"error: {error}")
-        return _exit_code(error)
+        _print_error(arguments, error.code, str(error), getattr(error, "problem", None))
+        usual = BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE
+        return {404: NOT_FOUND, 409: CONFLICT}.get(getattr(error, "status", 0), usual)  # status of a response
     except ModuleNotFoundError as error:
         problem = _missing_extra(error)
         if problem is None:
             raise
-        error_console.print(f"error: {problem}")
+        _print_error(arguments, "missing-extra", problem)
         return BAD_INPUT
     except (KeyboardInterrupt, typer.Abort):
         error_console.print("Aborted. Output files are complete or were not written.")
@@ -136,10 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         where = error.filename or "The standard output or a temporary file"
         problem = f"{where}: {error.strerror}. {'Free some space' if full else 'Check the path'}."
-        if "--json" in arguments:
-            _print_json("path", problem)
-        else:
-            error_console.print(f"error: {problem}")
+        _print_error(arguments, "path", problem)
         return BAD_INPUT
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
@@ -177,15 +172,12 @@ def _format_warning(
     return _formatted(message, category, filename, lineno, line)
 
 
-def _exit_code(error: SgsstError) -> int:
-    """Return the exit code for an expected error; `status` is that of a service's response."""
-    codes = {404: NOT_FOUND, 409: CONFLICT}
-    return codes.get(getattr(error, "status", 0), BAD_INPUT if isinstance(error, InvalidInputError) else FAILURE)
-
-
-def _print_json(code: str, detail: str, problem: Mapping[str, object] | None = None) -> None:
-    """Print an error as a line of JSON on stderr, with the fields of a problem document."""
-    print(json.dumps({"code": code, "detail": detail, **(problem or {})}), file=sys.stderr)
+def _print_error(arguments: Sequence[str], code: str, detail: str, problem: Mapping[str, object] | None = None) -> None:
+    """Print an error on stderr; with --json, as a line of JSON with the fields of a problem document."""
+    if "--json" in arguments:
+        print(json.dumps({"code": code, "detail": detail, **(problem or {})}), file=sys.stderr)
+    else:
+        error_console.print(f"error: {detail}")
 
 
 if __name__ == "__main__":

@@ -134,7 +134,11 @@ class Tools:
             artifacts = await self._client.artifacts(job_id)
             path = await self._write(job_id, _RESULT, out, _format(out)) if out else None
             preview = job.data["preview"]
-            image = await self._image(job_id, preview) if preview else None
+            image = None
+            if preview:
+                with tempfile.TemporaryDirectory() as folder:
+                    file = await self._client.download(job_id, Path(folder) / "preview.jpg", preview)
+                    image = Image(data=await anyio.to_thread.run_sync(file.read_bytes), format="jpeg")
         urls = {each["name"]: self._address(job_id, each["name"]) for each in artifacts}
         result = Result(job_id=job_id, status=job.status, urls=urls, path=path)
         text = TextContent(type="text", text=result.model_dump_json())
@@ -178,12 +182,6 @@ class Tools:
         """Download an artifact to a new file, and return the file's absolute path."""
         target = await anyio.to_thread.run_sync(_new_file, out)
         return str(await self._client.download(job_id, target, name, format=None if format == PLY.name else format))
-
-    async def _image(self, job_id: str, name: str) -> Image:
-        """Download a preview image."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = await self._client.download(job_id, Path(folder) / "preview.jpg", name)
-            return Image(data=await anyio.to_thread.run_sync(path.read_bytes), format="jpeg")
 
 
 def _new_file(out: str) -> Path:

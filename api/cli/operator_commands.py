@@ -37,11 +37,11 @@ def serve(
     data: DataOption = None,
 ) -> None:
     """Run the service on this machine: HTTP API and dispatcher. Environment variables SGSST_... configure it."""
-    chosen = {"SGSST_HOST": host, "SGSST_PORT": port, "SGSST_DATA": data.absolute() if data else None}
+    chosen = {"SGSST_HOST": host, "SGSST_PORT": port}
     os.environ.update({name: str(value) for name, value in chosen.items() if value is not None})
     from api.cli.supervisor import serve as run
 
-    run(_service_settings(), error_console.print)
+    run(_service_settings(data), error_console.print)
 
 
 def fsck(
@@ -61,11 +61,16 @@ def fsck(
     Exit code: 0 if nothing was found, else the sum of 4 (missing files), 8 (damaged), 16 (orphaned) and 32 (the
     database was rolled back).
     """
-    _check_database_exists(data)
-    store = _open_store(data)
-    from service.fsck import FileCheck
+    from sqlalchemy.engine import make_url
 
-    check, findings = FileCheck(_service_settings(), store), []
+    from service.fsck import FileCheck
+    from sgsst_core.errors import SettingsError
+
+    url = make_url(_service_settings(data).database_url)
+    if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():  # which opening would create
+        raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
+    store = _open_store(data)
+    check, findings = FileCheck(_service_settings(data), store), []
     for finding in check.findings(mend=mend):
         findings.append(finding)
         if not as_json:
@@ -82,19 +87,6 @@ def fsck(
     code = sum(_FSCK_CODES[kind] for kind in set(kinds)) + (_FSCK_ROLLED_BACK if store.database.rolled_back else 0)
     store.close()
     raise typer.Exit(code)
-
-
-def _check_database_exists(data: Path | None) -> None:
-    """Raise a SettingsError if the folder has no SQLite database, because opening it would create an empty one."""
-    from sqlalchemy.engine import make_url
-
-    from sgsst_core.errors import SettingsError
-
-    if data is not None:
-        os.environ["SGSST_DATA"] = str(data.absolute())
-    url = make_url(_service_settings().database_url)
-    if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():
-        raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
 
 
 @keys_app.command("create")
@@ -159,13 +151,16 @@ def revoke_key(
 COMMANDS = (serve, fsck)
 
 
-def _service_settings() -> ServiceSettings:
+def _service_settings(data: Path | None) -> ServiceSettings:
+    """Return the settings from the environment, to which a data folder is added for other processes."""
     from pydantic import ValidationError
 
     from service.settings import ServiceSettings
     from sgsst_core.errors import SettingsError
     from sgsst_core.options import reason
 
+    if data is not None:
+        os.environ["SGSST_DATA"] = str(data.absolute())
     try:
         return ServiceSettings()
     except ValidationError as error:
@@ -175,11 +170,9 @@ def _service_settings() -> ServiceSettings:
 
 
 def _open_store(data: Path | None) -> Store:
-    if data is not None:
-        os.environ["SGSST_DATA"] = str(data.absolute())
     from service.startup import keep_private
     from service.store import open_store
 
-    settings = _service_settings()
+    settings = _service_settings(data)
     keep_private(settings)
     return open_store(settings)

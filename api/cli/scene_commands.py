@@ -31,8 +31,6 @@ from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
     from sgsst_core.planning.plan import Plan
-    from sgsst_core.settings import Color
-    from worker.job import SceneRequest
     from worker.video import VideoRequest
 
 #: Number of frames after which the time of a video is estimated.
@@ -44,8 +42,7 @@ _TIMED_FRAMES = 6
 def plan(
     inputs: JobInputs,
     out: Annotated[
-        Path,
-        typer.Option(help="JSON file to write the plan to.", callback=file_to_write, rich_help_panel=ESSENTIALS),
+        Path, typer.Option(help="JSON file to write the plan to.", callback=file_to_write, rich_help_panel=ESSENTIALS)
     ] = Path("plan.json"),
     sheet: Annotated[
         Path | None, typer.Option(help="JPEG file to write with images of the views.", callback=file_to_write)
@@ -84,11 +81,7 @@ def _decisions_table(plan: Plan) -> Table:
 
 @with_options(ViewOptions, without=("drop_invalid",))
 def check(
-    scene: SceneArgument,
-    cameras: CamerasOption = None,
-    style: OptionalStyleOption = None,
-    *,
-    options: ViewOptions,
+    scene: SceneArgument, cameras: CamerasOption = None, style: OptionalStyleOption = None, *, options: ViewOptions
 ) -> None:
     """Report extreme values in a scene, its views and its style, and their consequences."""
     from api.cli.scene_tools import look_for_extremes
@@ -152,15 +145,11 @@ def render(
     elif given:
         raise SettingsError(f"--{given[0]} requires --video. Add it, or omit --{given[0]}.")
     elif out is not None:
-        _render_views(source, background, out)
+        from api.cli.scene_tools import render_views
 
-
-def _render_views(source: SceneRequest, background: Color, out: Path) -> None:
-    from api.cli.scene_tools import render_views
-
-    with _frame_bar() as progress:
-        paths = render_views(source, background, out, progress, _print_warning)
-    out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
+        with _frame_bar() as progress:
+            paths = render_views(source, background, out, progress, _print_warning)
+        out_console.print(f"{len(paths)} view{'s' if len(paths) > 1 else ''} in {out}")
 
 
 def _render_video(request: VideoRequest) -> None:

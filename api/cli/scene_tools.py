@@ -125,9 +125,7 @@ def render_views(
     """Render every view into a folder as PNG, numbered in the order of the cameras. All inputs are checked first.
 
     Args:
-        source: Scene and cameras.
         background: Background color, in 0..1.
-        out: Folder of the images.
         progress: Callback that receives the numbers of completed and of all images.
         warn: Callback for warnings about scene and cameras.
 
@@ -253,9 +251,7 @@ def blend_files(texts: Sequence[str], out: Path, *, drop_invalid: bool, spz_axes
 
     Args:
         texts: FILE or FILE:WEIGHT of each scene.
-        out: Scene file to write.
         drop_invalid: Whether to drop invalid Gaussians; see `read_scene`.
-        spz_axes: Axes of SPZ files.
 
     Raises:
         InvalidInputError: If the weights, a scene or the output cannot be used.

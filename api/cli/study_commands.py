@@ -23,8 +23,7 @@ study_app = typer.Typer(help="Blind comparisons of results by eye.", no_args_is_
 @with_options(StylizeOptions, "chosen", only=("background",))
 def make(
     variants: Annotated[
-        list[str],
-        typer.Argument(metavar="[NAME=]SCENE...", help="Two to four scenes to compare.", show_default=False),
+        list[str], typer.Argument(metavar="[NAME=]SCENE...", help="Two to four scenes to compare.", show_default=False)
     ],
     style: StyleOption,
     out: Annotated[Path, typer.Option(help="HTML page to write.", callback=file_to_write)] = Path("study.html"),

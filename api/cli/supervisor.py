@@ -9,8 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from types import FrameType
+from dataclasses import dataclass
 
 from service.optional import missing_extras
 from service.settings import ServiceSettings
@@ -43,7 +42,7 @@ class _Child:
     process: subprocess.Popen[bytes] | None = None
     started: float = 0.0
     wait: float = 0.0
-    not_before: float = field(default=0.0)
+    not_before: float = 0.0
 
     def start(self) -> None:
         """Start the process. It dies with this process, and does not receive Ctrl-C from the terminal."""
@@ -97,7 +96,8 @@ def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
             )
         for line in missing_extras():
             announce(line)
-        _run([api, dispatcher], settings, announce, _address(settings, listener))
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        _run([api, dispatcher], settings, announce, f"http://{host}:{listener.getsockname()[1]}")
 
 
 def _listen(settings: ServiceSettings) -> socket.socket:
@@ -115,19 +115,10 @@ def _listen(settings: ServiceSettings) -> socket.socket:
     return listener
 
 
-def _address(settings: ServiceSettings, listener: socket.socket) -> str:
-    host = f"[{settings.host}]" if ":" in settings.host else settings.host
-    return f"http://{host}:{listener.getsockname()[1]}"
-
-
 def _run(children: list[_Child], settings: ServiceSettings, announce: Callable[[str], None], address: str) -> None:
     signals: list[int] = []
-
-    def handle(number: int, _frame: FrameType | None) -> None:
-        signals.append(number)
-
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handle)
+        signal.signal(number, lambda number, _: signals.append(number))
     for child in children:
         child.start()
     announce(

@@ -82,7 +82,6 @@ class AsyncClient:
         Scene, styles and cameras may be URLs that the service fetches, if its operator allows their hosts.
 
         Args:
-            scene: Scene file.
             style: Style image, or several that are mixed with the weights of the parameter `style_weights`.
             cameras: Camera file or folder, as for `sgsst stylize --cameras`; None requires the parameter `orbit`.
             photos: Folder of photos for the content term; None for unstylized renders.

@@ -59,25 +59,14 @@ def _iterating(
 
 
 class Client:
-    """Client of the service over HTTP.
-
-    Args:
-        url: Address of the service. None uses the environment variable SGSST_URL, or port 8000 of this machine if the
-            variable is not set.
-        key: API key; None uses the environment variable SGSST_KEY.
-
-    Raises:
-        RequestError: If address, key, or a proxy or certificate file that the environment names cannot be used.
-
-    Attributes:
-        url: Address of the service.
-    """
+    """Client of the service over HTTP, with the arguments, errors and attributes of `AsyncClient`."""
 
     def __init__(self, url: str | None = None, key: str | None = None) -> None:
         self._client = AsyncClient(url, key)  # first: if it raises, no thread may be left running
         self._stack = ExitStack()
         self._portal = self._stack.enter_context(start_blocking_portal())
-        self._stack.callback(self._stop)
+        # cancels coroutines that interrupted calls left running
+        self._stack.callback(self._portal.call, self._portal.stop, True)
         self._stack.callback(self._portal.call, self._client.close)
         self.url = self._client.url
 
@@ -90,10 +79,6 @@ class Client:
     def close(self) -> None:
         """Close all connections."""
         self._stack.close()
-
-    def _stop(self) -> None:
-        """Stop the portal, and cancel coroutines that interrupted calls left running."""
-        self._portal.call(self._portal.stop, True)
 
     def _run(self, function: Callable[[], Awaitable[T]]) -> T:
         """Run a coroutine function in the portal's thread. If this thread is interrupted, the coroutine is canceled."""

@@ -16,20 +16,12 @@ _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".
 
 @dataclass(frozen=True)
 class InputFile:
-    """File to send: its role in the job, its path, its size in bytes, and its name on the service."""
+    """File of a job: its role, its path or the URL that the service fetches it from, its name there, and its bytes."""
 
     role: str
-    path: Path
-    name: str
-    size: int
-
-
-@dataclass(frozen=True)
-class InputUrl:
-    """File that the service fetches: its role in the job, and its URL."""
-
-    role: str
-    url: str
+    source: Path | str
+    name: str = ""
+    size: int = 0
 
 
 @dataclass(frozen=True)
@@ -37,10 +29,7 @@ class JobFiles:
     """Files of a job: paths of local files, or URLs as text.
 
     Attributes:
-        scene: Scene file.
-        styles: Style images.
         cameras: Camera file or folder; None for an orbit.
-        photos: Folder of photos; None for none.
         masks: Mask files, or folders of mask images, by the names that the job's regions give them.
     """
 
@@ -56,7 +45,7 @@ def path_or_url(value: str | Path) -> Path | str:
     return value if isinstance(value, str) and value.lower().startswith(("http://", "https://")) else Path(value)
 
 
-def input_files(job: JobFiles) -> list[InputFile | InputUrl]:
+def input_files(job: JobFiles) -> list[InputFile]:
     """Return all files that a job needs.
 
     Raises:
@@ -64,12 +53,11 @@ def input_files(job: JobFiles) -> list[InputFile | InputUrl]:
     """
     local_styles = [style for style in job.styles if isinstance(style, Path)]
     names = iter(different_names(local_styles))
-    files: list[InputFile | InputUrl] = [_input("scene", job.scene)]
+    files = [_input("scene", job.scene)]
     files += [_input("style", style, next(names) if isinstance(style, Path) else "") for style in job.styles]
-    if isinstance(job.cameras, str):
-        files.append(InputUrl("cameras", job.cameras))
-    elif job.cameras is not None:
-        files += [_input("cameras", path) for path in camera_files(job.cameras)]
+    if job.cameras is not None:
+        cameras = [job.cameras] if isinstance(job.cameras, str) else camera_files(job.cameras)
+        files += [_input("cameras", each) for each in cameras]
     files += [_input("photos", path, name) for path, name in (image_files(job.photos) if job.photos else [])]
     for mask, path in job.masks.items():
         images = [(each, f"{mask}/{name}") for each, name in image_files(path)] if path.is_dir() else [(path, mask)]
@@ -77,9 +65,9 @@ def input_files(job: JobFiles) -> list[InputFile | InputUrl]:
     return files
 
 
-def _input(role: str, source: Path | str, name: str = "") -> InputFile | InputUrl:
+def _input(role: str, source: Path | str, name: str = "") -> InputFile:
     if isinstance(source, str):
-        return InputUrl(role, source)
+        return InputFile(role, source)
     if not source.is_file():
         raise RequestError(f"{source}: not a file. Check the path.")
     return InputFile(role, source, name or source.name, source.stat().st_size)

@@ -120,7 +120,12 @@ class Download:
         """
         expected = self._stamp.read_text() if self._stamp.exists() else ""
         self._stamp.unlink(missing_ok=True)
-        if self._sha256() != expected:
+        with self._part.open("rb") as file:
+            file.seek(self._hashed)  # bytes that an earlier process has written have not been hashed
+            while block := file.read(BLOCK):
+                self._digest.update(block)
+                self._hashed += len(block)
+        if self._digest.hexdigest() != expected:
             self._part.unlink()
             raise ApiError(f"{self.path}: the download was damaged in transit. Try again.", 460)
         self._part.replace(self._target)
@@ -129,15 +134,6 @@ class Download:
         """Delete the partial file."""
         self._part.unlink(missing_ok=True)
         self._stamp.unlink(missing_ok=True)
-
-    def _sha256(self) -> str:
-        """Return the SHA-256 of the partial file. Bytes that an earlier process has written are read for that."""
-        with self._part.open("rb") as file:
-            file.seek(self._hashed)
-            while block := file.read(BLOCK):
-                self._digest.update(block)
-                self._hashed += len(block)
-        return self._digest.hexdigest()
 
 
 class Transport:
@@ -192,43 +188,17 @@ class Transport:
 
         return await self._retry(once, reading=method in _READS)
 
-    async def listen(
-        self, method: str, path: str, take: Callable[[httpx2.ServerSentEvent], None], **options: Any
-    ) -> httpx2.Response | None:
-        """Send a request, and pass each event of its response to `take`.
+    async def work(self, path: str, step: str, progress: Progress, **options: Any) -> dict[str, Any]:
+        """Request some work, and return its result.
 
-        Returns:
-            The complete response if it is not a stream of events; None otherwise.
+        Args:
+            step: Name of the events that report progress.
+            progress: Callback that receives the number of completed steps and of all steps.
 
         Raises:
             RequestError, ApiError: As for `call`.
         """
         json_text(options.get("json"))
-
-        async def once() -> httpx2.Response | None:
-            async with self.http.sse(path, method=method, **options) as source:
-                self.reached = True
-                if not source.response.headers.get("content-type", "").startswith("text/event-stream"):
-                    await source.response.aread()
-                    return checked(source.response)
-                async for event in source:
-                    take(event)
-                return None
-
-        return await self._retry(once)
-
-    async def work(self, path: str, step: str, progress: Progress, **options: Any) -> dict[str, Any]:
-        """Request some work, and return its result.
-
-        Args:
-            path: Path of the POST request.
-            step: Name of the events that report progress.
-            progress: Callback that receives the number of completed steps and of all steps.
-            options: Other options of the request.
-
-        Raises:
-            RequestError, ApiError: As for `call`.
-        """
         result: dict[str, Any] = {}
 
         def take(event: httpx2.ServerSentEvent) -> None:
@@ -243,9 +213,17 @@ class Transport:
             else:
                 result.update(data)
 
-        response = await self.listen("POST", path, take, **options)
-        if response is not None:
-            result = response.json()
+        async def once() -> None:
+            async with self.http.sse(path, method="POST", **options) as source:
+                self.reached = True
+                if source.response.headers.get("content-type", "").startswith("text/event-stream"):
+                    async for event in source:
+                        take(event)
+                else:
+                    await source.response.aread()
+                    result.update(checked(source.response).json())
+
+        await self._retry(once)
         if not result:  # the service was stopped, or a proxy cut the response off
             raise ApiError("The connection ended before the result arrived. Try again.", 502)
         return result

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from api.client.answers import ApiError, RequestError
-from api.client.inputs import InputFile, InputUrl, JobFiles, input_files
+from api.client.inputs import JobFiles, input_files
 from api.client.transport import Progress, Transport, in_thread, json_text
 
 #: Maximum bytes of a part; larger files are uploaded in parts.
@@ -23,7 +23,13 @@ _TUS = {"Tus-Resumable": "1.0.0"}
 async def upload(transport: Transport, path: Path, name: str, progress: Progress) -> str:
     """Upload a file in parts, and return the upload's id."""
     size = (await in_thread(path.stat)).st_size
-    created = (await transport.call("POST", "/v1/uploads", headers=_creation_headers(name, size))).json()
+    creation = {
+        **_TUS,
+        "Upload-Length": str(size),
+        "Upload-Metadata": f"filename {base64.b64encode(name.encode()).decode()}",
+        "Idempotency-Key": secrets.token_hex(16),
+    }
+    created = (await transport.call("POST", "/v1/uploads", headers=creation)).json()
     where = f"/v1/uploads/{created['id']}"
     offset = int(created["offset"])
     while offset < size:
@@ -37,15 +43,6 @@ async def upload(transport: Transport, path: Path, name: str, progress: Progress
             offset = int((await transport.call("HEAD", where, headers=_TUS)).headers["Upload-Offset"])
         progress(offset, size)
     return str(created["id"])
-
-
-def _creation_headers(name: str, size: int) -> dict[str, str]:
-    return {
-        **_TUS,
-        "Upload-Length": str(size),
-        "Upload-Metadata": f"filename {base64.b64encode(name.encode()).decode()}",
-        "Idempotency-Key": secrets.token_hex(16),
-    }
 
 
 def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
@@ -67,15 +64,7 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
 async def create_job(
     transport: Transport, files: JobFiles, parameters: Mapping[str, Any], *, webhook: str | None, progress: Progress
 ) -> dict[str, Any]:
-    """Submit a job, and return the service's response.
-
-    Args:
-        transport: Connections to the service.
-        files: Files of the job.
-        parameters: Parameters of the job; those that are None are not sent.
-        webhook: URL that is called when the job has ended.
-        progress: Callback that receives the uploaded bytes and the total bytes of all large files.
-    """
+    """Submit a job, and return the service's response; see `AsyncClient.submit`."""
     fields = await _send_files(transport, files, parameters, progress)
     if webhook:
         fields.append(("webhook", (None, webhook)))
@@ -87,11 +76,7 @@ async def create_job(
 async def plan_job(
     transport: Transport, files: JobFiles, parameters: Mapping[str, Any], *, progress: Progress, planning: Progress
 ) -> dict[str, Any]:
-    """Plan a job without queueing it. The other arguments are the same as for `create_job`.
-
-    Args:
-        planning: Callback that receives the number of surveyed views and the number of all views.
-    """
+    """Plan a job without queueing it; see `AsyncClient.plan`."""
     fields = await _send_files(transport, files, parameters, progress)
     return await transport.work("/v1/jobs", "planning", planning, params={"dry_run": True}, files=fields)
 
@@ -102,18 +87,18 @@ async def _send_files(
     """Upload the large files, and return the form fields of the request, which contain the small files and the URLs."""
     given = json_text({name: value for name, value in parameters.items() if value is not None})
     inputs = await in_thread(input_files, files)
-    total = sum(file.size for file in inputs if isinstance(file, InputFile) and file.size > PART_BYTES)
+    total = sum(file.size for file in inputs if file.size > PART_BYTES)
     done = 0
     fields: list[tuple[str, Any]] = []
     for file in inputs:
-        if isinstance(file, InputUrl):
-            fields.append((file.role, (None, file.url)))
+        if isinstance(file.source, str):
+            fields.append((file.role, (None, file.source)))
         elif file.size > PART_BYTES:
-            upload_id = await upload(transport, file.path, file.name, partial(_report_sum, progress, done, total))
+            upload_id = await upload(transport, file.source, file.name, partial(_report_sum, progress, done, total))
             fields.append((file.role, (None, upload_id)))
             done += file.size
         else:
-            content = await in_thread(file.path.read_bytes)
+            content = await in_thread(file.source.read_bytes)
             fields.append((file.role, (file.name, content, "application/octet-stream")))
     fields.append(("parameters", (None, given)))
     return fields
