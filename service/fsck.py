@@ -11,9 +11,10 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
-from sqlalchemy import delete, exists, select
+from sqlalchemy import Select, delete, exists, select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute
 
 from service.files.artifacts import Artifacts
 from service.files.blobs import BLOBS, UPLOADS
@@ -35,6 +36,7 @@ QUARANTINE = "quarantine"
 
 Kind = Literal["missing", "damaged", "orphaned"]
 What = Literal["input", "result", "checkpoint", "upload"]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,6 @@ class Fault:
     """File that is inconsistent with the database.
 
     Attributes:
-        kind: Kind of the fault.
-        what: Kind of the file.
         name: Name of the file in the file store or in the data folder.
         holders: Jobs and uploads that need the file.
         mended: Description of the repair; empty if nothing was done.
@@ -98,7 +98,11 @@ class FileCheck:
                     self.checked += 1
                     if finding is not None:
                         yield finding
-        yield from self._orphans(mend=mend and not self._database.rolled_back)
+        mend = mend and not self._database.rolled_back
+        for objects, what, name in self._unknown():
+            if mend:
+                objects.remove(name)
+            yield Fault("orphaned", what, name, mended="deleted" if mend else "")
 
     def _examine(self, file: _File, *, mend: bool) -> Fault | None:
         # The second check rules out that a running service has just replaced or removed the file and its row.
@@ -119,34 +123,22 @@ class FileCheck:
 
     def _pages(self) -> Iterator[Sequence[_File]]:
         """Yield files page by page in row order, so that a table of any length takes bounded memory."""
-        last = ""
-        while page := self._page_of_blobs(last):
-            last = page[-1].sha256
-            yield [self._input(row) for row in page]
-        last_artifact = ("", "")
-        while results := self._page_of_artifacts(last_artifact):
-            last_artifact = (results[-1].job_id, results[-1].name)
-            yield [self._result(row) for row in results]
-        last = ""
-        while uploads := self._page_of_uploads(last):
-            last = uploads[-1].id
+        unfinished = UploadRow.sha256.is_(None) & (UploadRow.offset > 0)
+        for blobs in self._rows(select(BlobRow), BlobRow.sha256):
+            yield [self._input(row) for row in blobs]
+        for artifacts in self._rows(select(ArtifactRow), ArtifactRow.job_id, ArtifactRow.name):
+            yield [self._result(row) for row in artifacts]
+        for uploads in self._rows(select(UploadRow).where(unfinished), UploadRow.id):
             yield [file for row in uploads for file in self._parts(row)]
 
-    def _page_of_blobs(self, after: str) -> Sequence[BlobRow]:
-        query = select(BlobRow).where(BlobRow.sha256 > after).order_by(BlobRow.sha256).limit(_PAGE)
-        with self._database.reading() as session:
-            return session.scalars(query).all()
+    def _rows(self, query: Select[T], *key: InstrumentedAttribute[str]) -> Iterator[Sequence[T]]:
+        """Yield pages of the rows that a query selects, ordered by columns that identify a row."""
+        after = ("",) * len(key)
+        while rows := self._page(query.where(tuple_(*key) > after).order_by(*key).limit(_PAGE)):
+            yield rows
+            after = tuple(getattr(rows[-1], column.key) for column in key)
 
-    def _page_of_artifacts(self, after: tuple[str, str]) -> Sequence[ArtifactRow]:
-        job_id, name = after
-        later = (ArtifactRow.job_id > job_id) | ((ArtifactRow.job_id == job_id) & (ArtifactRow.name > name))
-        query = select(ArtifactRow).where(later).order_by(ArtifactRow.job_id, ArtifactRow.name).limit(_PAGE)
-        with self._database.reading() as session:
-            return session.scalars(query).all()
-
-    def _page_of_uploads(self, after: str) -> Sequence[UploadRow]:
-        unfinished = UploadRow.sha256.is_(None) & (UploadRow.offset > 0)
-        query = select(UploadRow).where(UploadRow.id > after, unfinished).order_by(UploadRow.id).limit(_PAGE)
+    def _page(self, query: Select[T]) -> Sequence[T]:
         with self._database.reading() as session:
             return session.scalars(query).all()
 
@@ -225,12 +217,6 @@ class FileCheck:
         return [part(each.location, each.size) for each in self._store.inputs.parts(row.id)]
 
     # --- files that no row refers to -------------------------------------------------------------------------------
-
-    def _orphans(self, *, mend: bool) -> Iterator[Fault]:
-        for objects, what, name in self._unknown():
-            if mend:
-                objects.remove(name)
-            yield Fault("orphaned", what, name, mended="deleted" if mend else "")
 
     def _unknown(self) -> Iterator[tuple[ObjectStore, What, str]]:
         """Yield files that no database row refers to or will refer to.

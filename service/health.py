@@ -24,7 +24,13 @@ def main() -> int:
     """Run the check and return the exit status: 0 if the process is healthy."""
     match sys.argv[1:]:
         case ["api"]:
-            return 0 if _responds(f"http://127.0.0.1:{os.environ.get('SGSST_PORT', '8000')}/livez") else 1
+            url = f"http://127.0.0.1:{os.environ.get('SGSST_PORT', '8000')}/livez"
+            try:
+                with urllib.request.urlopen(url, timeout=_SECONDS) as answer:
+                    return 0 if answer.status == 200 else 1
+            except OSError as error:
+                print(f"{url}: {error}", file=sys.stderr)
+                return 1
         case ["dispatcher"]:
             from service.settings import ServiceSettings
             from service.store import Store
@@ -32,15 +38,6 @@ def main() -> int:
             return 0 if dispatcher_is_healthy(Store(ServiceSettings(), answer_seconds=_ANSWER_SECONDS)) else 1
     print("usage: python -m service.health api|dispatcher", file=sys.stderr)
     return 2
-
-
-def _responds(url: str) -> bool:
-    try:
-        with urllib.request.urlopen(url, timeout=_SECONDS) as answer:
-            return bool(answer.status == 200)
-    except OSError as error:
-        print(f"{url}: {error}", file=sys.stderr)
-        return False
 
 
 def dispatcher_is_healthy(store: Store) -> bool:

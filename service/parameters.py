@@ -26,7 +26,7 @@ class JobParameters(StylizeOptions):
         json_schema_extra={
             "examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}],
             "x-groups": {title: [*names] for title, names in GROUPS.items()},
-        },
+        }
     )
 
     name: Annotated[JobName, Option(default="the names of scene and style")] = Field(

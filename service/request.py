@@ -12,19 +12,6 @@ from worker.region_requests import RegionRequest
 from worker.styles import StyleFile
 
 
-def scene_request(staged: Staged, parameters: JobParameters) -> SceneRequest:
-    """Return the request for scene and cameras."""
-    return SceneRequest.of(staged.scene, staged.cameras, parameters)
-
-
-def _styles(staged: Staged, parameters: JobParameters) -> tuple[StyleFile, ...]:
-    """Return the style images that belong to no region; if the job has no style weights, their weights are equal."""
-    taken = region_styles(parameters.region_requests)
-    own = [path for path in staged.styles if path.name not in taken]
-    weights = parameters.style_weights or [1.0] * len(own)
-    return tuple(StyleFile(path, weight) for path, weight in zip(own, weights, strict=True))
-
-
 def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, ...]:
     """Return the regions with the paths of their staged styles and masks."""
     paths = {path.name: path for path in staged.styles}
@@ -41,9 +28,12 @@ def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, 
 
 def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
     """Return the specification of a job; its paths are relative to the staging folder."""
+    taken = region_styles(parameters.region_requests)
+    own = [path for path in staged.styles if path.name not in taken]
+    weights = parameters.style_weights or [1.0] * len(own)
     return JobSpec(
-        source=scene_request(staged, parameters),
-        styles=_styles(staged, parameters),
+        source=SceneRequest.of(staged.scene, staged.cameras, parameters),
+        styles=tuple(StyleFile(path, weight) for path, weight in zip(own, weights, strict=True)),
         images=staged.photos,
         out=Path("out", RESULT),
         settings=parameters.settings(),

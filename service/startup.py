@@ -86,23 +86,14 @@ def keep_private(settings: ServiceSettings) -> None:
     """
     os.umask(0o077)
     settings.folder.mkdir(parents=True, exist_ok=True)
-    for path in [settings.folder, *_result_folder(settings), *_database_files(settings)]:
+    store, url = ObjectStore(settings.artifacts_url), make_url(settings.database_url)
+    paths = [settings.folder, *([Path(store.root)] if store.local else [])]
+    if url.get_backend_name() == "sqlite" and url.database:
+        paths += [Path(url.database + ending) for ending in _BESIDE]
+    for path in filter(Path.exists, paths):
         mode = stat.S_IMODE(path.stat().st_mode)
         if mode & 0o077:
             try:
                 path.chmod(mode & 0o700)
             except PermissionError:
                 _log.warning("file readable by other users, and owned by another user: path=%s", path)
-
-
-def _result_folder(settings: ServiceSettings) -> list[Path]:
-    store = ObjectStore(settings.artifacts_url)
-    folder = Path(store.root)
-    return [folder] if store.local and folder.is_dir() else []
-
-
-def _database_files(settings: ServiceSettings) -> list[Path]:
-    url = make_url(settings.database_url)
-    if url.get_backend_name() != "sqlite" or not url.database:
-        return []
-    return [path for ending in _BESIDE if (path := Path(url.database + ending)).exists()]

@@ -85,10 +85,7 @@ TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
     Transition.REQUEUE: dict.fromkeys(WORKING, _S.QUEUED),
     Transition.STOP: dict.fromkeys(ACTIVE, _S.CANCELED),
     Transition.FINISH: {_S.RUNNING: _S.FINISHING, _S.FINISHING: _S.FINISHING},
-    Transition.CANCEL: {
-        **dict.fromkeys((_S.QUEUED, _S.CANCELED), _S.CANCELED),
-        **dict.fromkeys(ACTIVE, _S.CANCELING),
-    },
+    Transition.CANCEL: {**dict.fromkeys((_S.QUEUED, _S.CANCELED), _S.CANCELED), **dict.fromkeys(ACTIVE, _S.CANCELING)},
     Transition.RETRY: dict.fromkeys((_S.FAILED, _S.CANCELED), _S.QUEUED),
     Transition.EXPIRE: dict.fromkeys(FINISHED, _S.EXPIRED),
 }

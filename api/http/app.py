@@ -80,7 +80,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             readiness=Readiness(
                 {
                     "database": store.operations.check,
-                    "artifacts": results.ping,
+                    "artifacts": results.objects.ping,
                     "disk": lambda: blobs.ensure_space(0),
                     "weights": check_weights,
                 }
@@ -109,6 +109,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         version=_version(),
         description=_DESCRIPTION,
         lifespan=lifespan,
+        generate_unique_id_function=lambda route: route.name,
         docs_url=None,  # FastAPI's own page loads its script from a CDN
         redoc_url=None,
     )

@@ -248,15 +248,19 @@ class Connection(HttpToolsProtocol):
 
 
 _piece = memoryview(bytearray(MAX_HEAD_BYTES))
+#: Events of a transport that a reader passes to its connection.
+_EVENTS = ("connection_made", "connection_lost", "eof_received", "pause_writing", "resume_writing")
 
 
 class Reader(asyncio.BufferedProtocol):
     """Adapter that reads a connection in blocks within its memory budget; uvloop itself reads 256 kB at once."""
 
-    __slots__ = ("_connection",)
+    __slots__ = ("_connection", *_EVENTS)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._connection = Connection(*args, **kwargs)
+        for event in _EVENTS:
+            setattr(self, event, getattr(self._connection, event))
 
     def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
         """Return the buffer for the next block. All connections share it, because each block is parsed immediately."""
@@ -265,23 +269,3 @@ class Reader(asyncio.BufferedProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         """Parse the block that was read into the buffer."""
         self._connection.data_received(_piece[:nbytes])
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Pass the event to the connection."""
-        self._connection.connection_made(transport)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Pass the event to the connection."""
-        self._connection.connection_lost(exc)
-
-    def eof_received(self) -> None:
-        """Pass the event to the connection."""
-        self._connection.eof_received()
-
-    def pause_writing(self) -> None:
-        """Pass the event to the connection."""
-        self._connection.pause_writing()
-
-    def resume_writing(self) -> None:
-        """Pass the event to the connection."""
-        self._connection.resume_writing()

@@ -89,12 +89,8 @@ ContextDep = Annotated[Context, Depends(get_context)]
 _bearer = HTTPBearer(
     auto_error=False, description="API key created by `sgsst keys create NAME` on the service's machine."
 )
-
-
-session_cookie = APIKeyCookie(
-    name=SESSION_COOKIE,
-    auto_error=False,
-    description="Session cookie of a browser, from `POST /v1/session`.",
+_cookie = APIKeyCookie(
+    name=SESSION_COOKIE, auto_error=False, description="Session cookie of a browser, from `POST /v1/session`."
 )
 
 
@@ -103,7 +99,7 @@ async def get_caller(
     request: Request,
     context: ContextDep,
     given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
-    cookie: Annotated[str | None, Depends(session_cookie)],
+    cookie: Annotated[str | None, Depends(_cookie)],
 ) -> Caller:
     """Return the owner of the request's API key, or of its session if there is no key.
 
@@ -175,7 +171,8 @@ def check_site(request: Request, settings: ServiceSettings) -> None:
     Raises:
         FOREIGN_SITE: If the Host or Origin header is not this service's.
     """
-    host = _host_name(request.headers.get("host", ""))
+    match = _HOST.fullmatch(request.headers.get("host", ""))
+    host = (match[1] or match[2] or "").lower() if match else ""
     if settings.on_loopback and not is_loopback(host):
         raise problems.FOREIGN_SITE(
             f"The service accepts requests from this machine only, and {host[:100]!r} is not one of its names."
@@ -190,12 +187,6 @@ def _netloc(origin: str) -> str:
         return urlsplit(origin).netloc
     except ValueError:  # For example "http://[", which no browser sends.
         return ""
-
-
-def _host_name(header: str) -> str:
-    """Return the host of a Host header in lower case, or an empty string if the header is malformed."""
-    match = _HOST.fullmatch(header)
-    return (match[1] or match[2] or "").lower() if match else ""
 
 
 _ID = re.compile(r"[a-z]{3}_[0-9a-f]{8,36}")

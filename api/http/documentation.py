@@ -277,15 +277,11 @@ def _describe(operation: dict[str, Any], route: APIRoute, schemas: dict[str, Any
         answer = from_service(example)
         document = json.loads(bytes(answer.body))
         response = responses.setdefault(str(example.status), {"description": f"{document['title']}: see `code`."})
-        schema = {"$ref": f"#/components/schemas/{_problem_name(example.status)}"}  # see `complete`
+        schema = {"$ref": f"#/components/schemas/Problem{example.status}"}  # see `complete`
         content = response.setdefault("content", {}).setdefault(MEDIA_TYPE, {"schema": schema, "examples": {}})
         content["examples"][example.code] = {"value": document}
         names = [name for name in _HEADERS if name.lower() in answer.headers and name != "Content-Length"]
         response.setdefault("headers", {}).update(headers(*names))
-
-
-def _problem_name(status: int) -> str:
-    return f"Problem{status}"
 
 
 def _invalid(parameter: dict[str, Any]) -> ServiceError | None:
@@ -322,7 +318,7 @@ def complete(document: dict[str, Any], routes: Sequence[BaseRoute], models: Sequ
     schemas = document["components"]["schemas"]
     for model in models:
         _add_schema(schemas, model)
-    by_operation = {route.operation_id: route for route in routes if isinstance(route, APIRoute)}
+    by_operation = {route.operation_id or route.name: route for route in routes if isinstance(route, APIRoute)}
     for path in document["paths"].values():
         for method, operation in path.items():
             operation["summary"] = operation["description"].partition("\n")[0].partition(". ")[0].rstrip(".")
@@ -365,5 +361,5 @@ def _add_problem_schemas(document: dict[str, Any]) -> None:
         properties = copy.deepcopy(schemas["Problem"]["properties"])
         properties["status"] |= {"const": status}
         properties["code"] |= {"enum": sorted(by_code)}
-        title = {"title": _problem_name(status), "examples": [next(iter(by_code.values()))]}
-        schemas[_problem_name(status)] = {**schemas["Problem"], "properties": properties, **title}
+        title = {"title": f"Problem{status}", "examples": [next(iter(by_code.values()))]}
+        schemas[f"Problem{status}"] = {**schemas["Problem"], "properties": properties, **title}

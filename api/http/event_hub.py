@@ -38,11 +38,10 @@ class Item:
 
 @dataclass
 class _Channel:
-    """Buffered events and watchers of one job."""
+    """Newest event, recent events and watchers of one job."""
 
-    base: int
-    last: int
-    items: deque[Item] = field(default_factory=deque)
+    last: int = 0
+    items: deque[Item] = field(default_factory=lambda: deque(maxlen=_BUFFERED))
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     watchers: int = 0
     deleted: bool = False
@@ -85,9 +84,7 @@ class Hub:
 
     async def watch(self, job_id: str, after: int) -> AsyncIterator[bytes]:
         """Yield the encoded events of a job after the one with id `after`, until the job has ended."""
-        channel = self._channels.get(job_id)
-        if channel is None:
-            channel = self._channels.setdefault(job_id, _Channel(0, 0))
+        channel = self._channels.setdefault(job_id, _Channel())
         channel.watchers += 1
         try:
             yield b"retry: 2000\n\n"
@@ -111,7 +108,7 @@ class Hub:
                 self._channels.pop(job_id, None)
 
     async def _events_after(self, job_id: str, channel: _Channel, after: int) -> list[Item]:
-        if channel.last and after >= channel.base:
+        if channel.items and after >= channel.items[0].id:
             return [item for item in channel.items if item.id > after]
         try:
             rows = await asyncio.to_thread(self._store.jobs.events, job_id, after)
@@ -140,25 +137,18 @@ class Hub:
         newest = await asyncio.to_thread(self._store.jobs.last_events, list(watched))
         for job_id, channel in watched.items():
             number = newest.get(job_id)
-            if number is None:  # the job was deleted
+            if number is None:
                 channel.deleted = True
-                _wake_watchers(channel)
-                continue
-            if not channel.last:
-                channel.base = channel.last = number
-                _wake_watchers(channel)
+            elif not channel.last:
+                channel.last = number
             elif number > channel.last:
                 rows = await asyncio.to_thread(self._store.jobs.events, job_id, channel.last)
                 channel.items.extend(_to_item(row) for row in rows)
                 channel.last = rows[-1].id if rows else channel.last
-                while len(channel.items) > _BUFFERED:
-                    channel.base = channel.items.popleft().id
-                _wake_watchers(channel)
-
-
-def _wake_watchers(channel: _Channel) -> None:
-    changed, channel.changed = channel.changed, asyncio.Event()
-    changed.set()
+            else:
+                continue
+            changed, channel.changed = channel.changed, asyncio.Event()
+            changed.set()
 
 
 def _to_item(row: EventRow) -> Item:

@@ -124,8 +124,7 @@ class Fetcher:
             raise _invalid(source, error) from error
         if origin(parsed) not in self._allowed:
             scheme, host, port = origin(parsed)
-            reason = f"'{scheme}://{host}:{port}' is not among the hosts that its operator allows"
-            raise _invalid(source, reason)
+            raise _invalid(source, f"'{scheme}://{host}:{port}' is not among the hosts that its operator allows")
         return parsed
 
     async def _fetch(self, source: _Input, state: _Fetch) -> str:
@@ -158,7 +157,11 @@ class Fetcher:
             if response.status_code not in _REDIRECTS or location is None:
                 return await self._body(source, state, response)
             await stack.aclose()
-            url = self._parse(_joined(url, location, source), source)
+            try:
+                target = str(url.join(location))
+            except (httpx2.InvalidURL, ValueError) as error:
+                raise _not_fetched(source, _INVALID_REDIRECT) from error
+            url = self._parse(target, source)
         raise _not_fetched(source, f"the server redirects more than {_MAX_REDIRECTS} times")
 
     async def _body(self, source: _Input, state: _Fetch, response: httpx2.Response) -> AsyncIterator[bytes]:
@@ -198,8 +201,7 @@ class Fetcher:
         try:
             yield
         except TimeoutError as error:
-            reason = f"it did not arrive within {self._settings.url_seconds:g} s"
-            raise _not_fetched(source, reason) from error
+            raise _not_fetched(source, f"it did not arrive within {self._settings.url_seconds:g} s") from error
         except PermissionError as error:  # its message has the address, which is none of the client's business
             raise _invalid(source, "its host has an address that is not public") from error
         except httpx2.InvalidURL as error:  # httpx2 parses the target of a redirect even if it does not follow it
@@ -220,11 +222,3 @@ def _not_fetched(source: _Input, reason: str) -> ServiceError:
 def _write(chunk: bytes, file: Receiver, receipt: Receipt) -> None:
     receipt.take(len(chunk))
     file.write(chunk)
-
-
-def _joined(url: httpx2.URL, location: str, source: _Input) -> str:
-    """Return the target of a redirect, which may be relative."""
-    try:
-        return str(url.join(location))
-    except (httpx2.InvalidURL, ValueError) as error:
-        raise _not_fetched(source, _INVALID_REDIRECT) from error

@@ -8,6 +8,7 @@ import json
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +16,7 @@ from typing import Any, TypeVar
 from fastapi import Request
 from pydantic import BaseModel
 from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
+from python_multipart.multipart import MultipartParser, MultipartState, parse_options_header
 from starlette.requests import ClientDisconnect
 
 from api.http.documentation import raises
@@ -172,7 +173,7 @@ async def receive(
     try:
         async for block in blocks:
             await threads.run(receipt.owner, form.feed, block, size=form.unsaved)
-        form.finish()
+        form.check_complete()
     except BaseException as error:
         await threads.clean_up(threads.run(receipt.owner, form.discard))
         if isinstance(error, ServiceError) and error.problem not in (problems.TOO_SLOW, problems.TOO_LARGE):
@@ -183,18 +184,12 @@ async def receive(
 
 async def _drain(blocks: AsyncIterator[bytes]) -> None:
     left = _DRAIN_BYTES
-
-    async def drain() -> None:
-        nonlocal left
-        async for block in blocks:
-            left -= len(block)
-            if left < 0:
-                return
-
-    try:
-        await asyncio.wait_for(drain(), _DRAIN_SECONDS)
-    except (TimeoutError, ServiceError):
-        return
+    with suppress(TimeoutError, ServiceError):
+        async with asyncio.timeout(_DRAIN_SECONDS):
+            async for block in blocks:
+                left -= len(block)
+                if left < 0:
+                    return
 
 
 class _Form:
@@ -210,8 +205,6 @@ class _Form:
         self._role = self._name = ""
         self._file: Receiver | None = None
         self._text = bytearray()
-        self._done = False
-        self._closed: list[Receiver] = []
         callbacks: dict[str, Callable[..., None]] = {
             "on_part_begin": self._begin,
             "on_header_field": lambda data, start, end: self._header[0].extend(data[start:end]),
@@ -220,7 +213,6 @@ class _Form:
             "on_headers_finished": self._open,
             "on_part_data": self._data,
             "on_part_end": self._end,
-            "on_end": self._finished,
         }
         try:
             self._parser = MultipartParser(
@@ -240,13 +232,9 @@ class _Form:
         except FormParserError as error:
             raise problems.MALFORMED_BODY(f"The multipart body is invalid: {error}.") from error
 
-    def finish(self) -> None:
-        """Check that the body was complete.
-
-        Raises:
-            MALFORMED_BODY: If its last boundary is missing.
-        """
-        if not self._done:
+    def check_complete(self) -> None:
+        """Raise MALFORMED_BODY if the last boundary of the body is missing."""
+        if self._parser.state is not MultipartState.END:
             raise problems.MALFORMED_BODY("The multipart body ends before its last boundary. Send it again.")
 
     @property
@@ -264,16 +252,11 @@ class _Form:
         self._parts += 1
         if self._parts > self._most_files + len(_TEXT_FIELDS):
             raise problems.TOO_MANY_FILES(limit=self._parts - 1, what="fields")
-        self._headers = {}
-        self._clear_header()
-
-    def _clear_header(self) -> None:
-        self._header[0].clear()
-        self._header[1].clear()
+        self._headers, self._header = {}, (bytearray(), bytearray())
 
     def _header_end(self) -> None:
         self._headers[bytes(self._header[0]).lower()] = bytes(self._header[1])
-        self._clear_header()
+        self._header = bytearray(), bytearray()
 
     def _open(self) -> None:
         _, options = parse_options_header(self._headers.get(b"content-disposition", b""))
@@ -320,9 +303,6 @@ class _Form:
             raise problems.INVALID_REQUEST(f"The field {self._role!r} was sent twice. Send it once.")
         else:
             self.received.texts[self._role] = text
-
-    def _finished(self) -> None:
-        self._done = True
 
 
 def most_files(settings: ServiceSettings) -> int:

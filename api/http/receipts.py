@@ -41,10 +41,6 @@ class Receipts:
         if self._renewing is not None:
             self._renewing.cancel()
 
-    def of(self, owner: str, quotas: Quotas) -> Receipt:
-        """Return a receipt for an owner's request, with no charge yet."""
-        return Receipt(self, owner, quotas)
-
     async def end(self, owner: str, receipt: str) -> None:
         """Release the charge of a receipt, and delete the request's files unless other jobs or uploads use them."""
         self.active.discard(receipt)
@@ -73,7 +69,7 @@ class Receipts:
 
 
 class Receipt:
-    """Quota charge of one request, which also protects the request's files from deletion.
+    """Quota charge of one request, nothing at first, which also protects the request's files from deletion.
 
     At the end of the `async with` block, files that no job has taken over are deleted, unless other jobs or uploads use
     them.

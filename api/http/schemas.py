@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -14,7 +14,7 @@ from service.parameters import JobName, JobParameters
 from service.problems import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.jobs import ShownJob
-from service.store.tables import ArtifactRow, AttemptRow, JobRow, UploadRow
+from service.store.tables import ArtifactRow, AttemptRow, Base, JobRow, ShareRow, UploadRow
 from sgsst_core.files.formats import ResultName
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.progress import Progress
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 else:  # inlined in the OpenAPI document; enumerations would get schemas of their own
     StatusName = Literal[tuple(map(str, JobStatus))]
     OutcomeName = Literal[tuple(map(str, AttemptOutcome))]
+
+Model = TypeVar("Model", bound=BaseModel)
 
 #: Maximum number of points of a loss history.
 MOST_POINTS = 512
@@ -50,8 +52,13 @@ BlendWeight = Annotated[
 
 
 def _with_example(**example: Any) -> ConfigDict:
-    """Return a model configuration with an example for the OpenAPI document."""
+    """Return the configuration of a response with an example for the OpenAPI document."""
     return ConfigDict(json_schema_extra={"examples": [example]})
+
+
+def _strict(**example: Any) -> ConfigDict:
+    """Return the configuration of a request, which may have no unknown fields."""
+    return ConfigDict(extra="forbid", json_schema_extra={"examples": [example]})
 
 
 def example_of(model: type[BaseModel]) -> dict[str, Any]:
@@ -64,11 +71,8 @@ def example_of(model: type[BaseModel]) -> dict[str, Any]:
 class ErrorView(BaseModel):
     """Reason why a job or an attempt failed."""
 
-    model_config = ConfigDict(
-        extra="allow",
-        json_schema_extra={
-            "examples": [{"code": "diverged", "message": "Step 41: the loss is not finite. Lower the learning rate."}]
-        },
+    model_config = ConfigDict(extra="allow") | _with_example(
+        code="diverged", message="Step 41: the loss is not finite. Lower the learning rate."
     )
 
     code: str
@@ -178,10 +182,7 @@ class JobView(BaseModel):
         result=None,
         error=None,
         parameters={"name": "plush", "preset": "standard"},
-        inputs=[
-            example_of(InputView),
-            {"role": "style", "name": "style.jpg", "size": 10421, "sha256": SHA256[::-1]},
-        ],
+        inputs=[example_of(InputView), {"role": "style", "name": "style.jpg", "size": 10421, "sha256": SHA256[::-1]}],
         input_counts={"scene": 1, "style": 1},
         links=example_of(Links),
     )
@@ -263,7 +264,7 @@ class ArtifactList(BaseModel):
 class BlendPart(BaseModel):
     """Result of another job in a blend."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"job_id": JOB_ID, "weight": 0.2}]})
+    model_config = _strict(job_id=JOB_ID, weight=0.2)
 
     job_id: str = Field(pattern="^job_[0-9a-f]{31}$", description="Finished job of the same scene.")
     weight: BlendWeight
@@ -272,9 +273,7 @@ class BlendPart(BaseModel):
 class BlendRequest(BaseModel):
     """Blend of a job's scene with its result, and with results of other jobs of the same scene."""
 
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"weight": 0.7, "others": [], "format": "ply"}]}
-    )
+    model_config = _strict(weight=0.7, others=[], format="ply")
 
     weight: BlendWeight = Field(
         description="Weight of the job's result, rounded to thousandths. The scene has the remaining weight up to 1; "
@@ -382,11 +381,7 @@ class PlanView(BaseModel):
 class SignIn(BaseModel):
     """An API key that a browser sends to sign in."""
 
-    model_config = ConfigDict(
-        extra="forbid",
-        hide_input_in_errors=True,
-        json_schema_extra={"examples": [{"key": "sgsst_ThisIsNoKeyButAnExampleOfOne"}]},
-    )
+    model_config = _strict(key="sgsst_ThisIsNoKeyButAnExampleOfOne") | ConfigDict(hide_input_in_errors=True)
 
     key: str = Field(
         min_length=1, max_length=200, description="Key created by `sgsst keys create NAME` on the service's machine."
@@ -396,7 +391,7 @@ class SignIn(BaseModel):
 class JobChange(BaseModel):
     """Changes to a job."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"name": "plush, at night"}]})
+    model_config = _strict(name="plush, at night")
 
     name: JobName = Field(description="New display name; an empty one restores the names of scene and style.")
 
@@ -404,7 +399,7 @@ class JobChange(BaseModel):
 class NewShare(BaseModel):
     """Share link to create for the result of a job."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"days": 7}]})
+    model_config = _strict(days=7)
 
     days: float = Field(
         7.0,
@@ -463,27 +458,6 @@ class SharedView(BaseModel):
     files: list[str] = Field(description="Files of the result.")
 
 
-#: Results that a share shows.
-SHARED_RESULTS = ("colors.f16", "stylized.ply")
-#: Parameters of a job that matter for rendering.
-_RENDERED = ("background", "near", "render_mode", "eps2d", "sh_attenuation")
-
-
-def shared_view(job: ShownJob, expires_at: float, artifacts: Sequence[str]) -> SharedView:
-    """Return the public view of a shared job: only what the page needs to show it.
-
-    Args:
-        artifacts: Names of its shared results, from `SHARED_RESULTS`.
-    """
-    return SharedView(
-        name=job.row.name,
-        expires_at=expires_at,
-        parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters},
-        cameras=[entry["name"] for entry in job.inputs.named if entry["role"] == "cameras"],
-        files=list(artifacts),
-    )
-
-
 class SessionView(BaseModel):
     """Session state for the browser."""
 
@@ -506,64 +480,48 @@ class Health(BaseModel):
     checks: dict[str, str]
 
 
-ANSWERS: tuple[type[BaseModel], ...] = (
-    JobPage,
-    JobDetail,
-    ArtifactList,
-    UploadView,
-    PlanView,
-    Health,
-)
+#: Models of responses that routes send as encoded text.
+ANSWERS: tuple[type[BaseModel], ...] = (JobPage, JobDetail, ArtifactList, UploadView, PlanView, Health)
 
 
-def job_view(job: ShownJob) -> JobView:
+def _view(model: type[Model], row: Base, **given: Any) -> Model:
+    """Return a model whose fields are columns of a database row, apart from the given ones."""
+    return model(**{name: getattr(row, name) for name in model.model_fields if name not in given}, **given)
+
+
+def job_view(shown: ShownJob) -> JobView:
     """Return a job as the API shows it."""
-    return JobView(**_job_fields(job))
+    return _view(JobView, shown.row, **_given_fields(shown))
 
 
-def job_detail(job: ShownJob, attempts: list[AttemptRow]) -> JobDetail:
+def job_detail(shown: ShownJob, attempts: Sequence[AttemptRow]) -> JobDetail:
     """Return a job with its attempts."""
-    shown = [AttemptView.model_validate(row, from_attributes=True) for row in attempts]
-    return JobDetail(**_job_fields(job), attempts=shown)
+    views = [_view(AttemptView, row) for row in attempts]
+    return _view(JobDetail, shown.row, **_given_fields(shown), attempts=views)
 
 
-def _job_fields(shown: ShownJob) -> dict[str, Any]:
+def _given_fields(shown: ShownJob) -> dict[str, Any]:
+    """Return the fields of a job that are not columns of its row."""
     job = shown.row
     base = address(f"/v1/jobs/{job.id}")
+    result = f"{base}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None
     return {
-        "id": job.id,
-        "name": job.name,
-        "status": job.status,
-        "created_at": job.created_at,
-        "started_at": job.started_at,
-        "finished_at": job.finished_at,
-        "expires_at": job.expires_at,
-        "attempt": job.attempt,
         "queue_position": shown.position,
         "preview": shown.preview,
         # The remaining time is that of the last report, and a job that has ended has none.
         "progress": {**job.progress, **({} if job.status in UNFINISHED else {"eta_s": None})} if job.progress else None,
-        "result": job.result,
         "error": job.error or None,
         "parameters": JobParameters().model_dump(mode="json") | job.parameters,
         "inputs": shown.inputs.named,
         "input_counts": shown.inputs.counts,
-        "links": Links(
-            self=base,
-            events=f"{base}/events",
-            artifacts=f"{base}/artifacts",
-            result=f"{base}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None,
-        ),
+        "links": Links(self=base, events=f"{base}/events", artifacts=f"{base}/artifacts", result=result),
     }
 
 
-def input_views(job_id: str, entries: Sequence[tuple[int, dict[str, Any]]]) -> list[InputFileView]:
-    """Return files that a job was created from, each given with its index among those of its role."""
-    path = f"/v1/jobs/{job_id}/inputs"
-    return [
-        InputFileView(**entry, url=address(f"{path}/{entry['role']}" + (f":{index}" if index else "")))
-        for index, entry in entries
-    ]
+def input_view(job_id: str, index: int, entry: dict[str, Any]) -> InputFileView:
+    """Return a file that a job was created from, given its index among those of its role."""
+    path = f"/v1/jobs/{job_id}/inputs/{entry['role']}" + (f":{index}" if index else "")
+    return InputFileView(**entry, url=address(path))
 
 
 def poll_seconds(job: JobRow) -> int | None:
@@ -576,24 +534,15 @@ def poll_seconds(job: JobRow) -> int | None:
 
 def artifact_view(row: ArtifactRow) -> ArtifactView:
     """Return a result as the API shows it."""
-    return ArtifactView(
-        name=row.name,
-        size=row.size,
-        sha256=row.sha256,
-        media_type=media_type(row.name),
-        created_at=row.created_at,
-        url=address(f"/v1/jobs/{row.job_id}/artifacts/{row.name}"),
-    )
+    url = address(f"/v1/jobs/{row.job_id}/artifacts/{row.name}")
+    return _view(ArtifactView, row, media_type=media_type(row.name), url=url)
 
 
 def upload_view(row: UploadRow) -> UploadView:
     """Return an upload as the API shows it."""
-    return UploadView(
-        id=row.id,
-        filename=row.filename,
-        length=row.length,
-        offset=row.offset,
-        complete=row.sha256 is not None,
-        sha256=row.sha256,
-        expires_at=row.expires_at,
-    )
+    return _view(UploadView, row, complete=row.sha256 is not None)
+
+
+def share_view(row: ShareRow) -> ShareView:
+    """Return a link as the API shows it."""
+    return _view(ShareView, row)

@@ -81,10 +81,10 @@ class SentFile:
         sha256, size: SHA-256 and size in bytes of the content.
         name: Suggested name for saving the file.
         kind: Media type.
-        inline: Whether a browser may show the file inline.
-        policy: Content-Security-Policy; None for none.
         check: Function that checks that the stored file has this content. It is fast if the file was checked recently.
         read: Function that yields the bytes from one offset up to another, in chunks of at most a given size.
+        policy: Content-Security-Policy; None for none.
+        inline: Whether a browser may show the file inline.
     """
 
     owner: str
@@ -92,10 +92,10 @@ class SentFile:
     size: int
     name: str
     kind: str
-    inline: bool
-    policy: str | None
     check: Callable[[], None]
     read: Callable[[int, int, int], Iterator[bytes]]
+    policy: str | None = None
+    inline: bool = False
 
 
 def file_answers(starts: dict[str, Any], *, always_policy: bool = False) -> Responses:
@@ -137,13 +137,7 @@ ReadEntries = Callable[[str | None, int], tuple[Sequence[BaseModel], str | None]
 
 
 async def send_list(
-    name: str,
-    read: ReadEntries,
-    cursor: str | None,
-    limit: int,
-    turn: asyncio.Semaphore,
-    *,
-    at_once: int = 250,
+    name: str, read: ReadEntries, cursor: str | None, limit: int, turn: asyncio.Semaphore, *, at_once: int = 250
 ) -> Response:
     """Return the response with a page of a list, `{NAME: [...], "next_cursor": ...}`, which is sent as it is read.
 
@@ -211,7 +205,15 @@ async def send_file(request: Request, threads: FileThreads, file: SentFile, cond
         LostFileError, DamagedFileError: If the stored file does not match its database row. No byte of it is sent.
     """
     tag = f'"{file.sha256}"'
-    response_headers = _headers(file, tag)
+    response_headers = {
+        "ETag": tag,
+        "Accept-Ranges": "bytes",
+        "Cache-Control": "private, no-cache, no-transform",  # compressed by a proxy, it would have no ranges
+        "X-Content-Type-Options": "nosniff",
+        "Content-Disposition": disposition(file.name, inline=file.inline),
+    }
+    if file.policy is not None:
+        response_headers["Content-Security-Policy"] = file.policy
     if conditions.if_match is not None and not names_etag(conditions.if_match, tag, strong=True):
         raise problems.PRECONDITION_FAILED()
     if names_etag(conditions.if_none_match, tag):
@@ -244,19 +246,6 @@ def _next(body: Iterator[bytes]) -> bytes | None:
         return next(body, None)
     except FileNotFoundError as error:
         raise problems.FILE_REMOVED() from error
-
-
-def _headers(file: SentFile, tag: str) -> dict[str, str]:
-    response_headers = {
-        "ETag": tag,
-        "Accept-Ranges": "bytes",
-        "Cache-Control": "private, no-cache, no-transform",  # compressed by a proxy, it would have no ranges
-        "X-Content-Type-Options": "nosniff",
-        "Content-Disposition": disposition(file.name, inline=file.inline),
-    }
-    if file.policy is not None:
-        response_headers["Content-Security-Policy"] = file.policy
-    return response_headers
 
 
 def disposition(name: str, *, inline: bool) -> str:

@@ -47,6 +47,8 @@ POLICY = (
 #: Content-Security-Policy of `/docs`. Swagger UI's style sheet has inline icons.
 DOCS_POLICY = POLICY.replace("img-src 'self' blob:", "img-src 'self' data:")
 _PAGES = {"/": ("index.html", POLICY), "/shared": ("shared.html", POLICY), "/docs": ("docs.html", DOCS_POLICY)}
+#: Acceptance of gzip in an Accept-Encoding header; `q=0` refuses it.
+_GZIP = re.compile(r"\bgzip\b(?!\s*;\s*q=0(\.0*)?\s*(,|$))")
 _IMMUTABLE = "public, max-age=31536000, immutable"
 
 
@@ -157,7 +159,8 @@ def add_static(app: FastAPI) -> None:
 
 
 def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Response:
-    compressed = file.compressed if _accepts_gzip(request.headers.get("accept-encoding", "")) else None
+    accepted = _GZIP.search(request.headers.get("accept-encoding", ""))
+    compressed = file.compressed if accepted else None
     tag = f'"{file.digest}-gzip"' if compressed is not None else f'"{file.digest}"'
     response_headers = {
         "ETag": tag,
@@ -172,8 +175,3 @@ def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Re
     if compressed is not None:
         response_headers["Content-Encoding"] = "gzip"
     return Response(file.body if compressed is None else compressed, headers=response_headers, media_type=file.kind)
-
-
-def _accepts_gzip(accepted: str) -> bool:
-    """Return whether an Accept-Encoding header accepts gzip; `q=0` refuses it."""
-    return re.search(r"\bgzip\b(?!\s*;\s*q=0(\.0*)?\s*(,|$))", accepted) is not None

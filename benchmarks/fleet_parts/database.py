@@ -24,7 +24,7 @@ from service.files.staging import CHECKPOINT
 from service.scheduling.running import progress_seconds
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.jobs import _JOBS, NewJob, _row_of_new_job
+from service.store.jobs import _JOBS, NewJob
 from service.store.leases import Lease, Published
 from sgsst_core.progress import Progress
 from tests.postgres import fresh_database, server
@@ -57,7 +57,7 @@ def _fill(store: Store, queued: int) -> None:
     now = time.time() - queued
     jobs = [NewJob(f"key_{number % _OWNERS:03d}", "", 0, {"preset": "paper"}, _INPUTS) for number in range(queued)]
     with store.database.writing() as session:
-        session.execute(insert(_JOBS), [_row_of_new_job(job, now + number) for number, job in enumerate(jobs)])
+        session.execute(insert(_JOBS), [job.row(now + number) for number, job in enumerate(jobs)])
         session.execute(text("ANALYZE"))
 
 
@@ -129,7 +129,7 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
         "publish": lambda: store.leases.publish(some(), [checkpoint]),
         "renew eight": lambda: store.leases.renew(own()[:8]),
         "look at eight": lambda: store.leases.statuses(own()[:8]),
-        "look at the queue": lambda: (store.operations.dispatcher_count(), store.leases.waiting(1000)),
+        "look at the queue": lambda: (store.operations.dispatchers(), store.leases.waiting(1000)),
         "alive": lambda: store.operations.record_heartbeat(threading.current_thread().name, 8, 0),
         "end": lambda: store.leases.succeed(own().pop(), [Published("stylized.ply", "x", 1, _SHA)], {}),
     }

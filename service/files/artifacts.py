@@ -15,7 +15,7 @@ from pathlib import Path
 from service import problems
 from service.files.blobs import disk_errors
 from service.files.cache import file_digest
-from service.files.objects import CHUNK, ObjectStore
+from service.files.objects import ObjectStore
 from service.store.leases import Published
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import RESULT_FORMATS
@@ -35,7 +35,8 @@ _log = logging.getLogger(__name__)
 class Artifacts:
     """Results in the file store.
 
-    Object names are never reused; database rows refer to the current version of each file.
+    The objects of a job are below a folder with its id. Their names are never reused; database rows refer to the
+    current version of each file.
     """
 
     def __init__(self, url: str) -> None:
@@ -68,18 +69,6 @@ class Artifacts:
             size, sha256 = temporary.stat().st_size, file_digest(temporary)
         return Published(name, location, size, sha256)
 
-    def read(self, location: str, start: int, stop: int, chunk: int = CHUNK) -> Iterator[bytes]:
-        """Yield the bytes from `start` up to `stop` in chunks of at most `chunk` bytes."""
-        return self.objects.read(location, start, stop, chunk)
-
-    def check(self, location: str, sha256: str) -> None:
-        """Verify the SHA-256 of a result, unless it was verified recently and has not changed since.
-
-        Raises:
-            LostFileError, DamagedFileError: If the result is missing or differs.
-        """
-        self.objects.check_once(location, sha256)
-
     @disk_errors()
     def fetch(self, location: str, target: Path, sha256: str) -> None:
         """Copy a result to a local file, atomically.
@@ -98,14 +87,6 @@ class Artifacts:
         except FileNotFoundError as error:
             raise problems.FILE_LOST(sha256=sha256) from error
 
-    def remove(self, location: str) -> None:
-        """Remove a file if it exists."""
-        self.objects.remove(location)
-
-    def remove_job(self, job_id: str) -> None:
-        """Remove all files of a job."""
-        self.objects.remove_below(job_id)
-
     def sweep(self, job_id: str, epoch: int, retained: set[str]) -> None:
         """Remove files that interrupted attempts at a job left behind and that no database row refers to.
 
@@ -116,11 +97,7 @@ class Artifacts:
         for location in self.objects.below(job_id):
             below = location.partition("/")[2]
             if location not in retained and int(below.partition("/")[0]) <= epoch:
-                self.remove(location)
-
-    def ping(self) -> None:
-        """Raise OSError or StoreError if the file store cannot be reached."""
-        self.objects.ping()
+                self.objects.remove(location)
 
 
 def media_type(name: str) -> str:

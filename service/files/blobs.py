@@ -24,7 +24,7 @@ from typing import IO, Protocol
 
 from service import problems
 from service.errors import NotFoundError, StoreError
-from service.files.objects import CHUNK, ObjectStore
+from service.files.objects import ObjectStore
 from service.store.inputs import InputRows, check_offset
 from service.store.tables import BlobRow, UploadRow
 from sgsst_core.errors import OutputError
@@ -185,15 +185,6 @@ class Blobs(ABC):
             StoreError: If the file store does not respond.
         """
 
-    def read(self, row: BlobRow, start: int, stop: int, chunk: int = CHUNK) -> Iterator[bytes]:
-        """Yield the bytes of a blob from `start` up to `stop` in chunks, directly from the file store.
-
-        Raises:
-            FileNotFoundError: If the blob has just been removed.
-            StoreError: If the file store does not respond.
-        """
-        return self.objects.read(f"{BLOBS}/{row.location}", start, stop, chunk)
-
     @contextmanager
     def local_files(self, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:
         """Provide blobs as local files for the duration of the block, like `fetch`."""
@@ -209,7 +200,6 @@ class Blobs(ABC):
         """Return a writer of an upload's next bytes.
 
         Args:
-            upload: Row of the upload.
             seconds: Time from each `save` until the upload expires.
 
         Raises:
@@ -218,7 +208,6 @@ class Blobs(ABC):
             UPLOAD_LOCKED: If this or another process has an open writer of the upload.
         """
 
-    @abstractmethod
     def finish_upload(self, upload: UploadRow, seconds: float) -> str:
         """Turn a completely saved upload into a blob and return the blob's SHA-256.
 
@@ -228,6 +217,17 @@ class Blobs(ABC):
             NotFoundError: If the upload's bytes are gone.
             UPLOAD_LOCKED: If another request is finishing the upload.
         """
+        try:
+            return self._finish_upload(upload, seconds)
+        except (FileNotFoundError, NotFoundError):  # missing also if another request has just finished the upload
+            known = self._inputs.upload(upload.id, upload.owner).sha256
+            if known is None:
+                raise problems.LOST_UPLOAD(upload_id=upload.id) from None
+            return known
+
+    @abstractmethod
+    def _finish_upload(self, upload: UploadRow, seconds: float) -> str:
+        """Finish an upload; raise FileNotFoundError if bytes are missing."""
 
     @abstractmethod
     def discard_upload(self, upload_id: str) -> None:
@@ -240,21 +240,28 @@ class Blobs(ABC):
         """
         for upload_id in self._inputs.expire_uploads():
             self.discard_upload(upload_id)
-        removed = 0 if self._inputs.rolled_back else self._collect_blobs()
+        removed = 0
+        if not self._inputs.database.rolled_back:
+            unused = self._inputs.collect()
+            self.remove(unused)
+            removed = len(unused) + self._collect_orphans()
         before = self._expiry() - _ORPHAN_SECONDS
         for path in self.incoming.iterdir():
             if _older(path, before):
-                _remove(path)
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
                 removed += 1
         return removed
 
     def _expiry(self) -> float:
         """Return the reference time for expiry: the earlier of this machine's clock and the database's expiry time."""
-        return min(time.time(), self._inputs.expiry())
+        return min(time.time(), self._inputs.database.expiry())
 
     @abstractmethod
-    def _collect_blobs(self) -> int:
-        """Remove unused blobs and return the number of removed files."""
+    def _collect_orphans(self) -> int:
+        """Remove files without database rows, which processes left behind when they died; return their number."""
 
 
 class BlobFolder(Blobs):
@@ -271,8 +278,6 @@ class BlobFolder(Blobs):
         """Move or link a received file to its final path and return its SHA-256.
 
         Args:
-            path: Complete file that is no longer written to.
-            upload_id: Upload or receipt (`service.store.inputs`) that holds the blob from now on; None for none.
             link: Whether to hard-link the file instead of moving it, so that `path` remains.
         """
         with open_file(path, "rb") as file:
@@ -322,37 +327,26 @@ class BlobFolder(Blobs):
         """Return a writer to the upload's file."""
         return _FileWriter(self.upload_path(upload.id), self._inputs, upload, seconds)
 
-    def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Link the upload's file as a blob."""
+    def _finish_upload(self, upload: UploadRow, seconds: float) -> str:
         path = self.upload_path(upload.id)
-        try:
-            with open_file(path, "rb") as file:
-                _lock(file)
-                known = self._inputs.upload(upload.id, upload.owner).sha256
-                if known is not None:
-                    return known
-                if os.fstat(file.fileno()).st_size != upload.length:
-                    raise problems.LOST_UPLOAD(upload_id=upload.id)
-                sha256 = self.add(path, upload.id, link=True)
-                self._inputs.finish_upload(upload.id, sha256, seconds)
-                path.unlink(missing_ok=True)
-                return sha256
-        except FileNotFoundError:  # missing also if another request has just finished the upload
+        with open_file(path, "rb") as file:
+            _lock(file)
             known = self._inputs.upload(upload.id, upload.owner).sha256
-            if known is None:
-                raise problems.LOST_UPLOAD(upload_id=upload.id) from None
-            return known
+            if known is not None:
+                return known
+            if os.fstat(file.fileno()).st_size != upload.length:
+                raise FileNotFoundError(path)
+            sha256 = self.add(path, upload.id, link=True)
+            self._inputs.finish_upload(upload.id, sha256, seconds)
+            path.unlink(missing_ok=True)
+            return sha256
 
     def discard_upload(self, upload_id: str) -> None:
         """Remove the upload's file."""
         self.upload_path(upload_id).unlink(missing_ok=True)
 
-    def _collect_blobs(self) -> int:
-        unused = self._inputs.collect()
-        self.remove(unused)
-        removed = len(unused)
-        known = self._inputs.locations()
-        before = self._expiry() - _ORPHAN_SECONDS
+    def _collect_orphans(self) -> int:
+        known, before, removed = self._inputs.locations(), self._expiry() - _ORPHAN_SECONDS, 0
         for path in self._blobs.glob("*/*"):
             if _older(path, before) and f"{path.parent.name}/{path.name}" not in known:
                 path.unlink(missing_ok=True)
@@ -467,13 +461,6 @@ def flush_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def _older(path: Path, before: float) -> bool:

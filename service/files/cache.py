@@ -17,7 +17,6 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from service import problems
@@ -34,14 +33,6 @@ _log = logging.getLogger(__name__)
 
 #: Function that copies an object of the store to a file.
 Fetch = Callable[[Path], None]
-
-
-@dataclass(frozen=True)
-class _Entry:
-    path: Path
-    size: int
-    links: int
-    used_at: int
 
 
 class FileCache:
@@ -97,15 +88,18 @@ class FileCache:
         if self._total() + reserve <= self._limit:
             return
         with self._locked("evict"):
-            entries = sorted(self._entries(), key=lambda entry: entry.used_at)
-            total = sum(entry.size for entry in entries) + reserve
-            for entry in entries:
+            total = self._total() + reserve
+            for path, status in sorted(self._entries(), key=lambda entry: entry[1].st_atime_ns):
                 if total <= self._limit:
                     break
-                if entry.links == 1:
-                    entry.path.unlink(missing_ok=True)
-                    total -= entry.size
-            self._remove_partial_files()
+                if status.st_nlink == 1:
+                    path.unlink(missing_ok=True)
+                    total -= status.st_size
+            for path in self._partial.iterdir():
+                with contextlib.suppress(FileNotFoundError):
+                    # ctime, because a complete file has a synthetic modification time shortly before it is moved
+                    if path.stat().st_ctime < time.time() - _PARTIAL_SECONDS:
+                        path.unlink()
 
     def free(self, size: int) -> None:
         """Evict unused files to free `size` bytes of disk space for other purposes."""
@@ -177,20 +171,12 @@ class FileCache:
         return self._files / sha256[:2] / sha256
 
     def _total(self) -> int:
-        return sum(entry.size for entry in self._entries())
+        return sum(status.st_size for _, status in self._entries())
 
-    def _entries(self) -> Iterator[_Entry]:
+    def _entries(self) -> Iterator[tuple[Path, os.stat_result]]:
         for path in self._files.glob("*/*"):
             with contextlib.suppress(FileNotFoundError):
-                status = path.stat()
-                yield _Entry(path, status.st_size, status.st_nlink, status.st_atime_ns)
-
-    def _remove_partial_files(self) -> None:
-        for path in self._partial.iterdir():
-            with contextlib.suppress(FileNotFoundError):
-                # ctime, because a complete file has a synthetic modification time shortly before it is moved
-                if path.stat().st_ctime < time.time() - _PARTIAL_SECONDS:
-                    path.unlink()
+                yield path, path.stat()
 
     @contextlib.contextmanager
     def _locked(self, name: str) -> Iterator[None]:

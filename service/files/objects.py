@@ -114,12 +114,6 @@ class ObjectStore:
                 left -= len(data)
                 yield data
 
-    def exists(self, name: str) -> bool:
-        """Return whether the object exists, bypassing caches."""
-        with self._translated(name):
-            self._files.invalidate_cache()
-            return bool(self._files.isfile(self._path(name)))
-
     def stamp(self, name: str) -> Stamp:
         """Return metadata that change when the object's content changes.
 
@@ -179,20 +173,14 @@ class ObjectStore:
             self._checked.popitem(last=False)
         return None
 
-    def is_checked(self, name: str, sha256: str) -> bool:
-        """Return whether an object has passed `check` within the last hour and has not changed since."""
-        known = self._checked.get(name)
-        if known is None or known[1] != sha256 or time.monotonic() - known[2] > _CHECKED_SECONDS:
-            return False
-        try:
-            return known[0] == self.stamp(name)
-        except FileNotFoundError:
-            return False
-
     def check_once(self, name: str, sha256: str) -> None:
-        """Call `check` unless `is_checked` returns True."""
-        if not self.is_checked(name, sha256):
-            self.check(name, sha256)
+        """Call `check`, unless the object has passed it within the last hour and has not changed since."""
+        stamp, digest, checked_at = self._checked.get(name, (None, "", 0.0))
+        with contextlib.suppress(FileNotFoundError):
+            recent = digest == sha256 and time.monotonic() - checked_at <= _CHECKED_SECONDS
+            if recent and stamp == self.stamp(name):
+                return
+        self.check(name, sha256)
 
     def move(self, name: str, new_name: str) -> None:
         """Rename an object."""

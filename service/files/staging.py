@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
+
+from pydantic import BaseModel, ConfigDict
 
 from service import problems
 from service.parameters import MAX_JOB_NAME
@@ -37,29 +40,15 @@ _UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]
 _FALLBACKS = {"scene": "scene.ply", "style": "style", "cameras": "cameras.json", "mask": "mask.bin"}
 
 
-@dataclass(frozen=True)
-class Staged:
+class Staged(BaseModel):
     """Paths of a job's files relative to the staging folder, so that reports do not reveal its location."""
+
+    model_config = ConfigDict(frozen=True)
 
     scene: Path
     styles: tuple[Path, ...]
     cameras: Path | None
     photos: Path | None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the paths as JSON for `of_json`."""
-        return {
-            "scene": str(self.scene),
-            "styles": [str(path) for path in self.styles],
-            "cameras": None if self.cameras is None else str(self.cameras),
-            "photos": None if self.photos is None else str(self.photos),
-        }
-
-    @staticmethod
-    def of_json(values: Mapping[str, Any]) -> Staged:
-        """Return the paths from the JSON of `as_json`."""
-        cameras, photos = (None if values[role] is None else Path(values[role]) for role in ("cameras", "photos"))
-        return Staged(Path(values["scene"]), tuple(map(Path, values["styles"])), cameras, photos)
 
 
 def staged_name(role: str, name: str, number: int = 0) -> str:
@@ -69,7 +58,6 @@ def staged_name(role: str, name: str, number: int = 0) -> str:
     files keep only the last path component, and less of it if a file system may not hold it.
 
     Args:
-        role: Role of the input.
         name: Name that the user gave it, with slashes or backslashes between folders.
         number: Number of the input, for one without a name.
 
@@ -151,28 +139,20 @@ def check_roles(
             "file, in the same order.",
             input="style_weights",
         )
+    unfit = partial(problems.INVALID_INPUT, code="invalid-cameras")
     if not by_role["cameras"] and not orbit:
-        raise problems.INVALID_INPUT(
-            "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit'.",
-            code="invalid-cameras",
-            input="cameras",
-        )
+        message = "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit'."
+        raise unfit(message, input="cameras")
     if by_role["cameras"] and orbit:
-        raise problems.INVALID_INPUT(
-            "Both 'cameras' and the parameter 'orbit' were sent. Send only one of them.",
-            code="invalid-cameras",
-            input="cameras",
-        )
+        message = "Both 'cameras' and the parameter 'orbit' were sent. Send only one of them."
+        raise unfit(message, input="cameras")
     if by_role["photos"] and orbit:
-        raise problems.INVALID_INPUT(
-            "'photos' requires 'cameras', and cannot be combined with 'orbit'. Send 'cameras' instead.",
-            code="invalid-cameras",
-            input="photos",
-        )
+        message = "'photos' requires 'cameras', and cannot be combined with 'orbit'. Send 'cameras' instead."
+        raise unfit(message, input="photos")
     _check_camera_files([entry["name"] for entry in by_role["cameras"]])
-    twice = _first_duplicate((entry["role"], entry["name"].lower()) for entry in inputs)
-    if twice:
-        raise problems.INVALID_REQUEST(f"Two files of {twice[0]!r} have the name {twice[1]!r}. Rename one.")
+    (((role, name), count),) = Counter((entry["role"], entry["name"].lower()) for entry in inputs).most_common(1)
+    if count > 1:
+        raise problems.INVALID_REQUEST(f"Two files of {role!r} have the name {name!r}. Rename one.")
     for role in _FOLDER_ROLES:
         _check_folders(role, by_role[role])
 
@@ -189,8 +169,7 @@ def _check_region_styles(names: Sequence[str], of_regions: Sequence[str]) -> int
     own = len([name for name in names if name not in of_regions])
     if not own:
         raise problems.INVALID_REQUEST(
-            "Every file 'style' belongs to a region. Send one more for the rest of the scene.",
-            input="style",
+            "Every file 'style' belongs to a region. Send one more for the rest of the scene.", input="style"
         )
     return own
 
@@ -218,15 +197,6 @@ def _check_region_masks(names: Sequence[str], regions: Sequence[RegionRequest]) 
             "out the file.",
             input="mask",
         )
-
-
-def _first_duplicate(names: Iterable[tuple[str, str]]) -> tuple[str, str] | None:
-    seen: set[tuple[str, str]] = set()
-    for name in names:
-        if name in seen:
-            return name
-        seen.add(name)
-    return None
 
 
 def _check_folders(role: str, inputs: Sequence[Mapping[str, Any]]) -> None:
@@ -261,34 +231,17 @@ def layout(inputs: Sequence[Mapping[str, Any]]) -> tuple[Staged, list[tuple[Path
     Args:
         inputs: Inputs with `role`, `name` (from `staged_name`) and `sha256`.
     """
-    scene = Path()
-    styles: list[Path] = []
-    cameras: list[str] = []
-    photos = False
-    files = []
-    for entry in inputs:
-        role, name = entry["role"], entry["name"]
-        if role == "scene":
-            path = scene = Path(role, name)
-        elif role == "style":
-            path = Path(role, name)
-            styles.append(path)
-        elif role == "cameras":
-            path = Path("cameras", name)
-            cameras.append(name)
-        else:
-            path = Path(role, name)
-            photos = photos or role == "photos"
-        files.append((path, entry["sha256"]))
-    return Staged(scene, tuple(styles), _camera_path(cameras), Path("photos") if photos else None), files
+    files = [(Path(entry["role"], entry["name"]), entry["sha256"]) for entry in inputs]
+    by_role = {role: [path for path, _ in files if path.parts[0] == role] for role in ROLES}
+    (scene,), photos = by_role["scene"], Path("photos") if by_role["photos"] else None
+    cameras = _camera_path(by_role["cameras"])
+    return Staged(scene=scene, styles=tuple(by_role["style"]), cameras=cameras, photos=photos), files
 
 
 def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str, Path]) -> Staged:
     """Link a job's inputs into a folder.
 
     Args:
-        folder: Existing folder.
-        inputs: Inputs as for `layout`.
         blobs: Local paths of the files by digest.
     """
     staged, files = layout(inputs)
@@ -300,11 +253,9 @@ def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str,
     return staged
 
 
-def _camera_path(names: Sequence[str]) -> Path | None:
+def _camera_path(files: Sequence[Path]) -> Path | None:
     """Return the path of the cameras: the only file, the transforms.json, or the folder of a COLMAP model."""
-    jsons = [name for name in names if name.lower().endswith(".json") and name != "dataparser_transforms.json"]
-    if not names:
-        return None
-    if len(jsons) == 1:
-        return Path("cameras", jsons[0])
-    return Path("cameras", names[0]) if len(names) == 1 else Path("cameras")
+    jsons = [path for path in files if path.suffix.lower() == ".json" and path.name != "dataparser_transforms.json"]
+    if len(jsons) == 1 or len(files) == 1:
+        return (jsons or files)[0]
+    return Path("cameras") if files else None

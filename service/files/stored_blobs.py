@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from service import problems
 from service.errors import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BLOBS, UPLOADS, BlobFolder, Blobs, PartWriter, write_all
@@ -118,17 +117,10 @@ class StoredBlobs(Blobs):
         """Return a writer that stores one object per `save`, so that any API process can continue the upload."""
         return _ObjectWriter(self.incoming, self.objects, self._inputs, upload, seconds)
 
-    def finish_upload(self, upload: UploadRow, seconds: float) -> str:
-        """Concatenate the parts, on the server if possible, and fetch the result once to hash and cache it."""
+    def _finish_upload(self, upload: UploadRow, seconds: float) -> str:
         whole = self.incoming / f"{secrets.token_hex(12)}.part"
         try:
-            try:
-                sha256 = self._finish(upload, whole)
-            except (FileNotFoundError, NotFoundError):  # missing also if another request has just finished the upload
-                known = self._inputs.upload(upload.id, upload.owner).sha256
-                if known is None:
-                    raise problems.LOST_UPLOAD(upload_id=upload.id) from None
-                return known
+            sha256 = self._finish(upload, whole)
             self._inputs.finish_upload(upload.id, sha256, seconds)
         finally:
             whole.unlink(missing_ok=True)
@@ -138,8 +130,9 @@ class StoredBlobs(Blobs):
     def _finish(self, upload: UploadRow, whole: Path) -> str:
         """Turn an upload's bytes into a blob and a cached file, and return their SHA-256.
 
+        The parts are concatenated, on the server if possible, and the result is fetched once to hash and cache it.
+
         Args:
-            upload: Row of the upload.
             whole: Temporary path for the complete file.
 
         Raises:
@@ -193,19 +186,12 @@ class StoredBlobs(Blobs):
 
     # --- housekeeping ----------------------------------------------------------------------------------------------
 
-    def _collect_blobs(self) -> int:
-        unused = self._inputs.collect()
-        self.remove(unused)
-        removed = len(unused)
-        self._cache.evict()
-        if time.monotonic() - self._searched_at > _SEARCH_SECONDS:
-            self._searched_at = time.monotonic()
-            self._take_over()
-            removed += self._collect_orphans() + self.objects.abort_old_parts(self._expiry() - _ORPHAN_SECONDS)
-        return removed
-
     def _collect_orphans(self) -> int:
-        """Remove objects without database rows, which processes left behind when they died."""
+        self._cache.evict()
+        if time.monotonic() - self._searched_at <= _SEARCH_SECONDS:
+            return 0
+        self._searched_at = time.monotonic()
+        self._take_over()
         before = self._expiry() - _ORPHAN_SECONDS
         old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
         known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
@@ -215,7 +201,7 @@ class StoredBlobs(Blobs):
         orphans += [name for name in parts if name.split("/")[1] not in uploads]
         for name in orphans:
             self.objects.remove(name)
-        return len(orphans)
+        return len(orphans) + self.objects.abort_old_parts(before)
 
     def _take_over(self) -> None:
         """Upload inputs that remain from a time when the file store was a local folder."""

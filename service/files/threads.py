@@ -59,9 +59,6 @@ class FileThreads:
         """Call a function in a thread as soon as the owner has a free one, and return its result.
 
         Args:
-            owner: Owner that the work is done for.
-            function: Function that works on files.
-            arguments: Arguments of the function.
             size: Bytes that the function reads or writes, as far as they are known; they add to the time limit.
 
         Raises:

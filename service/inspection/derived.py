@@ -12,7 +12,7 @@ import shutil
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -146,7 +146,8 @@ class DerivedFiles:
             size = result.size + await input_bytes(self._store, job)
             staged = await self._threads.run(job.owner, self._stage, folder, job, [result], size=size)
             limits = {"name": name, "bytes": result.size + _HEADER_BYTES}  # a compressed scene is smaller
-            request = self._request("compress", folder, job, replace(staged, scene=Path(RESULT)), limits, result.size)
+            staged = staged.model_copy(update={"scene": Path(RESULT)})
+            request = self._request("compress", folder, job, staged, limits, result.size)
             loss = json.dumps(findings_of(await process.ask(request)), indent=1) + "\n"
             loss_file = folder / "loss.json"
             await self._threads.run(job.owner, loss_file.write_text, loss)
@@ -203,7 +204,7 @@ class DerivedFiles:
         return {
             "work": work,
             "folder": str(folder),
-            "staged": staged.as_json(),
+            "staged": staged.model_dump(mode="json"),
             "parameters": stored_parameters(job.parameters).model_dump(mode="json"),
             "limits": limits,
             "seconds": self._settings.inspection_seconds + _SECONDS_PER_BYTE * size,
@@ -255,7 +256,7 @@ def publish_derived(
         if unused is None:
             store.inputs.end_receipt(receipt)
         for location in [file.location for file in put] if unused is None else unused:
-            artifacts.remove(location)
+            artifacts.objects.remove(location)
 
 
 def remove_leftovers(folder: Path) -> None:

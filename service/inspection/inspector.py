@@ -256,7 +256,7 @@ class Inspector:
             request = {
                 "work": work,
                 "folder": str(folder),
-                "staged": staged.as_json(),
+                "staged": staged.model_dump(mode="json"),
                 "parameters": parameters.model_dump(mode="json"),
                 "limits": self._limits,
                 "seconds": seconds,

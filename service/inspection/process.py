@@ -33,7 +33,7 @@ from service.files.staging import ROLES, Staged
 from service.inspection.sandbox import confine, installation
 from service.optional import install_command
 from service.parameters import JobParameters
-from service.request import job_spec, scene_request
+from service.request import job_spec
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.decision import warnings_of
@@ -57,7 +57,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from worker.capture import choose_axes, read_capture
 from worker.inputs import Inputs, errors_of, read_inputs
-from worker.job import check_steps
+from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo
 from worker.prepare import dry_run
 from worker.processes import die_with_parent
@@ -202,7 +202,7 @@ def compress(staged: Staged, parameters: JobParameters, name: str) -> dict[str, 
     Returns:
         Loss of the compression: `CompressionLoss` as JSON.
     """
-    source, settings = scene_request(staged, parameters), parameters.settings()
+    source, settings = SceneRequest.of(staged.scene, staged.cameras, parameters), parameters.settings()
     scene, format = read_scene(source.scene).scene, format_of_name(name)
     assert format is not None
     with Path(name).open("wb") as output:
@@ -221,7 +221,7 @@ def blend(staged: Staged, parameters: JobParameters, parts: dict[str, float], na
     Returns:
         Nothing, as JSON.
     """
-    source, weights = scene_request(staged, parameters), list(parts.values())
+    source, weights = SceneRequest.of(staged.scene, staged.cameras, parameters), list(parts.values())
     files = [read_scene(Path(path)) for path in parts]
     rest = 1 - math.fsum(weights)
     if abs(rest) > _ROUNDING:
@@ -243,7 +243,9 @@ def video(staged: Staged, parameters: JobParameters, limits: dict[str, Any], sho
     """
     _check_encoder()
     options = JobVideo(**limits["options"])
-    source = scene_request(staged, parameters).model_copy(update={"resolution": options.resolution})
+    source = SceneRequest.of(staged.scene, staged.cameras, parameters).model_copy(
+        update={"resolution": options.resolution}
+    )
     unstylized = Path(limits["unstylized"]) if options.compare else None
     request = VideoRequest(
         source, Path(limits["name"]), options, parameters.settings().background, unstylized, images=staged.photos
@@ -290,7 +292,7 @@ def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
     """Return the final response of a child: `{"findings": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
         os.chdir(request["folder"])
-        staged = Staged.of_json(request["staged"])
+        staged = Staged.model_validate(request["staged"])
         work = WORK[request["work"]]
         return {"findings": work(staged, JobParameters(**request["parameters"]), request["limits"], show)}
     except MemoryError as error:
@@ -437,7 +439,8 @@ def _compile_kernels() -> None:
             write_scene(scene, Scene(*(torch.rand(count, *shape) for shape in shapes.values())))
             limits = dict.fromkeys(("gaussians", "views", "pixels", "image_pixels"), 1 << 40)
             parameters = JobParameters(orbit="3", resolution=96)
-            plan(Staged(scene, (STARRY_NIGHT,), None, None), parameters, limits, lambda now: None)
+            staged = Staged(scene=scene, styles=(STARRY_NIGHT,), cameras=None, photos=None)
+            plan(staged, parameters, limits, lambda now: None)
     finally:
         os._exit(0)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -143,7 +143,7 @@ class VideoMaker:
             request = {
                 "work": "video",
                 "folder": str(folder),
-                "staged": replace(staged, scene=Path(RESULT)).as_json(),
+                "staged": {**staged.model_dump(mode="json"), "scene": RESULT},
                 "parameters": stored_parameters(job.parameters).model_dump(mode="json"),
                 "limits": {
                     "name": VIDEO,

@@ -65,7 +65,7 @@ class Housekeeper:
         if not self._clocks.confirm():
             return
         for job_id in self._store.retention.expire():
-            self._artifacts.remove_job(job_id)
+            self._artifacts.objects.remove_below(job_id)
         for job_id, epoch in self._store.retention.unswept(_MAX_SWEEPS):
             sweep(self._store, self._artifacts, job_id, epoch)
         self._blobs.collect()
@@ -87,7 +87,7 @@ def remove_strays(store: Store, artifacts: Artifacts) -> int:
     removed = 0
     for job_id, names in old.items():
         for name in strays_of_job(store, job_id, names):
-            artifacts.remove(name)
+            artifacts.objects.remove(name)
             removed += 1
     return removed
 

@@ -159,7 +159,7 @@ class Publisher:
         """Remove replaced files; those that remain are swept when the job has ended."""
         try:
             for location in locations:
-                self._artifacts.remove(location)
+                self._artifacts.objects.remove(location)
         except StoreError as error:
             _log.warning("replaced files not deleted yet: %s", _reason(error), extra=self._lease.log_fields)
 

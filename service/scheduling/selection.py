@@ -75,7 +75,7 @@ class JobSelector:
         held = [each.grant for each in holdings]
         if self._capacity.free(held) < 1:
             return None  # without a query, which would lock rows that other dispatchers want
-        dispatchers = max(1, self._store.operations.dispatcher_count())
+        dispatchers = max(1, len(self._store.operations.dispatchers()))
         if not (waiting := self._store.leases.waiting(self._capacity.size * dispatchers)):
             return None
         waiting = -(-waiting // dispatchers)  # other dispatchers take their portion of the queue

@@ -237,7 +237,7 @@ def store_weights(objects: ObjectStore) -> dict[str, StoredFile]:
         status = path.stat()
         sha256 = _digest(path, status.st_size, status.st_mtime_ns)
         file = StoredFile(f"{_WEIGHTS_FOLDER}/{sha256}", sha256, status.st_size)
-        if not objects.exists(file.name):
+        if objects.size(file.name) < 0:
             objects.put(path, file.name)
         weights[path.name] = file
     return weights

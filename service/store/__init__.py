@@ -14,7 +14,6 @@ from service.store.inputs import InputRows
 from service.store.jobs import Jobs
 from service.store.leases import Leases
 from service.store.operations import Operations
-from service.store.quotas import Usage
 from service.store.retention import Retention
 from service.store.retries import RetryPolicy
 
@@ -39,7 +38,6 @@ class Store:
         self.keys = Keys(self.database)
         self.sessions = Sessions(self.database, settings.session_seconds)
         self.shares = Shares(self.database)
-        self.usage = Usage(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)
 
     def close(self) -> None:
@@ -48,10 +46,7 @@ class Store:
 
 
 def open_store(
-    settings: ServiceSettings,
-    clock: Clock | None = None,
-    patience: float = 0.0,
-    answer_seconds: float = ANSWER_SECONDS,
+    settings: ServiceSettings, clock: Clock | None = None, patience: float = 0.0, answer_seconds: float = ANSWER_SECONDS
 ) -> Store:
     """Open the store, and create its tables or migrate them to the current version.
 

@@ -12,7 +12,7 @@ from sqlalchemy import delete, insert, select
 from sqlalchemy.orm import Session
 
 from service import problems
-from service.states import JobStatus, Transition, next_status
+from service.states import Transition, next_status
 from service.store.clocks import retained_until
 from service.store.database import count, new_id
 from service.store.tables import Base, BlobRow, BlobUseRow, DeliveryRow, EventRow, JobRow
@@ -57,14 +57,10 @@ def end(session: Session, job: JobRow, transition: Transition, now: float, reten
     move(session, job, transition, now)
     count(session, "sgsst_jobs_finished_total", f'status="{status}"')
     if job.webhook:
-        session.add(_delivery(job, job.webhook, status, now))
-
-
-def _delivery(job: JobRow, url: str, status: JobStatus, now: float) -> DeliveryRow:
-    """Return the message that notifies a job's webhook of its end."""
-    data = {"id": job.id, "name": job.name, "status": status, "error": job.error}
-    body = {"type": f"job.{status}", "timestamp": now, "data": data}
-    return DeliveryRow(id=new_id("msg", now), job_id=job.id, url=url, body=body, tries=0, next_at=now)
+        data = {"id": job.id, "name": job.name, "status": status, "error": job.error}
+        body = {"type": f"job.{status}", "timestamp": now, "data": data}
+        message_id = new_id("msg", now)
+        session.add(DeliveryRow(id=message_id, job_id=job.id, url=job.webhook, body=body, tries=0, next_at=now))
 
 
 def add_status_event(session: Session, job: JobRow, now: float) -> None:

@@ -88,7 +88,6 @@ def advance_expiry_time(session: Session, now: float, seconds: float) -> None:
     """Advance the expiry time toward the clock.
 
     Args:
-        now: Current time of the clock.
         seconds: Working time of the dispatcher since its last call, by its monotonic clock.
     """
     row = session.get(CounterRow, (_NAME, ""), with_for_update=True)

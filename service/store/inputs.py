@@ -44,22 +44,20 @@ class InputRows:
     """Database rows of blobs, uploads, receipts and inspections."""
 
     def __init__(self, database: Database) -> None:
-        self._database = database
+        self.database = database
 
     def add_blob(self, sha256: str, location: str, size: int, upload_id: str | None = None) -> str:
         """Register a file's content and return its location; known content keeps its earlier location.
 
         Args:
-            sha256: SHA-256 of the content.
             location: Name of its file among the blobs.
-            size: Size of the content in bytes.
             upload_id: Upload or receipt that the content came with; it holds the blob from now on.
 
         Raises:
             NotFoundError: If the upload or receipt is gone.
         """
-        now = self._database.clock()
-        with self._database.writing() as session:
+        now = self.database.clock()
+        with self.database.writing() as session:
             if upload_id is not None:
                 _lock_upload(session, upload_id)
             insert = upsert(session)(BlobRow).values(sha256=sha256, location=location, size=size, touched_at=now)
@@ -70,13 +68,13 @@ class InputRows:
 
     def hold_known(self, sha256: str, size: int, upload_id: str | None) -> str | None:
         """Hold a known blob for an upload or receipt, and return its location; None if there is no such blob."""
-        with self._database.writing() as session:
+        with self.database.writing() as session:
             if upload_id is not None:
                 _lock_upload(session, upload_id)
             row = session.get(BlobRow, sha256, with_for_update=True)
             if row is None:
                 return None
-            row.touched_at = self._database.clock()
+            row.touched_at = self.database.clock()
             if upload_id is not None:
                 _hold_for_upload(session, upload_id, sha256, size)
             return row.location
@@ -89,10 +87,10 @@ class InputRows:
         """
         blobs = self.blobs(digests)
         # `touched_at` is not updated if it is recent, so consecutive submissions of one scene need no write
-        recent = self._database.clock() - _HOLD_FRACTION * GRACE_SECONDS
+        recent = self.database.clock() - _HOLD_FRACTION * GRACE_SECONDS
         if any(sha256 not in blobs or blobs[sha256].touched_at < recent for sha256 in digests):
-            with self._database.writing() as session:
-                now = self._database.clock()
+            with self.database.writing() as session:
+                now = self.database.clock()
                 for start in range(0, len(digests), 500):
                     held = BlobRow.sha256.in_(digests[start : start + 500])
                     # the same lock order as in `release_blobs`
@@ -107,7 +105,7 @@ class InputRows:
     def blobs(self, digests: Sequence[str]) -> dict[str, BlobRow]:
         """Return blobs by digest; missing ones are left out."""
         blobs: dict[str, BlobRow] = {}
-        with self._database.reading_rows() as connection:
+        with self.database.reading_rows() as connection:
             for start in range(0, len(digests), 500):
                 rows = connection.execute(_BLOBS, {"digests": digests[start : start + 500]})
                 blobs |= {row.sha256: BlobRow(**row._mapping) for row in rows}
@@ -115,27 +113,18 @@ class InputRows:
 
     def collect(self) -> list[str]:
         """Delete the rows of blobs that have been unused for a while; return their locations for removing the files."""
-        before = self._database.expiry() - GRACE_SECONDS
+        before = self.database.expiry() - GRACE_SECONDS
         used = exists().where(BlobUseRow.sha256 == BlobRow.sha256)
-        with self._database.writing() as session:
+        with self.database.writing() as session:
             query = select(BlobRow).where(BlobRow.touched_at < before, ~used).limit(1000)
             rows = session.scalars(query.with_for_update(skip_locked=True)).all()
             for row in rows:
                 session.delete(row)
             return [row.location for row in rows]
 
-    @property
-    def rolled_back(self) -> bool:
-        """Whether the database may have lost the rows of existing files."""
-        return self._database.rolled_back
-
-    def expiry(self) -> float:
-        """Return the time by which files expire."""
-        return self._database.expiry()
-
     def locations(self) -> set[str]:
         """Return the locations of all blobs."""
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             return set(session.scalars(select(BlobRow.location)))
 
     def create_upload(
@@ -156,18 +145,13 @@ class InputRows:
             IDEMPOTENCY_KEY_REUSED: If the key was used for a different upload.
             QUOTA_EXCEEDED: If its bytes would exceed the owner's quota.
         """
-        now = self._database.clock()
-        with self._database.writing() as session:
+        now = self.database.clock()
+        with self.database.writing() as session:
             lock_owner(session, owner)
             used_key = None
             if idempotency_key is not None:
-                used_key = idempotency_row(
-                    session,
-                    owner,
-                    f"upload:{idempotency_key}",
-                    hashlib.sha256(f"{length} {header}".encode()).hexdigest(),
-                    now,
-                )
+                fingerprint = hashlib.sha256(f"{length} {header}".encode()).hexdigest()
+                used_key = idempotency_row(session, owner, f"upload:{idempotency_key}", fingerprint, now)
                 known = session.get(UploadRow, used_key.created_id) if used_key.created_id else None
                 if known is not None:
                     return known
@@ -189,17 +173,17 @@ class InputRows:
         Raises:
             NotFoundError: If there is no such upload.
         """
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             row = session.get(UploadRow, upload_id)
-        if row is None or row.owner != owner or row.expires_at < self._database.clock():
+        if row is None or row.owner != owner or row.expires_at < self.database.clock():
             raise problems.NO_UPLOAD(upload_id=upload_id)
         return row
 
     def uploads(self, upload_ids: Sequence[str], owner: str) -> dict[str, UploadRow]:
         """Return uploads of this owner by id; missing and expired ones are left out."""
-        now = self._database.clock()
+        now = self.database.clock()
         uploads: dict[str, UploadRow] = {}
-        with self._database.reading_rows() as connection:
+        with self.database.reading_rows() as connection:
             for start in range(0, len(upload_ids), 500):
                 parameters = {"ids": upload_ids[start : start + 500], "owner": owner, "now": now}
                 uploads |= {row.id: UploadRow(**row._mapping) for row in connection.execute(_UPLOADS, parameters)}
@@ -211,7 +195,6 @@ class InputRows:
         """Record newly saved bytes of an upload and return its new expiry.
 
         Args:
-            upload_id: Id of the upload.
             start: Offset of the first new byte.
             size: Number of new bytes.
             seconds: Time until the upload expires.
@@ -220,11 +203,9 @@ class InputRows:
         Raises:
             ConflictError: If another request has saved bytes at this offset meanwhile.
         """
-        expires = self._database.clock() + seconds
-        with self._database.writing() as session:
-            row = session.get(UploadRow, upload_id, with_for_update=True)
-            if row is None:
-                raise problems.NO_UPLOAD(upload_id=upload_id)
+        expires = self.database.clock() + seconds
+        with self.database.writing() as session:
+            row = _lock_upload(session, upload_id)
             check_offset(row, start)
             if location is not None:
                 session.add(UploadPartRow(upload_id=upload_id, start=start, size=size, location=location))
@@ -234,24 +215,21 @@ class InputRows:
     def parts(self, upload_id: str) -> list[UploadPartRow]:
         """Return the parts of an unfinished upload in order."""
         query = select(UploadPartRow).where(UploadPartRow.upload_id == upload_id).order_by(UploadPartRow.start)
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             return list(session.scalars(query))
 
     def known_uploads(self, upload_ids: Sequence[str]) -> set[str]:
         """Return those of the given uploads that exist, finished or not."""
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             return set(session.scalars(select(UploadRow.id).where(UploadRow.id.in_(upload_ids))))
 
     def finish_upload(self, upload_id: str, sha256: str, seconds: float) -> None:
         """Link an upload to the blob made from its bytes."""
-        with self._database.writing() as session:
-            row = session.get(UploadRow, upload_id, with_for_update=True)
-            if row is None:
-                raise problems.NO_UPLOAD(upload_id=upload_id)
-            row.offset, row.sha256, row.expires_at = row.length, sha256, self._database.clock() + seconds
+        with self.database.writing() as session:
+            row = _lock_upload(session, upload_id)
+            row.offset, row.sha256, row.expires_at = row.length, sha256, self.database.clock() + seconds
             session.execute(delete(UploadPartRow).where(UploadPartRow.upload_id == upload_id))
-            use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
-            session.execute(use.on_conflict_do_nothing())
+            _hold_for_upload(session, upload_id, sha256)
 
     def delete_upload(self, upload_id: str, owner: str) -> list[str]:
         """Delete an upload; a blob made from it remains for the jobs that use it.
@@ -259,7 +237,7 @@ class InputRows:
         Returns:
             Locations of blobs that are no longer used, for `Blobs.remove`.
         """
-        with self._database.writing() as session:
+        with self.database.writing() as session:
             row = session.get(UploadRow, upload_id, with_for_update=True)
             if row is None or row.owner != owner:
                 raise problems.NO_UPLOAD(upload_id=upload_id)
@@ -276,10 +254,10 @@ class InputRows:
         Raises:
             QUOTA_EXCEEDED: If the bytes would exceed the owner's quota.
         """
-        now = self._database.clock()
+        now = self.database.clock()
         row = UploadRow(id=new_id(RECEIPT, now), owner=owner, length=size, offset=0, filename="", metadata_header="")
         row.created_at, row.expires_at = now, now + GRACE_SECONDS
-        with self._database.writing() as session:
+        with self.database.writing() as session:
             lock_owner(session, owner)
             session.add(row)
             session.flush()
@@ -293,7 +271,7 @@ class InputRows:
             QUOTA_EXCEEDED: If the bytes would exceed the owner's quota.
             NotFoundError: If the receipt has expired.
         """
-        with self._database.writing() as session:
+        with self.database.writing() as session:
             lock_owner(session, owner)
             _lock_upload(session, receipt).length += size
             session.flush()
@@ -301,8 +279,8 @@ class InputRows:
 
     def renew_receipts(self, receipts: Sequence[str]) -> None:
         """Extend the receipts of active requests."""
-        with self._database.writing() as session:
-            expires = self._database.clock() + GRACE_SECONDS
+        with self.database.writing() as session:
+            expires = self.database.clock() + GRACE_SECONDS
             session.execute(update(UploadRow).where(UploadRow.id.in_(receipts)).values(expires_at=expires))
 
     def end_receipt(self, receipt: str) -> list[str]:
@@ -311,14 +289,14 @@ class InputRows:
         Returns:
             Locations of blobs that are no longer used, for `Blobs.remove`.
         """
-        with self._database.writing() as session:
+        with self.database.writing() as session:
             session.execute(delete(UploadRow).where(UploadRow.id == receipt))
             return release_blobs(session, f"upload:{receipt}")
 
     def expire_uploads(self) -> list[str]:
         """Delete expired uploads and return their ids for removing their bytes."""
-        now = self._database.expiry()
-        with self._database.writing() as session:
+        now = self.database.expiry()
+        with self.database.writing() as session:
             query = select(UploadRow).where(UploadRow.expires_at < now).limit(500)
             rows = session.scalars(query.with_for_update(skip_locked=True)).all()
             for row in rows:
@@ -328,14 +306,14 @@ class InputRows:
 
     def inspection(self, key: str) -> dict[str, Any] | None:
         """Return the result of an earlier inspection of the same content; None if there is none."""
-        with self._database.reading_rows() as connection:
+        with self.database.reading_rows() as connection:
             result: dict[str, Any] | None = connection.execute(_INSPECTION, {"key": key}).scalar()
             return result
 
     def add_inspection(self, key: str, result: dict[str, Any]) -> None:
         """Store the result of an inspection, and delete old results."""
-        now = self._database.clock()
-        with self._database.writing() as session:
+        now = self.database.clock()
+        with self.database.writing() as session:
             insert = upsert(session)(InspectionRow).values(key=key, result=result, created_at=now)
             session.execute(insert.on_conflict_do_nothing())
             session.execute(delete(InspectionRow).where(InspectionRow.created_at < now - _INSPECTION_SECONDS))
@@ -355,8 +333,8 @@ def _lock_upload(session: Session, upload_id: str) -> UploadRow:
     return row
 
 
-def _hold_for_upload(session: Session, upload_id: str, sha256: str, size: int) -> None:
-    """Hold a blob for an upload or receipt; a receipt's charge moves from the incoming bytes to the blob."""
+def _hold_for_upload(session: Session, upload_id: str, sha256: str, size: int = 0) -> None:
+    """Hold a blob for an upload or receipt; a receipt's charge of `size` moves from the incoming bytes to the blob."""
     use = upsert(session)(BlobUseRow).values(holder=f"upload:{upload_id}", sha256=sha256)
     session.execute(use.on_conflict_do_nothing())
     receipt = update(UploadRow).where(UploadRow.id == upload_id, IS_RECEIPT).values(length=UploadRow.length - size)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Float, Select, String, bindparam, func, insert, select, tuple_
+from sqlalchemy import Connection, Float, String, bindparam, func, insert, select, tuple_
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -38,18 +38,14 @@ _NEWEST_PREVIEWS = (
 _UNFINISHED_OF = select(func.count()).where(_JOBS.c.owner == bindparam("owner"), _JOBS.c.status.in_(UNFINISHED))
 
 
-def _count_ahead() -> Select[int]:
-    """Return the query that counts the queued jobs ahead of a job, in two ranges of the queue's index."""
-    queued = select(func.count()).select_from(_JOBS).where(_JOBS.c.status == JobStatus.QUEUED)
-    higher = queued.where(_JOBS.c.priority > bindparam("priority"))
-    own_position = tuple_(bindparam("queued_at", type_=Float), bindparam("job_id", type_=String))
-    earlier = queued.where(
-        _JOBS.c.priority == bindparam("priority"), tuple_(_JOBS.c.queued_at, _JOBS.c.id) < own_position
-    )
-    return select(higher.scalar_subquery() + earlier.scalar_subquery())
-
-
-_AHEAD = _count_ahead()
+_QUEUED = select(func.count()).select_from(_JOBS).where(_JOBS.c.status == JobStatus.QUEUED)
+_OWN_POSITION = tuple_(bindparam("queued_at", type_=Float), bindparam("job_id", type_=String))
+_HIGHER = _QUEUED.where(_JOBS.c.priority > bindparam("priority"))
+_EARLIER = _QUEUED.where(
+    _JOBS.c.priority == bindparam("priority"), tuple_(_JOBS.c.queued_at, _JOBS.c.id) < _OWN_POSITION
+)
+#: Number of the queued jobs ahead of a job, in two ranges of the queue's index.
+_AHEAD = select(_HIGHER.scalar_subquery() + _EARLIER.scalar_subquery())
 
 
 @dataclass(frozen=True)
@@ -66,6 +62,12 @@ class NewJob:
     parameters: dict[str, Any]
     inputs: list[dict[str, Any]]
     webhook: str | None = None
+
+    def row(self, now: float) -> dict[str, Any]:
+        """Return the columns of the queued job."""
+        times = dict.fromkeys(("created_at", "queued_at", "not_before"), now)
+        counts = dict.fromkeys(("attempt", "failures", "lease_epoch"), 0)
+        return {**vars(self), **times, **counts, "id": new_id("job", now), "status": JobStatus.QUEUED}
 
 
 @dataclass(frozen=True)
@@ -117,10 +119,7 @@ class Jobs:
         """Queue a job and hold its blobs.
 
         Args:
-            new: Job to queue.
             limit: Maximum number of unfinished jobs of the owner.
-            quotas: Quotas of the owner.
-            idempotency: Idempotency-Key of the request; None for none.
             receipt: Receipt for the request's files, which the new job takes over; None if the request has no files.
 
         Returns:
@@ -144,7 +143,7 @@ class Jobs:
                     return known, False
             _check_queue(session, new.owner, limit)
             count_job(session, new.owner, quotas, now)
-            values = _row_of_new_job(new, now)
+            values = new.row(now)
             session.execute(insert(_JOBS), values)
             job = JobRow(**values)
             if used_key is not None:
@@ -335,9 +334,6 @@ class Jobs:
 
         Args:
             source: Row of the file that they were derived from.
-            files: Stored files.
-            owner: Owner of the job.
-            quotas: Quotas of the owner.
             replace: Whether files replace those of the same names, instead of being left out.
             receipt: Receipt that the owner was charged by before the files were stored; the files take it over.
 
@@ -385,25 +381,6 @@ class Jobs:
         query = select(EventRow.job_id, func.max(EventRow.id)).where(EventRow.job_id.in_(job_ids))
         with self._database.reading() as session:
             return dict(session.execute(query.group_by(EventRow.job_id)).all())
-
-
-def _row_of_new_job(new: NewJob, now: float) -> dict[str, Any]:
-    return {
-        "id": new_id("job", now),
-        "owner": new.owner,
-        "name": new.name,
-        "status": JobStatus.QUEUED,
-        "priority": new.priority,
-        "parameters": new.parameters,
-        "inputs": new.inputs,
-        "created_at": now,
-        "queued_at": now,
-        "not_before": now,
-        "attempt": 0,
-        "failures": 0,
-        "lease_epoch": 0,
-        "webhook": new.webhook,
-    }
 
 
 def _check_queue(session: Session, owner: str, limit: int) -> None:

@@ -8,11 +8,12 @@ only one of them can write.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Delete, and_, bindparam, delete, func, or_, select, update
+from sqlalchemy import and_, bindparam, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from service import problems
@@ -21,7 +22,7 @@ from service.states import ACTIVE, AttemptOutcome, JobStatus, Transition
 from service.store.changes import add_event, end, move
 from service.store.database import Database, count, observe, upsert
 from service.store.history import add_point
-from service.store.queue import LOST, WAITING, next_job, next_jobs, reserve, reserved_by
+from service.store.queue import LOST, WAITING, next_jobs, reserve, reserved_by
 from service.store.quotas import count_gpu_seconds
 from service.store.retries import DISPATCHER_LOST, MAX_LOSSES, Cause, FailureCount, RetryPolicy, Verdict, cause_of
 from service.store.tables import (
@@ -47,6 +48,11 @@ LIVE = "live/"
 _MAX_CAUSES = 2 * MAX_LOSSES
 #: Maximum number of candidates for backfilling, each from a different owner.
 _MAX_BACKFILL_CANDIDATES = 16
+
+_PROGRESS = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
+_OLD = select(EventRow.id).where(_PROGRESS).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
+#: Statement that deletes all but the last progress events of a job.
+_DELETE_OLD_PROGRESS = delete(EventRow).where(_PROGRESS, EventRow.id <= _OLD.scalar_subquery())
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,6 @@ class Leases:
         taken meanwhile, and the reservation remains.
 
         Args:
-            dispatcher: Name of the dispatcher.
             fits: Callback that returns whether there is capacity for a job.
             should_reserve: Callback that returns whether to reserve capacity for a job that does not fit; if not, the
                 job is skipped.
@@ -127,9 +132,10 @@ class Leases:
         while True:
             now = self._database.clock()
             with self._database.writing() as session:
-                job = next_job(session, dispatcher, now, skipped)
-                if job is None:
+                jobs = next_jobs(session, dispatcher, now, skipped, most=1)
+                if not jobs:
                     return None
+                job = jobs[0]
                 lost = job.status in ACTIVE
                 if lost and not is_lost(job):
                     skipped.append(job.id)
@@ -216,9 +222,7 @@ class Leases:
 
     def hold_gpus(self, lease: Lease, gpus: int) -> None:
         """Set the number of GPUs that the attempt holds, and charge its usage so far to the job's owner."""
-        now = self._database.clock()
-        with self._database.writing() as session:
-            job = self._require_lease(session, lease)
+        with self._held(lease) as (session, job, now):
             attempt = session.get_one(AttemptRow, (job.id, job.attempt))
             _count_gpus(session, job, attempt, now)
             attempt.gpus, attempt.gpus_since = gpus, now
@@ -230,9 +234,7 @@ class Leases:
 
         A job whose user wanted it to finish during an earlier attempt is marked as finishing again.
         """
-        now = self._database.clock()
-        with self._database.writing() as session:
-            job = self._require_lease(session, lease)
+        with self._held(lease) as (session, job, now):
             if job.status == JobStatus.STARTING:
                 move(session, job, Transition.START, now)
                 if job.finish_requested:
@@ -257,9 +259,7 @@ class Leases:
 
     def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
         """Publish files, replacing those of the same names; return the locations of the replaced files."""
-        now = self._database.clock()
-        with self._database.writing() as session:
-            job = self._require_lease(session, lease)
+        with self._held(lease) as (session, job, now):
             return _publish(session, job, files, now)
 
     # --- the end of an attempt -------------------------------------------------------------------------------------
@@ -269,9 +269,7 @@ class Leases:
 
         If a cancellation came too late, the job still counts as succeeded.
         """
-        now = self._database.clock()
-        with self._database.writing() as session:
-            job = self._require_lease(session, lease)
+        with self._held(lease) as (session, job, now):
             unused = _publish(session, job, files, now)
             # the checkpoint, and the colors of the unfinished job
             obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in (".", LIVE)))
@@ -288,16 +286,13 @@ class Leases:
         An error with the code of `InfrastructureError` is never permanent.
 
         Args:
-            lease: Lease of the job.
             error: `code` and `message`, and the `cause` of an outage (`retries.Cause`).
             permanent: Whether another attempt would fail in the same way.
 
         Returns:
             Whether the job will be retried.
         """
-        now = self._database.clock()
-        with self._database.writing() as session:
-            job = self._require_lease(session, lease)
+        with self._held(lease) as (session, job, now):
             verdict = self._close(session, job, AttemptOutcome.FAILED, error, now, permanent=permanent)
             if verdict.transition != Transition.STOP:
                 job.error = error
@@ -309,9 +304,7 @@ class Leases:
 
     def release(self, lease: Lease) -> None:
         """Return an unfinished job to the queue without counting a failure, because the dispatcher is shutting down."""
-        now = self._database.clock()
-        with self._database.writing() as session:
-            job = self._require_lease(session, lease)
+        with self._held(lease) as (session, job, now):
             verdict = self._close(session, job, AttemptOutcome.RELEASED, None, now)
             if verdict.transition == Transition.REQUEUE:
                 self._requeue(session, job, now, now)
@@ -320,9 +313,7 @@ class Leases:
 
     def stop(self, lease: Lease) -> None:
         """End a job that was being canceled."""
-        now = self._database.clock()
-        with self._database.writing() as session:
-            job = self._require_lease(session, lease)
+        with self._held(lease) as (session, job, now):
             _close_attempt(session, job, AttemptOutcome.CANCELED, None, now)
             end(session, job, Transition.STOP, now, self._retention)
 
@@ -373,27 +364,21 @@ class Leases:
         job = session.get(JobRow, lease.job_id, with_for_update=True)
         return job if job is not None and _is_held(job, lease) else None
 
-    def _require_lease(self, session: Session, lease: Lease) -> JobRow:
-        job = self._leased_job(session, lease)
-        if job is None:
-            raise _lost(lease)
-        return job
+    @contextmanager
+    def _held(self, lease: Lease) -> Iterator[tuple[Session, JobRow, float]]:
+        """Provide a transaction, the leased job and the time; raise `LeaseLostError` if the lease is lost."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._leased_job(session, lease)
+            if job is None:
+                raise _lost(lease)
+            yield session, job, now
 
     @staticmethod
     def _requeue(session: Session, job: JobRow, now: float, not_before: float) -> None:
         job.not_before = not_before
         job.lease_owner = job.lease_expires_at = None
         move(session, job, Transition.REQUEUE, now)
-
-
-def _delete_old_progress() -> Delete:
-    """Return the statement that deletes all but the last progress events of a job."""
-    of_job = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
-    newest = select(EventRow.id).where(of_job).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
-    return delete(EventRow).where(of_job, EventRow.id <= newest.scalar_subquery())
-
-
-_DELETE_OLD_PROGRESS = _delete_old_progress()
 
 
 def _lost(lease: Lease) -> ServiceError:

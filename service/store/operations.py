@@ -72,12 +72,6 @@ class Operations:
         with self._database.reading() as session:
             return list(session.scalars(select(DispatcherRow).where(_IS_ALIVE).order_by(DispatcherRow.name), span))
 
-    def dispatcher_count(self) -> int:
-        """Return the number of live dispatchers."""
-        span = self._span()
-        with self._database.reading_rows() as connection:
-            return connection.execute(_ALIVE, span).scalar_one()
-
     def check(self) -> int:
         """Query the database for a health check, and return the number of live dispatchers.
 

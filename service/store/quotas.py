@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from service import problems
 from service.settings import ServiceSettings
-from service.store.database import Database, upsert
+from service.store.database import upsert
 from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, UploadRow, UsageRow
 
 _DAY = 86_400
@@ -61,29 +61,6 @@ class Quotas:
 
 
 NO_QUOTAS = Quotas()
-
-
-@dataclass(frozen=True)
-class Used:
-    """Usage of a key today, and its stored bytes."""
-
-    jobs: int
-    gpu_seconds: float
-    stored_bytes: int
-
-
-class Usage:
-    """Usage of keys."""
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-
-    def of(self, owner: str) -> Used:
-        """Return the current usage of one owner."""
-        with self._database.reading() as session:
-            row = session.get(UsageRow, (owner, day_of(self._database.clock())))
-            jobs, seconds = (row.jobs, row.gpu_seconds) if row is not None else (0, 0.0)
-            return Used(jobs, seconds, stored_bytes(session, owner))
 
 
 def day_of(now: float) -> int:

@@ -112,7 +112,6 @@ class RetryPolicy:
         """Decide whether a job is retried after an attempt that failed, was lost or was released.
 
         Args:
-            outcome: Outcome of the attempt.
             causes: Cause of the attempt's end, then those of earlier attempts back to the last one that made a step.
             status: Status of the job while the attempt ran.
             count: Count of failures before this attempt.

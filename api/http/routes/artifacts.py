@@ -12,18 +12,12 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, Digits
-from api.http.documentation import Responses, headers, links
+from api.http.documentation import headers, links
 from api.http.multipart import json_body
 from api.http.progress import VIDEO, answer_work
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import ArtifactList, ArtifactView, BlendRequest, artifact_view
-from api.http.sending import (
-    ConditionsDep,
-    SentFile,
-    file_answers,
-    send_file,
-    send_list,
-)
+from api.http.sending import ConditionsDep, SentFile, file_answers, send_file, send_list
 from service import problems
 from service.errors import LostFileError
 from service.files.artifacts import media_type
@@ -51,9 +45,8 @@ _SANDBOX = (
             "links": links(
                 "get_artifact", "head_artifact", job_id="$request.path.job_id", name="$response.body#/artifacts/0/name"
             )
-        },
+        }
     },
-    operation_id="list_artifacts",
 )
 async def list_artifacts(
     job_id: JobId,
@@ -86,19 +79,14 @@ _CONTENT = {
     "image/png": "\x89PNG\r\n\x1a\n",
     "video/mp4": "\0\0\0 ftypisom",
 }
-_ANSWERS: Responses = {
-    **file_answers(_CONTENT),
-}
+_ANSWERS = file_answers(_CONTENT)
 
 
 @router.head(
     "/{job_id}/artifacts/{name:path}", operation_id="head_artifact", response_class=Response, responses=_ANSWERS
 )
 @router.get(
-    "/{job_id}/artifacts/{name:path}",
-    operation_id="get_artifact",
-    response_class=StreamingResponse,
-    responses=_ANSWERS,
+    "/{job_id}/artifacts/{name:path}", operation_id="get_artifact", response_class=StreamingResponse, responses=_ANSWERS
 )
 async def get_artifact(
     request: Request,
@@ -122,18 +110,9 @@ async def get_artifact(
     """Download a file, whole or in ranges. Resume with `Range` and `If-Range`."""
     job = await asyncio.to_thread(find, context, caller, job_id)
     row = await _find_artifact(context, caller, job, name, format_)
-    kind = media_type(row.name)
-    file = SentFile(
-        owner=job.owner,
-        sha256=row.sha256,
-        size=row.size,
-        name=_file_name(job.name, row.name),
-        kind=kind,
-        inline=kind.startswith(_INLINE),
-        policy=_SANDBOX if kind.startswith("text/html") else None,
-        check=partial(check_artifact, context, row),
-        read=partial(context.artifacts.read, row.location),
-    )
+    # the suggested name includes the job's, so that results of jobs differ
+    plain, last = re.sub(r"[^A-Za-z0-9._-]+", "_", job.name).strip("._")[:60], PurePosixPath(row.name).name
+    file = artifact_file(context, job.owner, row, f"{plain}-{last}" if plain else last, media_type(row.name))
     return await send_file(request, context.threads, file, conditions)
 
 
@@ -151,6 +130,13 @@ async def _find_artifact(
     return row
 
 
+def artifact_file(context: Context, owner: str, row: ArtifactRow, name: str, kind: str) -> SentFile:
+    """Return a stored result for sending it under a name, with a media type."""
+    check, read = partial(check_artifact, context, row), partial(context.artifacts.objects.read, row.location)
+    policy = _SANDBOX if kind.startswith("text/html") else None
+    return SentFile(owner, row.sha256, row.size, name, kind, check, read, policy, inline=kind.startswith(_INLINE))
+
+
 def check_artifact(context: Context, row: ArtifactRow) -> None:
     """Check that a stored result matches its database row.
 
@@ -159,18 +145,12 @@ def check_artifact(context: Context, row: ArtifactRow) -> None:
         NotFoundError: If the file has just been replaced by another one, or its job has been deleted.
     """
     try:
-        context.artifacts.check(row.location, row.sha256)
+        context.artifacts.objects.check_once(row.location, row.sha256)
     except LostFileError:
         now = context.store.jobs.artifact(row.job_id, row.name)
         if now is None or now.location != row.location:
             raise problems.FILE_REMOVED() from None
         raise
-
-
-def _file_name(job_name: str, name: str) -> str:
-    """Return the file name to suggest for a result. It includes the job's name, so that results of jobs differ."""
-    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", job_name).strip("._")[:60]
-    return f"{plain}-{PurePosixPath(name).name}" if plain else PurePosixPath(name).name
 
 
 @router.post(
@@ -182,9 +162,8 @@ def _file_name(job_name: str, name: str) -> str:
             "description": "The blend exists. The same request returns the same file.",
             "headers": headers("Location"),
             "links": links("get_artifact", "head_artifact", job_id="$request.path.job_id", name="$response.body#/name"),
-        },
+        }
     },
-    operation_id="create_blend",
 )
 async def create_blend(
     job_id: JobId,
@@ -196,25 +175,15 @@ async def create_blend(
     others = {part.job_id: part.weight for part in body.others}
     if len({job_id, *others}) != 1 + len(body.others):
         raise problems.INVALID_REQUEST("others: A job is named twice. Give each job one weight.")
-    job = await asyncio.to_thread(_find_owned, context, caller, job_id, others)
+    for other in others:
+        await asyncio.to_thread(find, context, caller, other)
+    job = await asyncio.to_thread(find, context, caller, job_id)
     row = await context.derived.blended(job, Blend(body.weight, others, by_name(body.format)), caller.quotas)
     view = artifact_view(row)
     return Response(view.model_dump_json(), 201, {"Location": view.url}, media_type="application/json")
 
 
-def _find_owned(context: Context, caller: Caller, job_id: str, others: dict[str, float]) -> JobRow:
-    """Return the caller's job; raise an error unless the caller owns the jobs in `others` too."""
-    for other in others:
-        find(context, caller, other)
-    return find(context, caller, job_id)
-
-
-@router.post(
-    "/{job_id}/video",
-    response_model=ArtifactView,
-    responses={200: VIDEO},
-    operation_id="make_video",
-)
+@router.post("/{job_id}/video", response_model=ArtifactView, responses={200: VIDEO})
 async def make_video(
     request: Request,
     job_id: JobId,

@@ -36,7 +36,6 @@ _EXAMPLES = {
 
 @router.get(
     "/{job_id}/events",
-    operation_id="watch_job",
     response_class=StreamingResponse,
     responses={
         200: {

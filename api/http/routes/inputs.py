@@ -12,16 +12,10 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, Digits
-from api.http.documentation import Responses, links
+from api.http.documentation import links
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import InputFileView, InputList, input_views
-from api.http.sending import (
-    ConditionsDep,
-    SentFile,
-    file_answers,
-    send_file,
-    send_list,
-)
+from api.http.schemas import InputFileView, InputList, input_view
+from api.http.sending import ConditionsDep, SentFile, file_answers, send_file, send_list
 from service import problems
 from service.errors import LostFileError
 from service.files.blobs import BLOBS
@@ -41,7 +35,7 @@ _KINDS = {
 }
 _INPUT = re.compile(r"([a-z]{1,10})(?::([0-9]{1,6}))?", re.ASCII)
 #: Content-Security-Policy of inputs. Users provide these files, so no script in them may run.
-_POLICY = "sandbox; default-src 'none'"
+INPUT_POLICY = "sandbox; default-src 'none'"
 
 
 _CONTENT: dict[str, Any] = {
@@ -51,9 +45,7 @@ _CONTENT: dict[str, Any] = {
     "image/png": "\x89PNG\r\n\x1a\n",
     "image/webp": "RIFF",
 }
-_ANSWERS: Responses = {
-    **file_answers(_CONTENT, always_policy=True),
-}
+_ANSWERS = file_answers(_CONTENT, always_policy=True)
 
 
 @router.get(
@@ -64,9 +56,8 @@ _ANSWERS: Responses = {
             "links": links(
                 "get_input", "head_input", job_id="$request.path.job_id", role="$response.body#/inputs/0/role"
             )
-        },
+        }
     },
-    operation_id="list_inputs",
 )
 async def list_inputs(
     job_id: JobId,
@@ -81,7 +72,8 @@ async def list_inputs(
     def read(start: str | None, most: int) -> tuple[list[InputFileView], str | None]:
         position = int(start or 0)
         page = context.store.jobs.input_page(job_id, position, most + 1)
-        return input_views(job_id, page[:most]), str(position + most) if len(page) > most else None
+        following = str(position + most) if len(page) > most else None
+        return [input_view(job_id, *entry) for entry in page[:most]], following
 
     return await send_list("inputs", read, str(cursor), limit, context.readers.of(caller.owner))
 
@@ -105,21 +97,19 @@ async def get_input(
 ) -> Response:
     """Download a file that a job was created from, whole or in ranges, until the job expires."""
     entry, row = await asyncio.to_thread(_find_input, context, caller, job_id, role)
-    file = SentFile(
-        owner=caller.owner,
-        sha256=row.sha256,
-        size=row.size,
-        name=entry["name"],
-        kind=_KINDS.get(PurePosixPath(entry["name"]).suffix.lower(), "application/octet-stream"),
-        inline=False,
-        policy=_POLICY,
-        check=partial(check_input, context, row),
-        read=partial(context.blobs.read, row),
-    )
+    kind = _KINDS.get(PurePosixPath(entry["name"]).suffix.lower(), "application/octet-stream")
+    file = input_file(context, caller.owner, row, entry["name"], kind)
     return await send_file(request, context.threads, file, conditions)
 
 
-def check_input(context: Context, row: BlobRow) -> None:
+def input_file(context: Context, owner: str, row: BlobRow, name: str, kind: str) -> SentFile:
+    """Return a stored input for sending it under a name, with a media type."""
+    path = f"{BLOBS}/{row.location}"
+    check, read = partial(_check_input, context, row), partial(context.blobs.objects.read, path)
+    return SentFile(owner, row.sha256, row.size, name, kind, check, read, policy=INPUT_POLICY)
+
+
+def _check_input(context: Context, row: BlobRow) -> None:
     """Check that a stored input matches its database row.
 
     Raises:

@@ -12,9 +12,7 @@ from fastapi import APIRouter, Depends, Path, Query, Response
 
 from api.http.context import Caller, CallerDep, Context, ContextDep, Digits, is_id
 from api.http.documentation import headers, links
-from api.http.multipart import (
-    json_body,
-)
+from api.http.multipart import json_body
 from api.http.schemas import (
     MOST_POINTS,
     JobChange,
@@ -58,10 +56,7 @@ FOLLOWING_OPERATIONS = (
 @router.get(
     "",
     response_model=JobPage,
-    responses={
-        200: {"links": links(*FOLLOWING_OPERATIONS, job_id="$response.body#/jobs/0/id")},
-    },
-    operation_id="list_jobs",
+    responses={200: {"links": links(*FOLLOWING_OPERATIONS, job_id="$response.body#/jobs/0/id")}},
 )
 async def list_jobs(
     context: ContextDep,
@@ -92,14 +87,8 @@ async def list_jobs(
         200: {"headers": _SHOWN, "links": links(*FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
         304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
     },
-    operation_id="get_job",
 )
-def get_job(
-    job_id: JobId,
-    context: ContextDep,
-    caller: CallerDep,
-    if_none_match: IfNoneMatch = None,
-) -> Response:
+def get_job(job_id: JobId, context: ContextDep, caller: CallerDep, if_none_match: IfNoneMatch = None) -> Response:
     """Get a job. `Retry-After` says when to poll again; `If-None-Match` avoids sending an unchanged body."""
     check_id(job_id)
     return _job_response(context, caller, job_id, if_none_match)
@@ -108,16 +97,10 @@ def get_job(
 @router.patch(
     "/{job_id}",
     response_model=JobDetail,
-    responses={
-        200: {"headers": _SHOWN, "links": links(*FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
-    },
-    operation_id="change_job",
+    responses={200: {"headers": _SHOWN, "links": links(*FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")}},
 )
 async def change_job(
-    job_id: JobId,
-    context: ContextDep,
-    caller: CallerDep,
-    change: Annotated[JobChange, Depends(json_body(JobChange))],
+    job_id: JobId, context: ContextDep, caller: CallerDep, change: Annotated[JobChange, Depends(json_body(JobChange))]
 ) -> Response:
     """Rename a job, whatever its status."""
     return await asyncio.to_thread(_rename, context, caller, job_id, change.name)
@@ -131,11 +114,7 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Respons
     return _job_response(context, caller, job_id)
 
 
-@router.get(
-    "/{job_id}/progress",
-    response_model=ProgressHistory,
-    operation_id="get_progress",
-)
+@router.get("/{job_id}/progress", response_model=ProgressHistory)
 def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
     """Get the loss history of a job from its first step on, while it runs and after its end."""
     points = context.store.jobs.loss_history(find(context, caller, job_id), MOST_POINTS)
@@ -149,9 +128,8 @@ def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> Progr
         200: {
             "headers": _SHOWN,
             "links": links("get_job", "cancel_job", "watch_job", "list_artifacts", job_id="$response.body#/id"),
-        },
+        }
     },
-    operation_id="finish_job",
 )
 def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """End a running job after its current step and keep its result so far. Until then, its status is `finishing`."""
@@ -167,9 +145,8 @@ def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
         200: {
             "headers": _SHOWN,
             "links": links("get_job", "retry_job", "delete_job", "watch_job", job_id="$response.body#/id"),
-        },
+        }
     },
-    operation_id="cancel_job",
 )
 def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Cancel a job. A waiting job is canceled at once, a running one within seconds (`canceling` until then)."""
@@ -187,9 +164,8 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
             "description": "The job is queued again.",
             "headers": _SHOWN,
             "links": links("get_job", "cancel_job", "list_artifacts", job_id="$response.body#/id"),
-        },
+        }
     },
-    operation_id="retry_job",
 )
 def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Queue a failed or canceled job again. It resumes from its last checkpoint."""
@@ -199,14 +175,7 @@ def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response
     return _job_response(context, caller, job_id, status=202)
 
 
-@router.delete(
-    "/{job_id}",
-    status_code=204,
-    responses={
-        204: {"description": "The job and its results are deleted."},
-    },
-    operation_id="delete_job",
-)
+@router.delete("/{job_id}", status_code=204, responses={204: {"description": "The job and its results are deleted."}})
 async def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
     """Delete a job that has ended, with its results."""
     check_id(job_id)
@@ -215,7 +184,7 @@ async def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> N
 
 
 def _remove_files(context: Context, job_id: str, unused: Sequence[str]) -> None:
-    context.artifacts.remove_job(job_id)
+    context.artifacts.objects.remove_below(job_id)
     context.blobs.remove(unused)
 
 

@@ -12,7 +12,7 @@ from api.http.schemas import Health
 router = APIRouter(tags=["operations"])
 
 
-@router.get("/livez", response_model=Health, operation_id="livez")
+@router.get("/livez", response_model=Health)
 async def livez() -> Health:
     """Check that the process answers. If it does not, restart it."""
     return Health(status="ok", checks={})
@@ -21,7 +21,6 @@ async def livez() -> Health:
 @router.get(
     "/readyz",
     response_model=Health,
-    operation_id="readyz",
     responses={
         503: {
             "description": "Something that jobs need is unavailable; `checks` names it.",
@@ -41,7 +40,7 @@ async def livez() -> Health:
                     },
                 }
             },
-        },
+        }
     },
 )
 async def readyz(context: ContextDep) -> Response:
@@ -75,9 +74,8 @@ async def readyz(context: ContextDep) -> Response:
         200: {
             "description": "Metrics in the Prometheus text format.",
             "content": {"text/plain": {"example": 'sgsst_jobs{status="queued"} 3.0\n'}},
-        },
+        }
     },
-    operation_id="metrics",
 )
 async def metrics(context: ContextDep) -> Response:
     """Get Prometheus metrics."""

@@ -8,12 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Request, Response
 
 from api.http.addresses import subpath
-from api.http.context import (
-    SESSION_COOKIE,
-    Context,
-    ContextDep,
-    check_origin,
-)
+from api.http.context import SESSION_COOKIE, Context, ContextDep, check_origin
 from api.http.documentation import headers, raises
 from api.http.multipart import json_body
 from api.http.schemas import SessionView, SignIn
@@ -34,12 +29,8 @@ async def check_page(request: Request) -> None:
     dependencies=[Depends(check_page)],
     status_code=204,
     response_class=Response,
-    operation_id="sign_in",
     responses={
-        204: {
-            "description": "Signed in; the cookie is the session.",
-            "headers": headers("Set-Cookie", "Cache-Control"),
-        },
+        204: {"description": "Signed in; the cookie is the session.", "headers": headers("Set-Cookie", "Cache-Control")}
     },
 )
 async def sign_in(
@@ -65,7 +56,7 @@ async def sign_in(
     return _answer(request, text, int(context.store.sessions.seconds))
 
 
-@router.get("", response_model=SessionView, operation_id="get_session")
+@router.get("", response_model=SessionView)
 async def get_session(request: Request, context: ContextDep, response: Response) -> SessionView:
     """Get whether a key is required, and whether this browser has a session."""
     response.headers["Cache-Control"] = "no-store"
@@ -78,10 +69,7 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     "",
     status_code=204,
     response_class=Response,
-    operation_id="sign_out",
-    responses={
-        204: {"description": "The session has ended.", "headers": headers("Set-Cookie", "Cache-Control")},
-    },
+    responses={204: {"description": "The session has ended.", "headers": headers("Set-Cookie", "Cache-Control")}},
 )
 async def sign_out(request: Request, context: ContextDep) -> Response:
     """End the session and delete its cookie. Without a session, nothing happens."""

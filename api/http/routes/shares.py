@@ -3,33 +3,36 @@
 from __future__ import annotations
 
 import asyncio
-from functools import partial
-from typing import Annotated, Any
+from dataclasses import replace
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
 from api.http.addresses import address
 from api.http.context import CallerDep, Context, ContextDep, check_site, is_id
-from api.http.documentation import Responses, headers, links, raises
+from api.http.documentation import headers, links, raises
 from api.http.multipart import json_body
-from api.http.routes.artifacts import check_artifact
-from api.http.routes.inputs import check_input, find_input
+from api.http.routes.artifacts import artifact_file
+from api.http.routes.inputs import INPUT_POLICY, find_input, input_file
 from api.http.routes.jobs import JobId, find
-from api.http.schemas import SHARED_RESULTS, NewShare, ShareCreated, SharedView, ShareList, ShareView, shared_view
+from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, share_view
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file
 from service import problems
 from service.errors import NoJobError, NoShareError
 from service.problems import SHARE_ID, SHARE_TOKEN
 from service.store.access import Shared
-from service.store.jobs import ShownJob
 from service.store.quotas import Quotas
 
 router = APIRouter(tags=["shares"])
 
 _DAY = 86_400.0
-#: Content-Security-Policy of shared files.
-_POLICY = "sandbox; default-src 'none'"
+#: Results that a share shows.
+_RESULTS = ("colors.f16", "stylized.ply")
+#: Parameters of a job that matter for rendering.
+_RENDERED = ("background", "near", "render_mode", "eps2d", "sh_attenuation")
+#: Media type of shared files.
+_KIND = "application/octet-stream"
 #: Headers of answers to requests with a token in their path: neither pages nor caches may pass it on.
 _SECRET = {"Referrer-Policy": "no-referrer", "Cache-Control": "no-store"}
 
@@ -69,9 +72,8 @@ SharedDep = Annotated[Shared, Depends(get_shared)]
             "description": "The link. Its token is not shown again.",
             "headers": headers("Cache-Control"),
             "links": links("revoke_share", job_id="$request.path.job_id", share_id="$response.body#/id"),
-        },
+        }
     },
-    operation_id="create_share",
 )
 async def create_share(
     job_id: JobId, context: ContextDep, caller: CallerDep, new: Annotated[NewShare, Depends(json_body(NewShare))]
@@ -83,33 +85,21 @@ async def create_share(
     """
     await asyncio.to_thread(find, context, caller, job_id)
     row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
-    url = address(f"/shared#{token}")
-    view = ShareCreated(id=row.id, created_at=row.created_at, expires_at=row.expires_at, url=url)
-    body = view.model_dump_json()
-    return Response(body, 201, {"Cache-Control": "no-store"}, media_type="application/json")
+    view = ShareCreated(**share_view(row).model_dump(), url=address(f"/shared#{token}"))
+    return Response(view.model_dump_json(), 201, {"Cache-Control": "no-store"}, media_type="application/json")
 
 
-@router.get(
-    "/v1/jobs/{job_id}/shares",
-    response_model=ShareList,
-    operation_id="list_shares",
-)
+@router.get("/v1/jobs/{job_id}/shares", response_model=ShareList)
 def list_shares(job_id: JobId, context: ContextDep, caller: CallerDep) -> ShareList:
     """List the links to the result of a job that have not expired. Their tokens are not stored."""
     find(context, caller, job_id)
-    rows = context.store.shares.of_job(job_id)
-    return ShareList(
-        shares=[ShareView(id=row.id, created_at=row.created_at, expires_at=row.expires_at) for row in rows]
-    )
+    return ShareList(shares=[share_view(row) for row in context.store.shares.of_job(job_id)])
 
 
 @router.delete(
     "/v1/jobs/{job_id}/shares/{share_id}",
     status_code=204,
-    responses={
-        204: {"description": "The link no longer works."},
-    },
-    operation_id="revoke_share",
+    responses={204: {"description": "The link no longer works."}},
 )
 def revoke_share(
     job_id: JobId,
@@ -127,36 +117,39 @@ def revoke_share(
 @router.get(
     "/v1/shared/{token}",
     response_model=SharedView,
-    responses={
-        200: {"headers": headers("Cache-Control", "Referrer-Policy")},
-    },
+    responses={200: {"headers": headers("Cache-Control", "Referrer-Policy")}},
     operation_id="get_shared",
 )
 async def show_shared(shared: SharedDep, context: ContextDep) -> Response:
     """Get what the viewer of a shared result needs to know. The token of the link replaces a key."""
-    job, names = await asyncio.to_thread(_find_shown, context, shared)
-    view = shared_view(job, shared.share.expires_at, names)
+    view = await asyncio.to_thread(_shared_view, context, shared)
     return Response(view.model_dump_json(), headers=_SECRET, media_type="application/json")
 
 
-def _find_shown(context: Context, shared: Shared) -> tuple[ShownJob, list[str]]:
-    """Return the shared job, and those of the names in `SHARED_RESULTS` that it has.
+def _shared_view(context: Context, shared: Shared) -> SharedView:
+    """Return the public view of a shared job: only what the page needs to show it.
 
     Raises:
         NoShareError: If the job was deleted meanwhile.
     """
     jobs, job_id = context.store.jobs, shared.job.id
     try:
-        return jobs.detail(job_id, None)[0], [name for name in SHARED_RESULTS if jobs.artifact(job_id, name)]
+        job, _ = jobs.detail(job_id, None)
+        files = [name for name in _RESULTS if jobs.artifact(job_id, name)]
     except NoJobError:
         raise problems.NO_SHARE() from None
+    return SharedView(
+        name=job.row.name,
+        expires_at=shared.share.expires_at,
+        parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters},
+        cameras=[entry["name"] for entry in job.inputs.named if entry["role"] == "cameras"],
+        files=files,
+    )
 
 
 #: Files that a share gives access to: the scene and its cameras as they were sent, and the result.
 _NAMES = r"^(scene|cameras:[0-7]|colors\.f16|stylized\.ply)$"
-_ANSWERS: Responses = {
-    **file_answers({"application/octet-stream": "ply\nformat binary_little_endian 1.0\n"}, always_policy=True),
-}
+_ANSWERS = file_answers({"application/octet-stream": "ply\nformat binary_little_endian 1.0\n"}, always_policy=True)
 
 
 @router.head("/v1/shared/{token}/{name}", operation_id="head_shared_file", response_class=Response, responses=_ANSWERS)
@@ -190,19 +183,10 @@ def _find_file(context: Context, shared: Shared, name: str) -> SentFile:
     Raises:
         NO_SHARED_FILE: If the job has no such file, such as `colors.f16` after Gaussians were split.
     """
-    check: partial[None]
     entry = find_input(context.store.jobs, shared.job, name)
     if entry is not None:
-        blob = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
-        if blob is None:
-            raise problems.NO_SHARED_FILE(name=name)
-        check, read = partial(check_input, context, blob), partial(context.blobs.read, blob)
-        sha256, size = blob.sha256, blob.size
-    else:
-        row = context.store.jobs.artifact(shared.job.id, name)
-        if row is None:
-            raise problems.NO_SHARED_FILE(name=name)
-        check, read = partial(check_artifact, context, row), partial(context.artifacts.read, row.location)
-        sha256, size = row.sha256, row.size
-    values: dict[str, Any] = {"kind": "application/octet-stream", "inline": False, "policy": _POLICY}
-    return SentFile(owner=shared.job.owner, sha256=sha256, size=size, name=name, check=check, read=read, **values)
+        if blob := context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"]):
+            return input_file(context, shared.job.owner, blob, name, _KIND)
+    elif row := context.store.jobs.artifact(shared.job.id, name):
+        return replace(artifact_file(context, shared.job.owner, row, name, _KIND), policy=INPUT_POLICY)
+    raise problems.NO_SHARED_FILE(name=name)

@@ -18,26 +18,13 @@ from api.http.addresses import address, subpath
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, links
 from api.http.fetching import file_name, is_url
-from api.http.multipart import (
-    MAX_TEXT,
-    Received,
-    check_file,
-    media_type,
-    most_files,
-    parse_json,
-    read_json,
-    receive,
-)
+from api.http.multipart import MAX_TEXT, Received, check_file, media_type, most_files, parse_json, read_json, receive
 from api.http.progress import DRY_RUN, answer_work
 from api.http.receipts import Receipt
 from api.http.routes.inputs import parse_input
 from api.http.routes.jobs import FOLLOWING_OPERATIONS, find
 from api.http.routes.uploads import IdempotencyHeader, uploaded_name
-from api.http.schemas import (
-    JobView,
-    PlanView,
-    job_view,
-)
+from api.http.schemas import JobView, PlanView, job_view
 from service import problems
 from service.deadlines import suspended
 from service.errors import NoJobError
@@ -156,7 +143,6 @@ _BODY = {
             "links": links(*FOLLOWING_OPERATIONS, job_id="$response.body#/id"),
         },
     },
-    operation_id="create_job",
 )
 async def create_job(
     request: Request,
@@ -169,7 +155,7 @@ async def create_job(
 ) -> Response:
     """Queue a job. All files are read and checked before the answer; unusable ones are refused with 422."""
     async with AsyncExitStack() as stack:
-        receipt = await stack.enter_async_context(context.receipts.of(caller.owner, caller.quotas))
+        receipt = await stack.enter_async_context(Receipt(context.receipts, caller.owner, caller.quotas))
         is_json = media_type(request) == "application/json"
         reading = _from_json(request, context) if is_json else _from_form(request, context, receipt)
         received, parameters, webhook = await reading
@@ -243,11 +229,7 @@ def _queue_job(
     new = NewJob(caller.owner, name, caller.priority, values, inputs, webhook or None)
     jobs = context.store.jobs
     job, created = jobs.create(
-        new,
-        limit=context.settings.max_jobs_per_key,
-        quotas=caller.quotas,
-        idempotency=idempotency,
-        receipt=receipt.id,
+        new, limit=context.settings.max_jobs_per_key, quotas=caller.quotas, idempotency=idempotency, receipt=receipt.id
     )
     if created:
         receipt.hand_over()
@@ -304,9 +286,8 @@ def _resolve_inputs(
         if is_url(text):
             resolved.append((file_name(text), fetched.get(text, "")))
             continue
-        reference = _parse_reference(text)
-        if reference is not None:
-            entry = _referred_input(context, caller, *reference, role, jobs)
+        if reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
+            entry = _referred_input(context, caller, reference[1], reference[2], role, jobs)
             resolved.append((entry["name"], entry["sha256"]))
             continue
         upload = uploads.get(text)
@@ -366,9 +347,3 @@ def _idempotency(
     values = parameters.model_dump(mode="json", exclude_defaults=True)
     text = json.dumps([list(inputs), values, webhook], sort_keys=True)
     return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())
-
-
-def _parse_reference(text: str) -> tuple[str, str] | None:
-    """Return the job's id and the input that a path of the API refers to, or None if it is not such a path."""
-    match = _PATH.fullmatch(text.removeprefix(subpath.get()))
-    return (match[1], match[2]) if match else None

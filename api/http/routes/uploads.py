@@ -114,9 +114,8 @@ def _following_operations(**parameters: str) -> dict[str, Any]:
             "headers": headers(
                 "Tus-Resumable", "Tus-Version", "Tus-Extension", "Tus-Checksum-Algorithm", "Tus-Max-Size"
             ),
-        },
+        }
     },
-    operation_id="describe_uploads",
 )
 def describe_uploads(context: ContextDep) -> Response:
     """Describe the supported protocol version and extensions."""
@@ -135,13 +134,12 @@ def describe_uploads(context: ContextDep) -> Response:
     status_code=201,
     dependencies=_REQUIRES_TUS,
     response_model=UploadView,
-    operation_id="create_upload",
     responses={
         201: {
             "description": "The upload is created; send its bytes to the `Location`.",
             "headers": headers("Location", "Tus-Resumable", "Upload-Expires", "Cache-Control"),
             "links": _following_operations(upload_id="$response.body#/id"),
-        },
+        }
     },
 )
 async def create_upload(
@@ -188,7 +186,7 @@ async def create_upload(
     return Response(upload_view(row).model_dump_json(), 201, response_headers, "application/json")
 
 
-@router.get("/{upload_id}", response_model=UploadView, operation_id="get_upload")
+@router.get("/{upload_id}", response_model=UploadView)
 def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> UploadView:
     """Get the state of an upload as JSON."""
     return upload_view(_find_upload(context, caller.owner, upload_id))
@@ -208,9 +206,8 @@ def get_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> U
                 "Cache-Control",
                 maybe=("Upload-Metadata",),
             ),
-        },
+        }
     },
-    operation_id="head_upload",
     response_class=Response,
 )
 def head_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
@@ -248,9 +245,8 @@ _PATCH_BODY = {
         204: {
             "description": "The part is stored; `Upload-Offset` is where the next part starts.",
             "headers": headers("Upload-Offset", "Upload-Expires", "Tus-Resumable", "Cache-Control"),
-        },
+        }
     },
-    operation_id="append_upload",
     openapi_extra=_PATCH_BODY,
     response_class=Response,
 )
@@ -287,8 +283,7 @@ async def append_upload(
             raise _longer_than_declared(row.length)
     row = await asyncio.to_thread(_find_upload, context, caller.owner, upload_id)
     return Response(
-        status_code=204,
-        headers={**_HEADERS, "Upload-Offset": str(row.offset), "Upload-Expires": _http_date(expires)},
+        status_code=204, headers={**_HEADERS, "Upload-Offset": str(row.offset), "Upload-Expires": _http_date(expires)}
     )
 
 
@@ -296,10 +291,7 @@ async def append_upload(
     "/{upload_id}",
     status_code=204,
     dependencies=_REQUIRES_TUS,
-    responses={
-        204: {"description": "The upload is deleted.", "headers": headers("Tus-Resumable", "Cache-Control")},
-    },
-    operation_id="delete_upload",
+    responses={204: {"description": "The upload is deleted.", "headers": headers("Tus-Resumable", "Cache-Control")}},
 )
 async def delete_upload(upload_id: UploadId, context: ContextDep, caller: CallerDep) -> Response:
     """Cancel an upload, or delete a finished one. Jobs that use it keep their file."""

@@ -256,5 +256,5 @@ def test_lock_wait_is_bounded_across_writers(tmp_path: Path) -> None:
         assert store.operations.check() == 0
         other.execute("ROLLBACK")
     store.operations.record_heartbeat("one", 1, 1)
-    assert store.operations.dispatcher_count() == 1
+    assert len(store.operations.dispatchers()) == 1
     store.close()

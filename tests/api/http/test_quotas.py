@@ -24,6 +24,7 @@ from tests.api.http.test_api import TUS, form, refused
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.postgres import fresh_database, is_installed, server
 from tests.raised import raises_problem
+from tests.service.store.helpers import usage_of
 
 
 class Clock:
@@ -227,7 +228,7 @@ def test_deleted_uploads_release_quota(service: Service) -> None:
 def stored_bytes(service: Service, owner: str) -> int:
     store = open_store(ServiceSettings(data=service.data, database=service.environment.get("SGSST_DATABASE")))
     try:
-        return store.usage.of(owner).stored_bytes
+        return usage_of(store, owner).stored_bytes
     finally:
         store.close()
 

@@ -23,7 +23,7 @@ from api.cli.main import main
 from api.client import Client
 from api.client.answers import RequestError
 from api.http.fetching import Fetcher, file_name
-from api.http.receipts import Receipts
+from api.http.receipts import Receipt, Receipts
 from service import outgoing, problems
 from service.errors import ServiceError
 from service.files.artifacts import Artifacts
@@ -37,6 +37,7 @@ from service.store.quotas import Quotas
 from tests.api.service import Service, check_documented
 from tests.http_servers import serve
 from tests.raised import raises_problem
+from tests.service.store.helpers import usage_of
 from tests.small_scenes import wall, write_files
 
 #: Time limit of a test's waits in seconds.
@@ -162,7 +163,8 @@ def fetch(stored: Stored, *urls: str, requests: int = 1, bytes_quota: int | None
     quotas = Quotas(stored_bytes=bytes_quota)
 
     async def request(fetcher: Fetcher) -> list[str]:
-        async with Receipts(stored.store.inputs, stored.blobs, fetcher.threads).of("me", quotas) as receipt:
+        receipts = Receipts(stored.store.inputs, stored.blobs, fetcher.threads)
+        async with Receipt(receipts, "me", quotas) as receipt:
             checked = fetcher.urls([(index, "style", url) for index, url in enumerate(urls)])
             digests = await fetcher.fetch(checked, receipt)
             for sha256 in digests.values():
@@ -179,7 +181,7 @@ def fetch(stored: Stored, *urls: str, requests: int = 1, bytes_quota: int | None
     finally:
         assert list((stored.folder / "incoming").iterdir()) == []
         assert list((stored.folder / "blobs").glob("*/*")) == []
-        assert stored.store.usage.of("me").stored_bytes == 0
+        assert usage_of(stored.store, "me").stored_bytes == 0
 
 
 # --- allowed hosts --------------------------------------------------------------------------------------------------

@@ -21,12 +21,12 @@ def test_artifact_is_read_completely_and_in_ranges(artifacts: Artifacts, tmp_pat
     source.write_bytes(bytes(range(256)) * 9000)
     put = artifacts.put("job_1", 1, "previews/x.jpg", source)
     assert put.size == source.stat().st_size
-    assert b"".join(artifacts.read(put.location, 0, put.size)) == source.read_bytes()
-    assert b"".join(artifacts.read(put.location, 255, 258)) == b"\xff\x00\x01"
+    assert b"".join(artifacts.objects.read(put.location, 0, put.size)) == source.read_bytes()
+    assert b"".join(artifacts.objects.read(put.location, 255, 258)) == b"\xff\x00\x01"
     artifacts.fetch(put.location, tmp_path / "back", put.sha256)
     assert (tmp_path / "back").read_bytes() == source.read_bytes()
     with pytest.raises(OSError, match="shorter"):
-        list(artifacts.read(put.location, 0, put.size + 1))
+        list(artifacts.objects.read(put.location, 0, put.size + 1))
 
 
 def test_final_file_is_linked_and_others_are_copied(artifacts: Artifacts, tmp_path: Path) -> None:
@@ -37,7 +37,7 @@ def test_final_file_is_linked_and_others_are_copied(artifacts: Artifacts, tmp_pa
     later = tmp_path / "later"
     later.write_bytes(b"second")
     later.replace(source)
-    assert b"".join(artifacts.read(put.location, 0, put.size)) == b"first"
+    assert b"".join(artifacts.objects.read(put.location, 0, put.size)) == b"first"
     assert put.sha256 == hashlib.sha256(b"first").hexdigest()
 
 
@@ -60,11 +60,11 @@ def test_files_without_rows_are_swept(artifacts: Artifacts, tmp_path: Path) -> N
     old, new, later = (artifacts.put("job_1", epoch, "plan.json", source) for epoch in (1, 2, 10))
     other = artifacts.put("job_2", 1, "plan.json", source)
     artifacts.sweep("job_1", 2, {new.location})
-    assert b"".join(artifacts.read(later.location, 0, 2)) == b"{}", "of a lease whose rows are still to come"
-    assert b"".join(artifacts.read(new.location, 0, 2)) == b"{}"
+    assert b"".join(artifacts.objects.read(later.location, 0, 2)) == b"{}", "of a lease whose rows are still to come"
+    assert b"".join(artifacts.objects.read(new.location, 0, 2)) == b"{}"
     with pytest.raises(FileNotFoundError):
-        list(artifacts.read(old.location, 0, 2))
-    artifacts.remove_job("job_1")
-    artifacts.remove_job("job_1")
-    artifacts.remove(new.location)
-    assert b"".join(artifacts.read(other.location, 0, 2)) == b"{}"
+        list(artifacts.objects.read(old.location, 0, 2))
+    artifacts.objects.remove_below("job_1")
+    artifacts.objects.remove_below("job_1")
+    artifacts.objects.remove(new.location)
+    assert b"".join(artifacts.objects.read(other.location, 0, 2)) == b"{}"

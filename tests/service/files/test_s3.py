@@ -62,20 +62,20 @@ def test_stored_object_is_read_and_fetched(artifacts: Artifacts, tmp_path: Path)
     put = artifacts.put("job_1", 3, "previews/step_1.jpg", source)
     assert (put.name, put.size, put.sha256) == ("previews/step_1.jpg", SIZE, hashlib.sha256(content).hexdigest())
     assert not artifacts.local
-    assert b"".join(artifacts.read(put.location, 0, SIZE)) == content
-    assert b"".join(artifacts.read(put.location, SIZE - 5, SIZE)) == content[-5:]
-    assert b"".join(artifacts.read(put.location, 5_000_000, 5_300_000)) == content[5_000_000:5_300_000]
+    assert b"".join(artifacts.objects.read(put.location, 0, SIZE)) == content
+    assert b"".join(artifacts.objects.read(put.location, SIZE - 5, SIZE)) == content[-5:]
+    assert b"".join(artifacts.objects.read(put.location, 5_000_000, 5_300_000)) == content[5_000_000:5_300_000]
     artifacts.fetch(put.location, tmp_path / "fetched", put.sha256)
     assert (tmp_path / "fetched").read_bytes() == content
     with pytest.raises(OSError, match="shorter"):
-        list(artifacts.read(put.location, 0, SIZE + 1))
+        list(artifacts.objects.read(put.location, 0, SIZE + 1))
 
 
 def test_object_names_are_never_reused(artifacts: Artifacts, tmp_path: Path) -> None:
     first = artifacts.put("job_1", 1, "plan.json", write(tmp_path, 10))
     second = artifacts.put("job_1", 1, "plan.json", write(tmp_path, 11))
     assert first.location != second.location
-    assert len(b"".join(artifacts.read(first.location, 0, 10))) == 10
+    assert len(b"".join(artifacts.objects.read(first.location, 0, 10))) == 10
 
 
 def test_objects_without_rows_are_swept(artifacts: Artifacts, tmp_path: Path) -> None:
@@ -83,15 +83,15 @@ def test_objects_without_rows_are_swept(artifacts: Artifacts, tmp_path: Path) ->
     referenced, lost = (artifacts.put("job_1", epoch, "stylized.ply", source) for epoch in (2, 1))
     other = artifacts.put("job_10", 1, "stylized.ply", source)
     artifacts.sweep("job_1", 9, {referenced.location})
-    assert b"".join(artifacts.read(referenced.location, 0, 10)) == source.read_bytes()
+    assert b"".join(artifacts.objects.read(referenced.location, 0, 10)) == source.read_bytes()
     with pytest.raises(FileNotFoundError):
-        list(artifacts.read(lost.location, 0, 10))
-    artifacts.remove_job("job_1")
+        list(artifacts.objects.read(lost.location, 0, 10))
+    artifacts.objects.remove_below("job_1")
     with pytest.raises(FileNotFoundError):
-        list(artifacts.read(referenced.location, 0, 10))
-    assert b"".join(artifacts.read(other.location, 0, 10)) == source.read_bytes()
-    artifacts.remove(referenced.location)
-    artifacts.remove_job("job_1")
+        list(artifacts.objects.read(referenced.location, 0, 10))
+    assert b"".join(artifacts.objects.read(other.location, 0, 10)) == source.read_bytes()
+    artifacts.objects.remove(referenced.location)
+    artifacts.objects.remove_below("job_1")
 
 
 def test_later_objects_are_visible_to_other_processes(
@@ -103,15 +103,15 @@ def test_later_objects_are_visible_to_other_processes(
     artifacts.sweep("job_1", 9, {first.location})
     late = f"{environment['AWS_ENDPOINT_URL']}/results/{prefix}/job_1/2/x/late"
     assert httpx2.put(late, content=b"0123456789").status_code == 200
-    assert b"".join(artifacts.read("job_1/2/x/late", 0, 10)) == b"0123456789"
+    assert b"".join(artifacts.objects.read("job_1/2/x/late", 0, 10)) == b"0123456789"
     artifacts.sweep("job_1", 9, {first.location})
     assert httpx2.head(late).status_code == 404
 
 
 def test_missing_bucket_is_not_ready(artifacts: Artifacts) -> None:
-    artifacts.ping()
+    artifacts.objects.ping()
     with pytest.raises(OSError, match="nowhere"):
-        Artifacts("s3://nowhere/x").ping()
+        Artifacts("s3://nowhere/x").objects.ping()
 
 
 @contextmanager

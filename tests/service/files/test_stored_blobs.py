@@ -135,11 +135,11 @@ def test_ranges_are_read_without_a_full_copy(fleet: Fleet) -> None:
     one, two = fleet.host("one"), fleet.host("two")
     row = fleet.store.inputs.blobs([fleet.take(one, data)]).popitem()[1]
     for start, stop in ((0, len(data)), (MB - 1, MB + 2), (2 * MB, 2 * MB + 7), (5, 5)):
-        assert b"".join(two.read(row, start, stop)) == data[start:stop]
+        assert b"".join(two.objects.read(f"blobs/{row.location}", start, stop)) == data[start:stop]
     assert not [path for path in (fleet.folder / "two" / "cache").rglob("*") if path.is_file() and path.stat().st_size]
     fleet.objects.remove(f"blobs/{row.location}")
     with pytest.raises(FileNotFoundError):
-        list(two.read(row, 0, 5))
+        list(two.objects.read(f"blobs/{row.location}", 0, 5))
 
 
 def test_unused_blobs_are_collected(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,7 +150,7 @@ def test_unused_blobs_are_collected(fleet: Fleet, monkeypatch: pytest.MonkeyPatc
     host.collect()
     assert len(fleet.names()) == 3, "the rows may still be on their way"
     monkeypatch.setattr(stored_blobs, "_ORPHAN_SECONDS", -HOUR)
-    fleet.store.inputs._database.clock = lambda: 10**11
+    fleet.store.inputs.database.clock = lambda: 10**11
     fleet.host("two").collect()
     assert fleet.names() == []
     with pytest.raises(NotFoundError):
@@ -260,8 +260,8 @@ def test_unfinished_upload_is_collected(fleet: Fleet) -> None:
     upload = fleet.upload(100)
     fleet.append(fleet.host("one"), upload, bytes(60))
     assert len(fleet.names()) == 1
-    now = fleet.store.inputs._database.clock()
-    fleet.store.inputs._database.clock = lambda: now + 2 * HOUR
+    now = fleet.store.inputs.database.clock()
+    fleet.store.inputs.database.clock = lambda: now + 2 * HOUR
     fleet.host("two").collect()
     assert fleet.names() == []
     assert fleet.store.inputs.parts(upload.id) == []

@@ -26,6 +26,7 @@ from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.ply import PLY
 from tests.api.service import PATIENCE
 from tests.raised import raises_problem
+from tests.service.store.helpers import usage_of
 from tests.small_scenes import wall, write_files
 
 
@@ -112,7 +113,7 @@ def test_parallel_blends_cannot_pass_their_limit(stored: Stored, tmp_path: Path)
 def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Path) -> None:
     job = stored.finished("one", tmp_path)
     before = {row.name for row in stored.store.jobs.artifacts(job.id)}
-    objects, used = set(stored.artifacts.objects.below("")), stored.store.usage.of("one").stored_bytes
+    objects, used = set(stored.artifacts.objects.below("")), usage_of(stored.store, "one").stored_bytes
 
     async def compress(quotas: Quotas) -> None:
         derived = stored.derived()
@@ -124,9 +125,9 @@ def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Pat
     with raises_problem(problems.QUOTA_EXCEEDED):
         asyncio.run(compress(Quotas(stored_bytes=used)))
     assert set(stored.artifacts.objects.below("")) == objects
-    assert stored.store.usage.of("one").stored_bytes == used
+    assert usage_of(stored.store, "one").stored_bytes == used
     assert {row.name for row in stored.store.jobs.artifacts(job.id)} == before
     asyncio.run(compress(NO_QUOTAS))
     assert {row.name for row in stored.store.jobs.artifacts(job.id)} == before | {"stylized.spz", "stylized.spz.json"}
     derived = sum(row.size for row in stored.store.jobs.artifacts(job.id) if row.name not in before)
-    assert stored.store.usage.of("one").stored_bytes == used + derived
+    assert usage_of(stored.store, "one").stored_bytes == used + derived

@@ -221,8 +221,8 @@ def test_leftovers_of_a_killed_dispatcher_are_swept(settings: ServiceSettings, s
         wait_for(lambda: store.retention.unswept(10) == [], "the job to be swept")
     left = {path.name for path in (settings.folder / "artifacts" / held.job_id).rglob("*.*")}
     assert left == {"stylized.ply"}
-    assert b"".join(artifacts.read(result.location, 0, 3)) == b"ply"
-    assert b"".join(artifacts.read(published_next.location, 0, 3)) == b"ply", "of a job that has not ended"
+    assert b"".join(artifacts.objects.read(result.location, 0, 3)) == b"ply"
+    assert b"".join(artifacts.objects.read(published_next.location, 0, 3)) == b"ply", "of a job that has not ended"
 
 
 @pytest.mark.parametrize(("damage", "code"), [("lost", "file-lost"), ("flipped", "file-damaged")])

@@ -53,7 +53,7 @@ def test_full_disk_delays_publishing(folder: Path, settings: ServiceSettings) ->
 def content(store: Store, settings: ServiceSettings, lease: Lease, name: str) -> bytes:
     row = store.jobs.artifact(lease.job_id, name)
     assert row is not None
-    return b"".join(Artifacts(settings.artifacts_url).read(row.location, 0, row.size))
+    return b"".join(Artifacts(settings.artifacts_url).objects.read(row.location, 0, row.size))
 
 
 def stored_names(settings: ServiceSettings) -> list[str]:

@@ -121,7 +121,7 @@ def test_first_rank_uploads_files_while_it_runs(job: StoreWorkplace) -> None:
     rank.finish(done=True)
     assert recorder.names() == {"plan.json", CHECKPOINT, "stylized.ply", "report.json"}
     result = next(file for file in recorder.files if file.name == "stylized.ply")
-    assert b"".join(Artifacts(job.url).read(result.location, 0, result.size)) == b"ply"
+    assert b"".join(Artifacts(job.url).objects.read(result.location, 0, result.size)) == b"ply"
     rank.close()
     assert not rank.folder.exists()
     following = job.after(recorder.files)

@@ -133,7 +133,7 @@ def test_dispatcher_with_a_wrong_clock_deletes_nothing(
     assert [store.jobs.get(job_id, None).status for job_id, _ in ended] == ["succeeded"] * 3
     for job_id, result in ended:
         assert [row.name for row in store.jobs.artifacts(job_id)] == ["stylized.ply"]
-        assert b"".join(artifacts.read(result.location, 0, 3)) == b"ply"
+        assert b"".join(artifacts.objects.read(result.location, 0, 3)) == b"ply"
     assert incoming.exists()
     assert store.inputs.blobs([SHA])
 

@@ -1,13 +1,16 @@
-"""Helpers for tests of the store: a simulated clock, and jobs."""
+"""Helpers for tests of the store: a simulated clock, jobs, and the usage of keys."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
 from service.store.leases import Lease
+from service.store.quotas import day_of, stored_bytes
+from service.store.tables import UsageRow
 
 SHA = "a" * 64
 LEASE, RETRY, ATTEMPTS = 30.0, 5.0, 3
@@ -48,3 +51,19 @@ def lease(store: Store, dispatcher: str = "one") -> Lease:
     taken = store.leases.take(dispatcher)
     assert taken is not None
     return taken
+
+
+@dataclass(frozen=True)
+class Used:
+    """Usage of a key today, and its stored bytes."""
+
+    jobs: int
+    gpu_seconds: float
+    stored_bytes: int
+
+
+def usage_of(store: Store, owner: str) -> Used:
+    with store.database.reading() as session:
+        row = session.get(UsageRow, (owner, day_of(store.database.clock())))
+        jobs, seconds = (row.jobs, row.gpu_seconds) if row is not None else (0, 0.0)
+        return Used(jobs, seconds, stored_bytes(session, owner))

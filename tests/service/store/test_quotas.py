@@ -13,9 +13,9 @@ from service.settings import ServiceSettings
 from service.store import Store
 from service.store.inputs import GRACE_SECONDS
 from service.store.leases import Published
-from service.store.quotas import NO_QUOTAS, Quotas, Used
+from service.store.quotas import NO_QUOTAS, Quotas
 from tests.raised import raises_problem
-from tests.service.store.helpers import LEASE, SHA, Clock, lease, new_job, queue
+from tests.service.store.helpers import LEASE, SHA, Clock, Used, lease, new_job, queue, usage_of
 
 DAY = 86_400.0
 
@@ -37,7 +37,7 @@ def test_daily_jobs_are_limited(store: Store, clock: Clock) -> None:
     submit(store, quotas)
     error = refusal(store, quotas)
     assert (error.extra, error.retry_after) == ({"quota": "jobs-a-day", "limit": 2}, 6400)
-    assert len(store.jobs.page("local")) == store.usage.of("local").jobs == 2, "nothing of it stays"
+    assert len(store.jobs.page("local")) == usage_of(store, "local").jobs == 2, "nothing of it stays"
     submit(store, quotas, "other")
     store.jobs.cancel(first, "local")
     assert refusal(store, quotas).extra["quota"] == "jobs-a-day", "it was one of today's"
@@ -52,11 +52,11 @@ def test_gpu_seconds_count_held_gpus(store: Store, clock: Clock) -> None:
     store.leases.hold_gpus(held, 8)
     clock.now += 10
     store.leases.hold_gpus(held, 2)
-    assert store.usage.of("local").gpu_seconds == 80
+    assert usage_of(store, "local").gpu_seconds == 80
     submit(store, quotas)
     clock.now += 15
     store.leases.succeed(held, [], {})
-    assert store.usage.of("local").gpu_seconds == 110
+    assert usage_of(store, "local").gpu_seconds == 110
     assert refusal(store, quotas).extra["quota"] == "gpu-seconds-a-day"
     assert lease(store).job.owner == "local", "what was accepted runs"
     clock.now += DAY
@@ -73,7 +73,7 @@ def test_gpu_seconds_count_for_every_outcome(store: Store, clock: Clock, ending:
         store.leases.fail(held, {"code": "x", "message": "x"}, permanent=False)
     else:
         getattr(store.leases, ending)(held)
-    assert store.usage.of("local").gpu_seconds == 15
+    assert usage_of(store, "local").gpu_seconds == 15
 
 
 def test_lost_attempt_charges_no_gpu_seconds(store: Store, clock: Clock) -> None:
@@ -81,7 +81,7 @@ def test_lost_attempt_charges_no_gpu_seconds(store: Store, clock: Clock) -> None
     store.leases.hold_gpus(lease(store), 8)
     clock.now += LEASE + 1
     lease(store, "two")
-    assert store.usage.of("local").gpu_seconds == 0
+    assert usage_of(store, "local").gpu_seconds == 0
 
 
 def test_stored_bytes_count_uploads_inputs_and_results(store: Store, clock: Clock) -> None:
@@ -90,16 +90,16 @@ def test_stored_bytes_count_uploads_inputs_and_results(store: Store, clock: Cloc
     job_id = submit(store, quotas)
     clock.now += 1  # jobs of the same moment have no defined order
     submit(store, quotas)
-    assert store.usage.of("local") == Used(2, 0, 3)
+    assert usage_of(store, "local") == Used(2, 0, 3)
     store.inputs.create_upload("local", 5, "x", "", 1000, quotas=quotas)
     with raises_problem(problems.QUOTA_EXCEEDED) as caught:
         store.inputs.create_upload("local", 3, "x", "", 1000, quotas=quotas)
     assert caught.value.extra["quota"] == "stored-bytes"
     assert caught.value.retry_after
-    assert store.usage.of("local").stored_bytes == 8
+    assert usage_of(store, "local").stored_bytes == 8
     held = lease(store)
     store.leases.succeed(held, [Published("stylized.ply", "x/1", 4, SHA)], {})
-    assert store.usage.of("local").stored_bytes == 12
+    assert usage_of(store, "local").stored_bytes == 12
     assert refusal(store, quotas).extra["quota"] == "stored-bytes"
     assert held.job_id == job_id
     store.jobs.delete(job_id, "local")
@@ -115,7 +115,7 @@ def test_blends_count_toward_stored_bytes(store: Store) -> None:
         store.jobs.add_derived(result, [blend], "local", Quotas(stored_bytes=10))
     assert store.jobs.artifact(job_id, blend.name) is None
     assert store.jobs.add_derived(result, [blend], "local", Quotas(stored_bytes=11)) == []
-    assert store.usage.of("local").stored_bytes == 11
+    assert usage_of(store, "local").stored_bytes == 11
 
 
 def test_derived_files_are_charged_before_they_are_stored(store: Store) -> None:
@@ -124,20 +124,20 @@ def test_derived_files_are_charged_before_they_are_stored(store: Store) -> None:
     result, blend = store.jobs.artifact(job_id, "stylized.ply"), Published("blends/a.ply", "x/2", 4, SHA)
     assert result is not None
     receipt = store.inputs.open_receipt("local", blend.size, quotas)
-    assert store.usage.of("local").stored_bytes == 11
+    assert usage_of(store, "local").stored_bytes == 11
     with raises_problem(problems.QUOTA_EXCEEDED):
         store.inputs.open_receipt("local", blend.size, quotas)
     assert store.jobs.add_derived(result, [blend], "local", quotas, receipt=receipt) == []
-    assert store.usage.of("local").stored_bytes == 11
+    assert usage_of(store, "local").stored_bytes == 11
     store.inputs.end_receipt(receipt)
-    assert store.usage.of("local").stored_bytes == 11
+    assert usage_of(store, "local").stored_bytes == 11
 
 
 def test_upload_used_as_an_input_counts_once(store: Store) -> None:
     row = store.inputs.create_upload("local", 3, "scene.ply", "", 1000)
     store.inputs.finish_upload(row.id, SHA, 1000)
     queue(store)
-    assert store.usage.of("local").stored_bytes == 3
+    assert usage_of(store, "local").stored_bytes == 3
 
 
 def test_retry_is_bounded_like_a_new_job(store: Store, clock: Clock) -> None:
@@ -151,7 +151,7 @@ def test_retry_is_bounded_like_a_new_job(store: Store, clock: Clock) -> None:
             store.jobs.retry(job_id, "local", limit=10, quotas=bound)
         assert caught.value.extra["quota"] == quota
     assert store.jobs.get(job_id, "local").status == "canceled"
-    assert store.usage.of("local").jobs == 2
+    assert usage_of(store, "local").jobs == 2
     clock.now += DAY
     store.jobs.retry(job_id, "local", limit=10, quotas=quotas)
 
@@ -205,7 +205,7 @@ def test_concurrent_requests_exceed_no_limit(store: Store) -> None:
         store.jobs.cancel(job_id, "g")
     assert at_once(lambda: store.jobs.retry(canceled.pop(), "g", limit=3), 8) == 3
     for owner, stored in (("c", 8), ("d", 8), ("f", 8)):
-        assert store.usage.of(owner).stored_bytes == stored
+        assert usage_of(store, owner).stored_bytes == stored
 
 
 def test_quota_errors_name_the_quota(store: Store) -> None:
@@ -226,14 +226,14 @@ OTHER = "b" * 64
 def test_receipt_charges_until_its_job_is_created(store: Store) -> None:
     quotas = Quotas(stored_bytes=100)
     receipt = store.inputs.open_receipt("me", 90, quotas)
-    assert store.usage.of("me").stored_bytes == 90
+    assert usage_of(store, "me").stored_bytes == 90
     store.inputs.add_blob(SHA, "aa/again", 60, receipt)
-    assert store.usage.of("me").stored_bytes == 33, "30 bytes are still to come, and the blob was there, with 3"
+    assert usage_of(store, "me").stored_bytes == 33, "30 bytes are still to come, and the blob was there, with 3"
     job = store.jobs.create(new_job("me"), limit=10, quotas=quotas, receipt=receipt)[0]
-    assert store.usage.of("me").stored_bytes == 3
+    assert usage_of(store, "me").stored_bytes == 3
     assert store.inputs.end_receipt(receipt) == []
     assert store.jobs.delete(store.jobs.cancel(job.id, "me").id, "me") == ["aa/blob"]
-    assert store.usage.of("me").stored_bytes == 0
+    assert usage_of(store, "me").stored_bytes == 0
 
 
 def test_unused_files_of_an_ended_request_are_deleted(store: Store) -> None:
@@ -242,7 +242,7 @@ def test_unused_files_of_an_ended_request_are_deleted(store: Store) -> None:
     store.inputs.add_blob(SHA, "aa/again", 3, mine)
     store.inputs.add_blob(SHA, "aa/again", 3, others)
     assert store.inputs.end_receipt(mine) == ["bb/blob"]
-    assert store.usage.of("me").stored_bytes == 0
+    assert usage_of(store, "me").stored_bytes == 0
     job = store.jobs.create(new_job("other"), limit=10, receipt=others)[0]
     assert store.inputs.end_receipt(others) == []
     assert store.inputs.blobs([SHA, OTHER]).keys() == {SHA}
@@ -273,7 +273,7 @@ def test_receipt_of_a_dead_process_expires(store: Store, clock: Clock) -> None:
     clock.now += GRACE_SECONDS / 2 + 1
     assert store.inputs.expire_uploads() == [lost]
     assert "bb/blob" in store.inputs.collect()
-    assert store.usage.of("me").stored_bytes == 5
+    assert usage_of(store, "me").stored_bytes == 5
     store.inputs.create_upload("me", 1, "x", "", 1000, most=1)  # a receipt does not count as an unfinished upload
 
 
