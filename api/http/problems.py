@@ -69,8 +69,8 @@ def _response(status: int, code: str, detail: str, headers: dict[str, str], **ex
 
 def add_handlers(app: FastAPI) -> None:
     """Register handlers that convert every error of the app to a problem document."""
-    app.add_exception_handler(ServiceError, _service_error)
-    app.add_exception_handler(InvalidInputError, _invalid_input)
+    app.add_exception_handler(ServiceError, _expected)
+    app.add_exception_handler(InvalidInputError, _expected)
     app.add_exception_handler(RequestValidationError, _invalid_request)
     app.add_exception_handler(ValidationError, _invalid_request)
     app.add_exception_handler(HTTPException, _http_error)
@@ -86,14 +86,10 @@ def from_service(error: ServiceError) -> JSONResponse:
     return _response(error.status, error.code, str(error), headers, **error.extra)
 
 
-async def _service_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, ServiceError)
-    return from_service(error)
-
-
-async def _invalid_input(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, InvalidInputError)
-    return from_service(problems.INVALID_INPUT(str(error), code=error.code))
+async def _expected(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, ServiceError | InvalidInputError)
+    known = error if isinstance(error, ServiceError) else problems.INVALID_INPUT(str(error), code=error.code)
+    return from_service(known)
 
 
 async def _invalid_request(request: Request, error: Exception) -> JSONResponse:

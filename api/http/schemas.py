@@ -512,8 +512,8 @@ def _given_fields(shown: ShownJob) -> dict[str, Any]:
         "progress": {**job.progress, **({} if job.status in UNFINISHED else {"eta_s": None})} if job.progress else None,
         "error": job.error or None,
         "parameters": JobParameters().model_dump(mode="json") | job.parameters,
-        "inputs": shown.inputs.named,
-        "input_counts": shown.inputs.counts,
+        "inputs": shown.inputs,
+        "input_counts": shown.input_counts,
         "links": Links(self=base, events=f"{base}/events", artifacts=f"{base}/artifacts", result=result),
     }
 

@@ -43,7 +43,7 @@ class Artifacts:
         self.objects = ObjectStore(url)
         self.local = self.objects.local
         if self.local:
-            self.objects.make_folder()
+            Path(self.objects.root).mkdir(parents=True, exist_ok=True)
 
     @disk_errors()
     def put(self, job_id: str, epoch: int, name: str, source: Path, *, final: bool = False) -> Published:

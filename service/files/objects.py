@@ -268,10 +268,6 @@ class ObjectStore:
                 if not self._files.exists(bucket):
                     self._files.mkdir(bucket)
 
-    def make_folder(self) -> None:
-        """Create the root folder."""
-        self._files.makedirs(self.root, exist_ok=True)
-
     def _path(self, name: str) -> str:
         return f"{self.root}/{name}"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -25,29 +24,19 @@ _ENTRIES = {
 }
 
 
-@dataclass
-class InputSummary:
-    """Inputs of a job without the names of photos and masks.
-
-    Attributes:
-        named: Entries of scene, style images and camera files, in their order.
-        counts: Number of files by role.
-    """
-
-    named: list[dict[str, Any]] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
-
-
-def summaries(connection: Connection, job_ids: Sequence[str]) -> dict[str, InputSummary]:
-    """Return the summary of each job's inputs."""
-    shown: dict[str, InputSummary] = {job_id: InputSummary() for job_id in job_ids}
+def counts_and_named(
+    connection: Connection, job_ids: Sequence[str]
+) -> tuple[dict[str, dict[str, int]], dict[str, list[dict[str, Any]]]]:
+    """Return the number of files by role of each job, and its entries of scene, style images and camera files."""
+    counts: dict[str, dict[str, int]] = {job_id: {} for job_id in job_ids}
+    named: dict[str, list[dict[str, Any]]] = {job_id: [] for job_id in job_ids}
     if job_ids:
         of_jobs = {"ids": list(job_ids)}
         for job_id, role, number in connection.execute(_query(connection, "counts"), of_jobs):
-            shown[job_id].counts[role] = number
+            counts[job_id][role] = number
         for job_id, entry in connection.execute(_query(connection, "named"), {**of_jobs, "roles": list(NAMED_ROLES)}):
-            shown[job_id].named.append(json.loads(entry))
-    return shown
+            named[job_id].append(json.loads(entry))
+    return counts, named
 
 
 def page(connection: Connection, job_id: str, start: int, limit: int) -> list[tuple[int, dict[str, Any]]]:

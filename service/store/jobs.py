@@ -17,7 +17,6 @@ from service.store.changes import add_status_event, end, forget, holder_name, jo
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import points
 from service.store.inputs import close_receipt
-from service.store.job_inputs import InputSummary
 from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job, lock_owner
 from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
@@ -84,14 +83,16 @@ class ShownJob:
 
     Attributes:
         row: Its record, without inputs.
-        inputs: Summary of its inputs.
+        inputs: Entries of scene, style images and camera files, in their order.
+        input_counts: Number of files by role.
         position: Number of queued jobs ahead by priority and age, plus one; None if it is not queued. The turns of
             owners are ignored, because they change with every lease.
         preview: Name of its newest preview; None if there is none.
     """
 
     row: JobRow
-    inputs: InputSummary
+    inputs: list[dict[str, Any]]
+    input_counts: dict[str, int]
     position: int | None
     preview: str | None
 
@@ -391,11 +392,14 @@ def _check_queue(session: Session, owner: str, limit: int) -> None:
 
 def _shown(connection: Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:
     """Return jobs as users see them, in the same snapshot."""
-    inputs = job_inputs.summaries(connection, [job.id for job in jobs])
+    counts, inputs = job_inputs.counts_and_named(connection, [job.id for job in jobs])
     started = [job.id for job in jobs if job.attempt]
     rows = connection.execute(_NEWEST_PREVIEWS, {"ids": started}) if started else ()
     previews = {row.job_id: row.newest for row in rows}
-    return [ShownJob(job, inputs[job.id], _queue_position(connection, job), previews.get(job.id)) for job in jobs]
+    return [
+        ShownJob(job, inputs[job.id], counts[job.id], _queue_position(connection, job), previews.get(job.id))
+        for job in jobs
+    ]
 
 
 def _queue_position(connection: Connection, job: JobRow) -> int | None:

@@ -58,18 +58,6 @@ class FailureCount:
     failures: int
     failed_step: int | None
 
-    def with_failure(self, saved_step: int | None) -> FailureCount:
-        """Return the count after another failure.
-
-        A failure after progress resets the count. A long job thus survives many sporadic failures, while a job that
-        fails at the same step each time does not.
-
-        Args:
-            saved_step: Last saved step of the job; None for no step.
-        """
-        progress = (saved_step or 0) > (self.failed_step or 0)
-        return FailureCount(0 if progress else self.failures + 1, saved_step)
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -123,7 +111,9 @@ class RetryPolicy:
         if outcome == AttemptOutcome.RELEASED:
             return Verdict(Transition.REQUEUE, count)
         if causes[0] == Cause.JOB:
-            count = count.with_failure(saved_step)
+            # progress resets the count: a long job survives many sporadic failures, but not one at the same step again
+            progress = (saved_step or 0) > (count.failed_step or 0)
+            count = FailureCount(0 if progress else count.failures + 1, saved_step)
             failed, repeated = permanent or count.failures >= self.max_attempts, count.failures
         else:
             failed = list(causes[:MAX_LOSSES]) == [Cause.DISPATCHER] * MAX_LOSSES

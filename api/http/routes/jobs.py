@@ -110,7 +110,7 @@ def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Respons
     check_id(job_id)
     job, _ = context.store.jobs.detail(job_id, caller.owner)
     regions = JobParameters(**job.row.parameters).region_requests
-    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs.named, regions))
+    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs, regions))
     return _job_response(context, caller, job_id)
 
 

@@ -142,7 +142,7 @@ def _shared_view(context: Context, shared: Shared) -> SharedView:
         name=job.row.name,
         expires_at=shared.share.expires_at,
         parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters},
-        cameras=[entry["name"] for entry in job.inputs.named if entry["role"] == "cameras"],
+        cameras=[entry["name"] for entry in job.inputs if entry["role"] == "cameras"],
         files=files,
     )
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Request, Response
 
@@ -99,10 +99,12 @@ def check_protocol(request: Request, tus: Tus = "") -> None:
 _REQUIRES_TUS = [Depends(check_protocol)]
 
 
-def _following_operations(**parameters: str) -> dict[str, Any]:
-    """Return OpenAPI links to the operations that a client may call next on an upload."""
-    without_offset = links("get_upload", "head_upload", "delete_upload", **parameters)
-    return without_offset | links("append_upload", **parameters, **{"Upload-Offset": "0"})
+_NEW = {"upload_id": "$response.body#/id"}
+#: OpenAPI links to the operations that a client may call next on a new upload.
+_FOLLOWING_OPERATIONS = {
+    **links("get_upload", "head_upload", "delete_upload", **_NEW),
+    **links("append_upload", **_NEW, **{"Upload-Offset": "0"}),
+}
 
 
 @router.options(
@@ -138,7 +140,7 @@ def describe_uploads(context: ContextDep) -> Response:
         201: {
             "description": "The upload is created; send its bytes to the `Location`.",
             "headers": headers("Location", "Tus-Resumable", "Upload-Expires", "Cache-Control"),
-            "links": _following_operations(upload_id="$response.body#/id"),
+            "links": _FOLLOWING_OPERATIONS,
         }
     },
 )

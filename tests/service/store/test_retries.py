@@ -24,7 +24,7 @@ FRESH = FailureCount(0, None)
     ],
 )
 def test_failures_count_only_without_progress(before: FailureCount, saved: int | None, after: FailureCount) -> None:
-    assert before.with_failure(saved) == after
+    assert POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, before, saved).count == after
 
 
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST, AttemptOutcome.RELEASED])

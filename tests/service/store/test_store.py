@@ -486,8 +486,8 @@ def test_inputs_are_read_in_pieces(store: Store) -> None:
     job_id = store.jobs.create(replace(new_job(), inputs=entries), limit=10)[0].id
     (shown,) = store.jobs.page(None)
     assert shown.inputs == store.jobs.detail(job_id, None)[0].inputs
-    assert [entries.index(entry) for entry in shown.inputs.named] == [1, 3, 5, 6]
-    assert shown.inputs.counts == {"scene": 1, "style": 2, "cameras": 1, "photos": 3, "mask": 1}
+    assert [entries.index(entry) for entry in shown.inputs] == [1, 3, 5, 6]
+    assert shown.input_counts == {"scene": 1, "style": 2, "cameras": 1, "photos": 3, "mask": 1}
     assert store.jobs.input_page(job_id, 2, 4) == [(1, entries[2]), (0, entries[3]), (0, entries[4]), (1, entries[5])]
     assert store.jobs.input_page(job_id, 8, 4) == []
     assert store.jobs.input(job_id, "photos", 2) == entries[7]
