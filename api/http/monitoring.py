@@ -95,22 +95,19 @@ class _StoreCollector(Collector):
         for status in JobStatus:
             depth.add_metric([status], counts.get(status, 0))
         yield depth
-        yield GaugeMetricFamily(
-            "sgsst_queue_oldest_seconds", "Seconds that the oldest queued job has waited.", operations.oldest_queued()
-        )
         yield from self._counters()
-        rates = [step / seconds for step, seconds in operations.steps_and_seconds()]
-        yield GaugeMetricFamily(
-            "sgsst_iterations_per_second", "Iterations per second of all running jobs together.", sum(rates)
-        )
-        alive = operations.dispatchers()
-        yield GaugeMetricFamily("sgsst_dispatchers", "Dispatchers that are alive.", len(alive))
-        slots, free = sum(row.slots for row in alive), sum(row.free for row in alive)
-        yield GaugeMetricFamily("sgsst_slots", "GPUs, or slots for jobs on hosts without GPUs.", slots)
-        yield GaugeMetricFamily("sgsst_slots_free", "GPUs or slots that no job occupies.", free)
-        disk = shutil.disk_usage(self._folder)
-        yield GaugeMetricFamily("sgsst_disk_free_bytes", "Free bytes of the disk that receives files.", disk.free)
-        yield GaugeMetricFamily("sgsst_disk_bytes", "Size of that disk.", disk.total)
+        alive, disk = operations.dispatchers(), shutil.disk_usage(self._folder)
+        rate = sum(step / seconds for step, seconds in operations.steps_and_seconds())
+        for name, text, value in (
+            ("queue_oldest_seconds", "Seconds that the oldest queued job has waited.", operations.oldest_queued()),
+            ("iterations_per_second", "Iterations per second of all running jobs together.", rate),
+            ("dispatchers", "Dispatchers that are alive.", len(alive)),
+            ("slots", "GPUs, or slots for jobs on hosts without GPUs.", sum(row.slots for row in alive)),
+            ("slots_free", "GPUs or slots that no job occupies.", sum(row.free for row in alive)),
+            ("disk_free_bytes", "Free bytes of the disk that receives files.", disk.free),
+            ("disk_bytes", "Size of that disk.", disk.total),
+        ):
+            yield GaugeMetricFamily(f"sgsst_{name}", text, value)
 
     def _counters(self) -> Iterable[Metric]:
         stored: defaultdict[str, dict[str, float]] = defaultdict(dict)
@@ -155,7 +152,10 @@ class Readiness:
         """Return the result or exception of each check; `TimeoutError` for a check that has not returned in time."""
         running = {name: self._start(name) for name in self._checks}
         await asyncio.wait(running.values(), timeout=_SECONDS)
-        return {name: _outcome(future) for name, future in running.items()}
+        return {
+            name: (future.exception() or future.result()) if future.done() else TimeoutError()
+            for name, future in running.items()
+        }
 
     def _start(self, name: str) -> asyncio.Future[object]:
         running = self._running.get(name)
@@ -167,9 +167,3 @@ class Readiness:
     def close(self) -> None:
         """Cancel checks that have not started, without waiting for running ones."""
         self._threads.shutdown(wait=False, cancel_futures=True)
-
-
-def _outcome(future: asyncio.Future[object]) -> object:
-    if not future.done():
-        return TimeoutError()
-    return future.exception() or future.result()

@@ -76,11 +76,6 @@ def add_event(session: Session, job_id: str, kind: str, data: dict[str, Any], no
     session.execute(insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
 
 
-def release_inputs(session: Session, job_id: str) -> None:
-    """Release a job's inputs; blobs without other holders are collected later."""
-    session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job_id)))
-
-
 def release_blobs(session: Session, holder: str) -> list[str]:
     """Release a holder's blobs and delete the rows of those without other holders.
 

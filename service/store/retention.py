@@ -5,10 +5,10 @@ from __future__ import annotations
 from sqlalchemy import and_, delete, select, update
 
 from service.states import FINISHED, JobStatus, Transition
-from service.store.changes import forget, move, release_inputs
+from service.store.changes import forget, holder_name, move
 from service.store.clocks import advance_expiry_time, expiry_time, retained_until
 from service.store.database import IDEMPOTENCY_SECONDS, Database
-from service.store.tables import ArtifactRow, DispatcherRow, IdempotencyRow, JobRow
+from service.store.tables import ArtifactRow, BlobUseRow, DispatcherRow, IdempotencyRow, JobRow
 
 #: Time in seconds after which a dispatcher without heartbeat is forgotten.
 _FORGET_SECONDS = 86_400.0
@@ -53,7 +53,8 @@ class Retention:
                     continue
                 job.expires_at = retained_until(session, clock, self._retention)
                 session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
-                release_inputs(session, job.id)
+                # blobs without other holders are collected later
+                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
                 move(session, job, Transition.EXPIRE, clock)
             session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
