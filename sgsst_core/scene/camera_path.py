@@ -89,20 +89,15 @@ class CameraPath:
         else:
             positions, rotations = self._positions(times), self._rotations(times).as_matrix()
         intrinsics = np.stack([np.interp(times, self.knots, column) for column in self._intrinsics.T], axis=1)
-        return [
-            self._camera(f"frame_{index:05d}", *pose)
-            for index, pose in enumerate(zip(positions, rotations, intrinsics, strict=True))
-        ]
-
-    def _camera(
-        self, name: str, position: NDArray[np.float64], rotation: NDArray[np.float64], intrinsics: NDArray[np.float64]
-    ) -> Camera:
-        world_to_camera = torch.eye(4, dtype=torch.float64)
-        world_to_camera[:3, :3] = torch.from_numpy(rotation)
-        world_to_camera[:3, 3] = torch.from_numpy(-rotation @ position)
-        fx, fy = (math.sqrt(self._width * self._height) * np.exp(intrinsics[:2])).tolist()
-        cx, cy = self._width * float(intrinsics[2]), self._height * float(intrinsics[3])
-        return Camera(name, self._width, self._height, fx, fy, cx, cy, world_to_camera)
+        cameras = []
+        for index, (position, rotation, relative) in enumerate(zip(positions, rotations, intrinsics, strict=True)):
+            pose = torch.eye(4, dtype=torch.float64)
+            pose[:3, :3] = torch.from_numpy(rotation)
+            pose[:3, 3] = torch.from_numpy(-rotation @ position)
+            fx, fy = (math.sqrt(self._width * self._height) * np.exp(relative[:2])).tolist()
+            cx, cy = self._width * float(relative[2]), self._height * float(relative[3])
+            cameras.append(Camera(f"frame_{index:05d}", self._width, self._height, fx, fy, cx, cy, pose))
+        return cameras
 
 
 def catmull_rom_tangents(knots: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

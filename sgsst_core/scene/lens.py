@@ -78,10 +78,6 @@ class Lens:
             x: First coordinates of points (x, y, 1) on the rays, any shape, float64.
             y: Second coordinates.
         """
-        x, y = self._distorted(x, y)
-        return (self.fx * x + self.cx) / self.width, (self.fy * y + self.cy) / self.height
-
-    def _distorted(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         if self.kind == "fisheye":
             k1, k2, k3, k4 = self.coefficients
             radius = torch.hypot(x, y)
@@ -89,15 +85,16 @@ class Lens:
             square = angle * angle
             bent = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
             factor = torch.where(radius > 1e-12, bent / radius.clamp_min(1e-12), 1.0)
-            return x * factor, y * factor
-        assert self.kind == "radial"
-        k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients
-        square = x * x + y * y
-        factor = (1 + square * (k1 + square * (k2 + square * k3))) / (1 + square * (k4 + square * (k5 + square * k6)))
-        return (
-            x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x),
-            y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
-        )
+            u, v = x * factor, y * factor
+        else:
+            assert self.kind == "radial"
+            k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients
+            square = x * x + y * y
+            above, below = square * (k1 + square * (k2 + square * k3)), square * (k4 + square * (k5 + square * k6))
+            factor = (1 + above) / (1 + below)
+            u = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+            v = y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+        return (self.fx * u + self.cx) / self.width, (self.fy * v + self.cy) / self.height
 
 
 @functools.lru_cache(maxsize=1024)  # most cameras of a capture share their lens

@@ -56,7 +56,11 @@ class Frame:
 
     def apply(self, arrays: Arrays) -> None:
         """Transform the arrays of a scene in place. Computes in float64; rotations by 180 degrees are exact."""
-        turn, harmonics = self._quaternion(), self._harmonics(arrays["sh_rest"].shape[1])
+        from scipy.spatial.transform import Rotation  # not for the API process, which only reads headers
+
+        x, y, z, w = Rotation.from_matrix(self.rotation).as_quat()
+        turn = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])  # left multiplication, wxyz
+        harmonics = self._harmonics(arrays["sh_rest"].shape[1])
         for part in blocks(len(arrays["means"])):
             block = {name: array[part] for name, array in arrays.items()}
             means = block["means"].astype(np.float64)
@@ -66,13 +70,6 @@ class Frame:
             block["quats"][:] = block["quats"].astype(np.float64) @ turn.T
             rest = block["sh_rest"].astype(np.float64)
             block["sh_rest"][:] = np.einsum("ij,njc->nic", harmonics, rest)
-
-    def _quaternion(self) -> NDArray[np.float64]:
-        """Return the matrix [4, 4] of left multiplication by the rotation's quaternion, for quaternions wxyz."""
-        from scipy.spatial.transform import Rotation  # not for the API process, which only reads headers
-
-        x, y, z, w = Rotation.from_matrix(self.rotation).as_quat()
-        return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
     def _harmonics(self, coefficients: int) -> NDArray[np.float64]:
         """Return the matrix of SH coefficients above degree 0, [coefficients, coefficients].

@@ -100,25 +100,18 @@ class Accessor:
     Attributes:
         offset: Byte offset of the first value.
         stride: Bytes from one value to the next.
-        components: Number of components of a value.
-        kind: NumPy type code of a component.
-        normalized: Whether integers stand for -1 to 1, or 0 to 1.
+        kind: dtype of a value with its components.
+        largest: Integer that stands for 1 if integers are normalized; None otherwise.
         view: Index of the buffer view.
         view_end: Byte offset of the end of the buffer view.
     """
 
     offset: int
     stride: int
-    components: int
-    kind: str
-    normalized: bool
+    kind: np.dtype
+    largest: int | None
     view: int
     view_end: int
-
-    @property
-    def value_bytes(self) -> int:
-        """Return the bytes of one value."""
-        return self.components * np.dtype(self.kind).itemsize
 
 
 @dataclass(frozen=True)
@@ -272,7 +265,7 @@ def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data
         raise ValueError(f"byteLength: {declared}")
     spans = [(data.start + declared, data.stop), (data.stop, path.stat().st_size)]
     ends = {
-        accessor: accessor.offset + (part.count - 1) * accessor.stride + accessor.value_bytes
+        accessor: accessor.offset + (part.count - 1) * accessor.stride + accessor.kind.itemsize
         for part in parts
         for accessor in (*part.accessors.values(), *part.harmonics)
     }
@@ -286,26 +279,26 @@ def _about_rest(path: Path, document: dict[str, Any], parts: list[GlbPart], data
     return [note for span in dict.fromkeys(spans) for note in about_part(path, *span)]
 
 
-def _accessor(document: dict[str, Any], index: int, kind: str, count: int, data: range) -> Accessor:
+def _accessor(document: dict[str, Any], index: int, shape: str, count: int, data: range) -> Accessor:
     """Check that the values of an accessor lie in the binary data."""
     entry = document["accessors"][index]
-    if entry["type"] != kind or entry["count"] != count or "sparse" in entry:
+    if entry["type"] != shape or entry["count"] != count or "sparse" in entry:
         raise ValueError(f"accessor {index}: {entry}")
     view = document["bufferViews"][entry["bufferView"]]
     if view.get("buffer") != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
         raise ValueError(f"buffer view {entry['bufferView']} is not in the file, or compressed")
     code = _TYPES[entry["componentType"]]
-    value_bytes = _COMPONENTS[kind] * np.dtype(code).itemsize
-    stride = view.get("byteStride", value_bytes)
+    kind = np.dtype((code, (_COMPONENTS[shape],)))
+    stride = view.get("byteStride", kind.itemsize)
     first, start, size = entry.get("byteOffset", 0), view.get("byteOffset", 0), view["byteLength"]
     if any(type(number) is not int or number < 0 for number in (stride, first, start, size)):
         raise ValueError(f"accessor {index}: {entry}, {view}")
-    inside = start + size <= len(data) and first + (count - 1) * stride + value_bytes <= size
-    if not inside or not value_bytes <= stride <= _MAX_STRIDE:
+    inside = start + size <= len(data) and first + (count - 1) * stride + kind.itemsize <= size
+    if not inside or not kind.itemsize <= stride <= _MAX_STRIDE:
         raise ValueError(f"accessor {index}: {count} values are more than its {size} bytes can hold")
-    normalized = bool(entry.get("normalized", False)) and code in _LARGEST
+    largest = _LARGEST.get(code) if entry.get("normalized", False) else None
     offset, end = data.start + start + first, data.start + start + size
-    return Accessor(offset, stride, _COMPONENTS[kind], code, normalized, entry["bufferView"], end)
+    return Accessor(offset, stride, kind, largest, entry["bufferView"], end)
 
 
 def _node_matrix(nodes: list[dict[str, Any]], parents: dict[int, int], index: int) -> NDArray[np.float64]:
@@ -366,16 +359,12 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
 
 def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:
     """Yield the values of an accessor block by block, as slices of Gaussians and [n, components]."""
-    kind = np.dtype(accessor.kind)
     for block in blocks(count):
         rows = block.stop - block.start
-        data_bytes = (rows - 1) * accessor.stride + accessor.value_bytes
+        data_bytes = (rows - 1) * accessor.stride + accessor.kind.itemsize
         data = read_rows(file, np.dtype(np.uint8), accessor.offset + block.start * accessor.stride, data_bytes)
-        shape, strides = (rows, accessor.components), (accessor.stride, kind.itemsize)
-        values = np.ndarray(shape, kind, data, 0, strides).astype(np.float64)
-        if accessor.normalized:
-            values = np.maximum(values / _LARGEST[accessor.kind], -1)
-        yield block, values
+        values = np.ndarray((rows,), accessor.kind, data, 0, (accessor.stride,)).astype(np.float64)
+        yield block, values if accessor.largest is None else np.maximum(values / accessor.largest, -1)
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
