@@ -31,8 +31,8 @@ _COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def unknown_text(name: str, known: Iterable[str]) -> str:
-    """Return the message for an unknown option or parameter, with the most similar known one."""
-    similar = difflib.get_close_matches(name, known, 1)
+    """Return the message for an unknown option or parameter, with a known one that differs by a slip of the keys."""
+    similar = difflib.get_close_matches(name, known, 1, cutoff=0.75)
     return "is not a parameter." + (f" Did you mean {similar[0]!r}?" if similar else "")
 
 

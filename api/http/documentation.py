@@ -288,7 +288,7 @@ def _invalid(parameter: dict[str, Any]) -> ServiceError | None:
     """Return an example error for a parameter; None if every value of it is valid."""
     schema = parameter["schema"]
     schema = schema | schema.get("anyOf", [{}])[0]
-    at = f"{parameter['in']}.{parameter['name']}"
+    at = parameter["name"]
     if "le" in schema or "lt" in schema:
         bound = "or equal to " if "le" in schema else ""
         return _invalid_request(at, f"Input should be less than {bound}{schema.get('le', schema.get('lt'))}")

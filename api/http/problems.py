@@ -94,9 +94,12 @@ async def _expected(request: Request, error: Exception) -> JSONResponse:
 
 async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError | ValidationError)
+    outer = int(
+        isinstance(error, RequestValidationError)
+    )  # its locations start with a part of the request: query, body
     errors = [
         {
-            "at": (at := ".".join(str(part) for part in entry["loc"])[:_SHOWN]),
+            "at": (at := ".".join(str(part) for part in entry["loc"][outer:])[:_SHOWN]),
             "message": _unknown(at) if entry["type"] == "extra_forbidden" else reason(entry),
         }
         for entry in merged(error.errors())[:20]

@@ -94,6 +94,7 @@ def moved(cameras: bytes) -> bytes:
         ),
         ({"background": "red"}, "background", "'red' is not a color. Give black, white or three numbers from 0 to 255"),
         ({"list[x]": 1}, "list[x]", "is not a parameter."),
+        ({"resolutoin": 1}, "resolutoin", "is not a parameter. Did you mean 'resolution'?"),
     ],
 )
 def test_value_of_several_types_gets_one_message(
@@ -104,6 +105,17 @@ def test_value_of_several_types_gets_one_message(
     problem = refused(answer, 422, "invalid-request")
     assert [error["at"] for error in problem["errors"]] == [at]
     assert problem["detail"].startswith(f"{at}: {message}")
+
+
+def test_unknown_parameter_gets_no_distant_suggestion(client: httpx2.Client, files: dict[str, bytes]) -> None:
+    answer = client.post("/v1/jobs", files=form(files), data={"parameters": '{"video": {}}'})
+    assert refused(answer, 422, "invalid-request")["detail"] == "video: is not a parameter."
+
+
+def test_invalid_query_is_named_as_it_was_sent(client: httpx2.Client) -> None:
+    problem = refused(client.get("/v1/jobs", params={"limit": "many"}), 422, "invalid-request")
+    assert problem["detail"].startswith("limit: ")
+    assert problem["errors"][0]["at"] == "limit"
 
 
 def test_missing_and_surplus_files_are_rejected(client: httpx2.Client, files: dict[str, bytes]) -> None:
