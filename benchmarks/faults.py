@@ -30,9 +30,10 @@ from benchmarks.machine import write_result
 from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
 from worker.job import JobSpec
-from worker.ranks.attempts import Listener, RanksResult, stylize_on_ranks
+from worker.ranks.attempts import stylize_on_ranks
 from worker.ranks.cluster import Cluster
 from worker.ranks.rank import WorkerOptions
+from worker.run import Ended, Listener
 
 STEPS = 250
 #: Number of faults per job. An attempt makes a few dozen steps before its fault.
@@ -83,7 +84,7 @@ class Chaos:
         self.injected: list[dict[str, Any]] = []
         self._arm()
 
-    def run(self) -> RanksResult:
+    def run(self) -> Ended:
         """Run the job to its end."""
         options = WorkerOptions(RANK_TIMEOUT, CHECKPOINT_SECONDS, actor=FaultyRank)
         listener = Listener(progress=self._progress, happened=self._happened)
@@ -208,7 +209,7 @@ def main() -> None:
     print(write_result("faults", figures))
 
 
-def _loss(ended: RanksResult) -> float:
+def _loss(ended: Ended) -> float:
     assert ended.result is not None
     assert ended.result.loss_after is not None
     return ended.result.loss_after

@@ -25,7 +25,6 @@ from sgsst_core.stylizing.loop import Callbacks, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.job import Result
 from worker.options import RunOptions
-from worker.outputs import Outputs
 from worker.prepare import Job, Warn
 from worker.previews import Previews
 
@@ -72,7 +71,9 @@ def execute(
         stylizer.load_state(job.resumed.state)
     if first:
         progress(Progress(stage="starting", step=stylizer.step, total=stylizer.job.total_steps))
-        _clear_outputs(job.outputs)
+        job.outputs.ply.parent.mkdir(parents=True, exist_ok=True)
+        for path in job.outputs.all:
+            remove_leftovers(path)  # of an attempt that was killed
     stylizer.job.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.job.plan)))
     if first:
         _write_views(job, warn)
@@ -97,13 +98,6 @@ def execute(
     if first and preview:
         preview.finish(stylizer)
     return result
-
-
-def _clear_outputs(outputs: Outputs) -> None:
-    """Create the output folder, and delete temporary files of an attempt that was killed."""
-    outputs.ply.parent.mkdir(parents=True, exist_ok=True)
-    for path in outputs.all:
-        remove_leftovers(path)
 
 
 def _write_views(job: Job, warn: Warn) -> None:
@@ -173,7 +167,10 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
     """Write the PLY, then all other outputs. Every rank must call this function."""
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.job.collectives.rank == 0
-    stylizer.job.collectives.broadcast(lambda: _write_ply(job))
+    attenuation = stylizer.job.settings.sh_attenuation
+    stylizer.job.collectives.broadcast(
+        lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized(), sh_attenuation=attenuation)
+    )
     compressed = stylizer.job.collectives.broadcast(lambda: _write_compressed(job))
     if first and stopped != "max-seconds":
         outputs.checkpoints.remove()
@@ -194,19 +191,6 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
         compressed=compressed and compressed.text("the PLY"),
         loss_over_time=loss_over_time(stylizer, before),
     )
-
-
-def _write_ply(job: Job) -> None:
-    stylizer = job.stylizer
-    write_stylized(
-        job.scene_file, job.outputs.ply, stylizer.stylized(), sh_attenuation=stylizer.job.settings.sh_attenuation
-    )
-
-
-def _only_colors_change(job: Job) -> bool:
-    """Return whether the result has the same rows as the scene's file, with only f_dc changed."""
-    attenuation = job.stylizer.job.settings.sh_attenuation
-    return _has_rows_of_file(job) and not (attenuation and job.scene_file.scene.sh_degree)
 
 
 def _has_rows_of_file(job: Job) -> bool:
@@ -237,7 +221,8 @@ def _write_reports(
         from sgsst_core.report.charts import write_loss_chart
         from sgsst_core.report.page import write_page
 
-        if job.request.colors and _only_colors_change(job):
+        attenuated = stylizer.job.settings.sh_attenuation and job.scene_file.scene.sh_degree
+        if job.request.colors and _has_rows_of_file(job) and not attenuated:  # only f_dc changes
             write_colors(outputs.colors, stylizer.stylized())
         near, survey = stylizer.job.settings.near, stylizer.job.plan.survey
         findings = findings_of(job.scene_file, stylizer.job.views.cameras, stylizer.job.style, near=near, survey=survey)

@@ -376,5 +376,4 @@ def same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
 
 def _stamp(photo: Photo) -> tuple[object, ...]:
     status = photo.path.stat()
-    stamp = (photo.path.name, status.st_size, status.st_mtime_ns)
-    return (*stamp, "oriented") if photo.oriented else stamp
+    return (photo.path.name, status.st_size, status.st_mtime_ns, *(["oriented"] if photo.oriented else []))

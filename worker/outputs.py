@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,6 +68,19 @@ def check_folder(folder: Path) -> None:
     ensure_writable_folder(folder)
 
 
+#: Ending of each file beside a job's PLY, by its attribute.
+_SUFFIXES = {
+    "report": ".report.json",
+    "page": ".report.html",
+    "plan": ".plan.json",
+    "views": ".views.jpg",
+    "sheet": ".before_after.jpg",
+    "curves": ".loss.png",
+    "checkpoint": ".checkpoint.safetensors",
+    "colors": ".colors.f16",
+}
+
+
 @dataclass(frozen=True)
 class Outputs:
     """Output files of a job, named after its PLY so that jobs can share a folder.
@@ -75,10 +88,28 @@ class Outputs:
     Attributes:
         ply: Stylized scene.
         compressed: Stylized scene in another format, which the suffix of its name determines; None if not requested.
+        report, page, plan: Report as JSON and as HTML, and plan as JSON.
+        views: Unstylized renders of an orbit's views.
+        sheet, curves: Contact sheet, and loss curves.
+        checkpoint: Newest checkpoint.
+        colors: Stylized colors alone.
     """
 
     ply: Path
     compressed: Path | None = None
+    report: Path = field(init=False)
+    page: Path = field(init=False)
+    plan: Path = field(init=False)
+    views: Path = field(init=False)
+    sheet: Path = field(init=False)
+    curves: Path = field(init=False)
+    checkpoint: Path = field(init=False)
+    colors: Path = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Name the files beside the PLY."""
+        for name, suffix in _SUFFIXES.items():
+            object.__setattr__(self, name, self.ply.with_name(self.ply.stem + suffix))
 
     @staticmethod
     def of(out: Path) -> Outputs:
@@ -97,54 +128,10 @@ class Outputs:
         """Return the format of the compressed file; None if there is none."""
         return None if self.compressed is None else format_of_name(self.compressed.name)
 
-    def _beside(self, suffix: str) -> Path:
-        return self.ply.with_name(self.ply.stem + suffix)
-
-    @property
-    def report(self) -> Path:
-        """Return the path of the JSON report."""
-        return self._beside(".report.json")
-
-    @property
-    def page(self) -> Path:
-        """Return the path of the HTML report."""
-        return self._beside(".report.html")
-
-    @property
-    def plan(self) -> Path:
-        """Return the path of the JSON plan."""
-        return self._beside(".plan.json")
-
-    @property
-    def sheet(self) -> Path:
-        """Return the path of the contact sheet."""
-        return self._beside(".before_after.jpg")
-
-    @property
-    def views(self) -> Path:
-        """Return the path of the unstylized renders of an orbit's views."""
-        return self._beside(".views.jpg")
-
-    @property
-    def curves(self) -> Path:
-        """Return the path of the loss curves."""
-        return self._beside(".loss.png")
-
-    @property
-    def colors(self) -> Path:
-        """Return the path of the stylized colors alone."""
-        return self._beside(".colors.f16")
-
-    @property
-    def checkpoint(self) -> Path:
-        """Return the path of the newest checkpoint."""
-        return self._beside(".checkpoint.safetensors")
-
     @property
     def all(self) -> list[Path]:
         """Return the paths of all output files except the older checkpoint, which is only created by renaming."""
-        paths = [self.ply, self.report, self.page, self.plan, self.views, self.sheet, self.curves, self.checkpoint]
-        paths.append(self.colors)
+        paths = [self.ply, *(getattr(self, name) for name in _SUFFIXES)]
         return paths if self.compressed is None else [*paths, self.compressed]
 
     @property

@@ -5,14 +5,20 @@ Every rank calls the same functions. Nothing is printed, and nothing is written 
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
+from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile
@@ -25,7 +31,7 @@ from sgsst_core.refine.split import Refinement
 from sgsst_core.report.document import Sources
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.checkpoint import Checkpoint
+from sgsst_core.stylizing.checkpoint import Checkpoint, load_plan, save_plan, versions
 from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.refining import refine, refined
@@ -68,6 +74,7 @@ def prepare(
     warn: Warn = lambda line: None,
     show_planning: ShowPlanning | None = None,
     preview: Previews | None = None,
+    plan_file: Path | None = None,
 ) -> Job:
     """Read and check all inputs of a job, and plan it. Every rank must call this function.
 
@@ -81,6 +88,7 @@ def prepare(
         show_planning: Callback for the progress of planning. It is not called if the checkpoint's plan
             is used.
         preview: Writer of previews, used on rank 0 of a new job; None to write none.
+        plan_file: Plan that `dry_run` has handed over; None or a missing file for none.
 
     Raises:
         InvalidInputError: If an input cannot be used. Every rank raises the same error.
@@ -99,18 +107,21 @@ def prepare(
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
     if preview and not resumed and collectives.rank == 0:
         preview.write_first(inputs, settings)
-    refinement, scene_file = resumed.plan.refinement if resumed else None, inputs.scene_file
+    known: Checkpoint | _HandedOver | None = resumed
+    if plan_file and not resumed:
+        known = collectives.broadcast(lambda: _handed_over(plan_file, fingerprint, inputs, settings))
+    refinement, scene_file = known.plan.refinement if known else None, inputs.scene_file
     if settings.growth > 1:
         with timer("refining"):
-            refinement = refinement if resumed else _refine(inputs, settings, weights, collectives, show_planning)
+            refinement = refinement if known else _refine(inputs, settings, weights, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
-    plan = _usable_plan(resumed, collectives)
-    planned_ranks = resumed.ranks if resumed and plan else collectives.size
+    plan = _usable_plan(known, collectives)
+    planned_ranks = known.ranks if known and plan else collectives.size
     stylization = _planner(inputs, settings, weights, scene_file.scene, refinement)(
         plan=plan,
         photos=inputs.photo_loader(settings.background),
         collectives=collectives,
-        survey=resumed.plan.survey if resumed else None,
+        survey=known.plan.survey if known else None,
         show=show_planning,
         timer=timer,
     )
@@ -124,13 +135,14 @@ def prepare(
     return Job(request, outputs, scene_file, sources, stylizer, fingerprint, resumed, planned_ranks, workers)
 
 
-def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None) -> Plan:
-    """Plan a job as `prepare` would on one rank, and write nothing.
+def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None, hand_over: Path | None = None) -> Plan:
+    """Plan a job as `prepare` would on one rank.
 
     Args:
         request: Job to plan.
         inputs: Inputs of the job, from `read_inputs`.
         show: Callback for the progress of planning.
+        hand_over: Existing file to write the plan to, for `prepare`; None writes nothing.
 
     Raises:
         InvalidInputError: If the job cannot be planned.
@@ -138,7 +150,47 @@ def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None) 
     settings, weights = request.settings, load_network_weights(request.backbone)
     refinement = _refine(inputs, settings, weights, ALONE, show)
     scene = refined(inputs.scene_file.scene, refinement)
-    return _planner(inputs, settings, weights, scene, refinement)(show=show).plan
+    plan = _planner(inputs, settings, weights, scene, refinement)(show=show).plan
+    if hand_over:
+        job = fingerprint_of(inputs, settings, weights.sha256, ALONE)
+        with contextlib.suppress(OSError):  # a job without this file plans again
+            save_plan(hand_over, plan, job, _conditions(settings))
+    return plan
+
+
+@dataclass(frozen=True)
+class _HandedOver:
+    """Plan that a dry run has handed over.
+
+    Attributes:
+        ranks: Number of ranks for which it was made; 0 if only its survey and its refinement can be used here.
+    """
+
+    plan: Plan
+    ranks: int
+
+
+def _handed_over(file: Path, fingerprint: str, inputs: Inputs, settings: Settings) -> _HandedOver | None:
+    """Return the plan of a dry run of the same job; None if there is none.
+
+    The fingerprint covers the content of all inputs, and the settings that determine the course of the job. What a
+    plan measured holds for the same settings, machine, threads and versions alone, and if the memory that it plans with
+    is free now; otherwise, the job makes a trial of its own.
+    """
+    try:
+        plan, conditions = load_plan(file, fingerprint, inputs.scene_file.scene, inputs.cameras)
+    except CheckpointError:
+        return None
+    limit = settings.memory_limit or default_memory_limit()
+    same = conditions == _conditions(settings) and plan.memory_limit <= limit and plan.spare <= limit
+    return _HandedOver(plan, int(same))
+
+
+def _conditions(settings: Settings) -> str:
+    """Return a text about everything besides the inputs that determines what a plan has measured."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    machine = (socket.gethostname(), os.cpu_count(), psutil.virtual_memory().total, torch.get_num_threads(), device)
+    return json.dumps([settings.model_dump(mode="json"), versions(), machine])
 
 
 def _planner(
@@ -176,15 +228,15 @@ def _refine(
     )
 
 
-def _usable_plan(resumed: Checkpoint | None, collectives: Collectives) -> Plan | None:
-    """Return the plan of a resumed job; None if the job is new or the plan cannot be used on this machine.
+def _usable_plan(known: Checkpoint | _HandedOver | None, collectives: Collectives) -> Plan | None:
+    """Return the plan that is known already; None if there is none or it cannot be used on this machine.
 
     A plan made for another device or for fewer ranks cannot be used. If the plan uses a GPU rasterizer, its kernels are
     compiled and checked here: compiling may take longer than ranks wait for each other during a step.
     """
-    if resumed is None or collectives.size > resumed.ranks:
+    if known is None or collectives.size > known.ranks:
         return None
-    plan = resumed.plan
+    plan = known.plan
     if plan.device != common_device(collectives):
         return None
     on_gpu = RASTERIZERS[plan.uncached].on_gpu

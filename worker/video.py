@@ -122,7 +122,10 @@ def render_video(
     after = layer(scene)
     unstylized = None
     if before is not None:
-        unstylized = Layer(before, after.rasterizer) if _same_geometry(before, scene) else layer(before)
+        shape = ("means", "quats", "scales", "opacities")
+        same = all(torch.equal(getattr(before, name), getattr(scene, name)) for name in shape)
+        same = same and before.rendering == scene.rendering
+        unstylized = Layer(before, after.rasterizer) if same else layer(before)
     request.out.parent.mkdir(parents=True, exist_ok=True)
     write_to, first, options = encoder if in_place else video_writer, cameras[0], request.options
     with write_to(request.out, first.width, first.height, options.fps, alpha=request.transparent) as write:
@@ -185,10 +188,3 @@ def _read(source: SceneRequest) -> tuple[Scene, list[Decision]]:
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = file.rendered(source.render_mode, source.eps2d)
     return file.scene, [*about_notes(file), *decisions, *about_rendering(file)]
-
-
-def _same_geometry(first: Scene, second: Scene) -> bool:
-    """Return whether two scenes only differ in their colors."""
-    return first.rendering == second.rendering and all(
-        torch.equal(getattr(first, name), getattr(second, name)) for name in ("means", "quats", "scales", "opacities")
-    )

@@ -212,10 +212,10 @@ def convert(
     options: ViewOptions,
 ) -> None:
     """Convert a scene to another format, which the name of OUT determines."""
-    from api.cli.scene_tools import convert_scene
+    from worker.derive import convert as convert_scene
     from worker.job import SceneRequest
 
-    converted = convert_scene(SceneRequest.of(scene, cameras, options), out, compare)
+    converted = convert_scene(SceneRequest.of(scene, cameras, options), out, compare=compare)
     for line in converted.decisions:
         print_field(line.item, f"{line.decision}: {line.reason}")
     if converted.loss is not None:
@@ -249,7 +249,7 @@ def blend(
     """Blend scenes that differ only in color: a scene and its results, or several results."""
     from api.cli.scene_tools import blend_files
 
-    blended = blend_files(scenes, out, drop_invalid=options.drop_invalid, spz_axes=options.spz_axes)
+    blended = blend_files(scenes, out, options)
     for path, weight in blended:
         print_field("weight", f"{weight:.4g} of {path}")
     print_field("scene", out)

@@ -1,45 +1,35 @@
-"""Implementation of the commands `plan`, `check`, `render`, `convert` and `blend`.
+"""Implementation of the commands `plan`, `check`, `render` and `blend`.
 
 The functions check all inputs, compute, and write the outputs, but print nothing. `stylize` is implemented by
-`worker.prepare` and `worker.execute`, on one rank or several.
+`worker.run`, and `convert` by `worker.derive`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from api.cli.arguments import local_path
-from sgsst_core.decision import Decision, warnings_of
+from sgsst_core.decision import warnings_of
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.atomic import ensure_writable_folder, write_json
-from sgsst_core.files.blending import blend_scenes, normalized
-from sgsst_core.files.formats import read_scene_header
-from sgsst_core.files.formats.sog import META_NAME
-from sgsst_core.files.formats.spz import SpzAxes
+from sgsst_core.files.blending import normalized
 from sgsst_core.files.images import load_image, save_png
-from sgsst_core.files.library import load_scene, save
-from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
-from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
-from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
-from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from worker.capture import about_notes, about_rendering, choose_axes, read_capture
+from worker.derive import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
-from worker.outputs import check_is_not_input, result_format
-from worker.prepare import describe_scene, dry_run
+from worker.options import ViewOptions
+from worker.outputs import check_is_not_input
+from worker.prepare import dry_run
 from worker.styles import split_weight
 
 #: Number of views of an orbit that a converted scene is compared in.
@@ -163,95 +153,15 @@ def view_file_names(cameras: Sequence[Camera]) -> list[str]:
     return names
 
 
-# --- convert -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Converted:
-    """Result of a conversion.
-
-    Attributes:
-        scene: Text about the scene, with contents that were not read, or not read as stored.
-        decisions: Decisions about the scene's axes and the cameras.
-        loss: Difference of the written scene; None if it was not measured.
-    """
-
-    scene: str
-    decisions: tuple[Decision, ...]
-    loss: CompressionLoss | None
-
-
-def convert_scene(source: SceneRequest, out: Path, compare: bool) -> Converted:
-    """Write a scene in the format that the name of a file determines. Colors and order may change by its rounding.
-
-    Args:
-        source: Scene or checkpoint of a trainer, and cameras for the comparison; without cameras, views are those of an
-            orbit.
-        out: File to write: a scene, the meta.json of an unpacked SOG, or a USD file, which cannot be compared.
-        compare: Whether to read the file back and compare renders.
-
-    Raises:
-        InvalidInputError: If scene, cameras or output cannot be used.
-    """
-    _check_target(out, compare)
-    check_is_not_input(out, source.scene)
-    if compare and source.cameras is None:
-        source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
-    axes, decisions = choose_axes(source)
-    loaded = load_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
-    file = loaded.scene_file() if isinstance(loaded, TrainerCheckpoint) else loaded
-    file = file.rendered(source.render_mode, source.eps2d)
-    scene, decisions = file.scene, [*about_notes(file), *decisions, *about_rendering(file)]
-    cameras: list[Camera] = []
-    if source.cameras or source.orbit:
-        capture = read_capture(source, scene).checked(scene, source.near)
-        cameras, decisions = capture.cameras, [*decisions, *capture.decisions]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    size = _write_as(out, scene)
-    decisions += _about_lost_mode(out, scene)
-    loss = replace(measure_compression(out, scene, cameras, near=source.near), size=size) if compare else None
-    return Converted(describe_scene(file), tuple(decisions), loss)
-
-
-def _check_target(out: Path, compare: bool) -> None:
-    """Check that the name of a file determines a format that can be written and, if requested, compared."""
-    if out.suffix.lower() in USD_SUFFIXES:
-        check_usd(out)
-        if compare:
-            raise OutputError(f"{out}: USD can only be written, so it cannot be compared. Omit --compare.")
-    elif out.name != META_NAME:
-        result_format(out)
-
-
-def _about_lost_mode(out: Path, scene: Scene) -> list[Decision]:
-    """Return a warning if the format of the written file cannot record the scene's render mode."""
-    stated = CLASSIC if out.suffix.lower() in USD_SUFFIXES else read_scene_header(out).tag.rendering
-    if stated == scene.rendering:
-        return []
-    reason = f"its format cannot state {scene.rendering.text}"
-    return [Decision("rendering", f"warning: {out.name} will be drawn {stated.text}", reason)]
-
-
-def _write_as(out: Path, scene: Scene) -> int:
-    """Write a scene in the format that the name of a file determines. Return the bytes that it takes."""
-    if out.name == META_NAME:
-        return write_sog_folder(out.parent, scene)
-    if out.suffix.lower() in USD_SUFFIXES:
-        write_usd(out, scene)
-    else:
-        write_scene(out, scene, result_format(out))
-    return out.stat().st_size
-
-
 # --- blend ---------------------------------------------------------------------------------------------------------
 
 
-def blend_files(texts: Sequence[str], out: Path, *, drop_invalid: bool, spz_axes: SpzAxes) -> list[tuple[Path, float]]:
+def blend_files(texts: Sequence[str], out: Path, options: ViewOptions) -> list[tuple[Path, float]]:
     """Write the weighted mean of scenes that differ only in color, and return each scene with its normalized weight.
 
     Args:
         texts: FILE or FILE:WEIGHT of each scene.
-        drop_invalid: Whether to drop invalid Gaussians; see `read_scene`.
+        options: Options for reading the scenes.
 
     Raises:
         InvalidInputError: If the weights, a scene or the output cannot be used.
@@ -261,11 +171,5 @@ def blend_files(texts: Sequence[str], out: Path, *, drop_invalid: bool, spz_axes
     if len(paths) < 2:
         raise SettingsError("There is one scene to blend. Give at least two, such as scene.ply:0.3 stylized.ply:0.7.")
     fractions = normalized(weights)
-    result_format(out)
-    for path in paths:
-        check_is_not_input(out, path)
-    files = [read_scene(path, drop_invalid=drop_invalid, spz_axes=spz_axes) for path in paths]
-    blend = blend_scenes(files, weights)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    save(out, blend)
+    blend([(SceneRequest.of(path, None, options), weight) for path, weight in zip(paths, weights, strict=True)], out)
     return list(zip(paths, fractions, strict=True))

@@ -6,7 +6,7 @@ import shlex
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -28,8 +28,8 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command i
     from worker.job import JobSpec, Result
     from worker.outputs import Outputs
     from worker.prepare import Prepared
-    from worker.ranks.attempts import RanksResult
     from worker.ranks.rank import WorkerOptions
+    from worker.run import Ended
 
 #: Resolution and number of steps of the demo, and seconds after which it stops on a slow machine. The whole demo takes
 #: less than five minutes.
@@ -103,48 +103,33 @@ def _stylize(
     """
     from worker.outputs import check_request
     from worker.ranks.rank import WorkerOptions
+    from worker.run import Listener, stylize
 
-    outputs = check_request(request)
+    outputs, stop, notify = check_request(request), StopFlag(), error_console.print
     command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
-    options = options or WorkerOptions()
-    if workers is None:
-        _stylize_here(request, outputs, command, options.checkpoint_seconds)
-    else:
-        _stylize_on_ranks(request, outputs, command, workers, options)
+    with ExitStack() as stack:
+        if workers is not None:  # the processes of ranks are ended in order even before the first step
+            stack.enter_context(stop.on_signal(_announce_stop))
+        bar = stack.enter_context(job_bar(error_console))
 
+        def prepared(summary: Prepared) -> None:
+            for heading, line in summary.lines:
+                print_field(heading, line)
+            if workers is None:
+                stack.enter_context(stop.on_signal(_announce_stop))
 
-def _stylize_here(request: JobSpec, outputs: Outputs, command: str, checkpoint_seconds: float) -> None:
-    """Stylize on one rank in this process."""
-    from worker.execute import execute
-    from worker.prepare import describe, prepare
-
-    with job_bar(error_console) as bar:
-        job = prepare(request, warn=error_console.print, show_planning=bar.show)
-    with stop_on_signal(_announce_stop) as stop:
-        _print_plan(describe(job))
-        with job_bar(error_console) as bar:
-            result = execute(
-                job, progress=bar.show, stop=stop, warn=error_console.print, checkpoint_seconds=checkpoint_seconds
-            )
-    if result.stopped == "interrupted":
-        _print_interruption(outputs, result.steps, result.total, result.steps, command)
-        raise typer.Exit(stop.exit_code)
-    _print_result(outputs, result, command)
-
-
-def _stylize_on_ranks(request: JobSpec, outputs: Outputs, command: str, workers: int, options: WorkerOptions) -> None:
-    """Stylize on several ranks, each in a process of its own."""
-    from worker.ranks.attempts import Listener, stylize_on_ranks
-
-    with stop_on_signal(_announce_stop) as stop, job_bar(error_console) as bar:
-        notify = error_console.print
-        listener = Listener(prepared=_print_plan, progress=bar.show, happened=notify, warn=notify, stop=stop)
-        ended = stylize_on_ranks(request, workers, listener, options=options)
+        listener = Listener(prepared, bar.show, warn=notify, stop=stop, happened=notify)
+        ended = stylize(request, workers, listener, options or WorkerOptions())
     if ended.interrupted:
-        _print_interruption(outputs, ended.step, ended.total, ended.saved, command)
+        _print_interruption(outputs, ended, command)
         raise typer.Exit(stop.exit_code)
+    for attempt in ended.attempts:
+        print_field(
+            "restarted",
+            f"{attempt.reason}, at step {attempt.last_step}; resumed from step {attempt.saved_step} "
+            f"after {attempt.seconds_to_resume:.1f} s",
+        )
     assert ended.result is not None
-    _print_restarts(ended)
     _print_result(outputs, ended.result, command)
 
 
@@ -152,28 +137,14 @@ def _announce_stop() -> None:
     error_console.print("Stopping after this step. Press Ctrl-C again to abort immediately.")
 
 
-def _print_plan(prepared: Prepared) -> None:
-    for heading, line in prepared.lines:
-        print_field(heading, line)
-
-
-def _print_interruption(outputs: Outputs, step: int, total: int, saved: int | None, command: str) -> None:
-    if saved is None:
-        error_console.print(f"Stopped at step {step}. Nothing was saved.")
+def _print_interruption(outputs: Outputs, ended: Ended, command: str) -> None:
+    if ended.saved is None:
+        error_console.print(f"Stopped at step {ended.step}. Nothing was saved.")
         return
-    state = "saved" if saved == step else f"step {saved} is saved"
+    state = "saved" if ended.saved == ended.step else f"step {ended.saved} is saved"
     error_console.print(
-        f"Stopped at step {step} of {total}; {state} in {outputs.checkpoint}.\nTo continue, run:\n{command}"
+        f"Stopped at step {ended.step} of {ended.total}; {state} in {outputs.checkpoint}.\nTo continue, run:\n{command}"
     )
-
-
-def _print_restarts(ended: RanksResult) -> None:
-    for attempt in ended.attempts:
-        print_field(
-            "restarted",
-            f"{attempt.reason}, at step {attempt.last_step}; resumed from step {attempt.saved_step} "
-            f"after {attempt.seconds_to_resume:.1f} s",
-        )
 
 
 def _print_result(outputs: Outputs, result: Result, command: str) -> None:
@@ -225,41 +196,38 @@ class StopFlag:
     """Flag that records whether a signal has asked the program to stop after its step, and which."""
 
     def __init__(self) -> None:
-        self.signal: int | None = None
+        self._signal: int | None = None
 
     def __call__(self) -> bool:
         """Return whether a signal has arrived."""
-        return self.signal is not None
+        return self._signal is not None
 
     @property
     def exit_code(self) -> int:
         """Exit code of a program that was ended by the signal: 130 for Ctrl-C."""
-        return 128 + (self.signal or signal.SIGINT)
+        return 128 + (self._signal or signal.SIGINT)
 
+    @contextmanager
+    def on_signal(self, announce: Callable[[], None]) -> Iterator[None]:
+        """Set this flag at the first SIGINT or SIGTERM, and call `announce`. The second has its usual effect.
 
-@contextmanager
-def stop_on_signal(announce: Callable[[], None]) -> Iterator[StopFlag]:
-    """Turn the first SIGINT or SIGTERM into a flag, and call `announce` when it arrives.
+        Outside the main thread, Python allows no signal handlers, so the flag stays unset.
+        """
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    The second signal has its usual effect. Outside the main thread, Python allows no signal handlers, so the flag stays
-    unset.
-    """
-    flag = StopFlag()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        def handle(number: int, _frame: FrameType | None) -> None:
+            self._signal = number
+            for other, handler in before.items():
+                signal.signal(other, handler)
+            announce()
 
-    def handle(number: int, _frame: FrameType | None) -> None:
-        flag.signal = number
-        for other, handler in before.items():
-            signal.signal(other, handler)
-        announce()
-
-    try:
-        for number in before:
-            signal.signal(number, handle)
-        yield flag
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        try:
+            for number in before:
+                signal.signal(number, handle)
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)

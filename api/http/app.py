@@ -32,7 +32,6 @@ from service.files.stored_blobs import open_blobs
 from service.files.threads import FileThreads, OwnerLimit
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
-from service.inspection.video_maker import VideoMaker
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.weights import check_weights
@@ -68,7 +67,6 @@ def create_app(settings: ServiceSettings) -> FastAPI:
             artifacts=results,
             inspector=Inspector(settings, store, blobs, threads),
             derived=DerivedFiles(settings, store, blobs, results, threads),
-            videos=VideoMaker(settings, store, blobs, results, threads),
             hub=Hub(store),
             sign_ins=SignIns(),
             rates=Rates(),
@@ -99,7 +97,6 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         await context.hub.close()
         await context.inspector.close()
         await context.derived.close()
-        await context.videos.close()
         context.readiness.close()
         threads.close()
         store.close()

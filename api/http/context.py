@@ -32,7 +32,6 @@ from service.files.blobs import Blobs
 from service.files.threads import FileThreads, OwnerLimit
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
-from service.inspection.video_maker import VideoMaker
 from service.settings import ServiceSettings, is_loopback
 from service.store import Store
 from service.store.quotas import NO_QUOTAS, Quotas
@@ -58,7 +57,6 @@ class Context:
     artifacts: Artifacts
     inspector: Inspector
     derived: DerivedFiles
-    videos: VideoMaker
     hub: Hub
     metrics: Metrics
     readiness: Readiness

@@ -65,17 +65,20 @@ class Work(Protocol):
         """Return the result; call `show` with the data of each progress event."""
 
 
-async def answer_work(request: Request, work: Work, progress: str, result: str) -> Response:
+async def answer_work(
+    request: Request, work: Work, progress: str, result: str, checked: asyncio.Event | None = None
+) -> Response:
     """Return the result as JSON, or a stream of events if the request accepts one.
 
-    JSON is returned when the result is complete; a stream is returned immediately. If the client closes the
-    connection, the work is canceled.
+    JSON is returned when the result is complete; a stream is returned as soon as the inputs are checked. If the client
+    closes the connection, the work is canceled.
 
     Args:
         request: Request, whose body has been read.
         work: Function that makes the result.
         progress: Name of the progress events.
         result: Name of the event with the result.
+        checked: Event after which an error is reported in the stream; None to start the stream immediately.
     """
     if _EVENTS in request.headers.get("accept", ""):
         response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
@@ -83,6 +86,17 @@ async def answer_work(request: Request, work: Work, progress: str, result: str) 
         # Started here rather than in `_events`, so that the work releases its resources even if no event is read.
         task = asyncio.create_task(work(reports.put_nowait))
         task.add_done_callback(lambda _: reports.put_nowait(None))
+        if checked is not None:
+            waiting = asyncio.create_task(checked.wait())
+            try:
+                await asyncio.wait((task, waiting), return_when=asyncio.FIRST_COMPLETED)
+            except asyncio.CancelledError:
+                task.cancel()
+                raise
+            finally:
+                waiting.cancel()
+            if not checked.is_set():
+                await task  # raises its error
         return StreamingResponse(_events(task, reports, progress, result), 200, response_headers, _EVENTS)
     working, leaving = asyncio.create_task(work(lambda now: None)), asyncio.create_task(_wait_for_disconnect(request))
     try:

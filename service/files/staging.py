@@ -23,6 +23,8 @@ from worker.styles import MOST_STYLE_IMAGES
 RESULT = "stylized.ply"
 #: Name of the checkpoint that an unfinished job resumes from; the leading dot hides it from users.
 CHECKPOINT = ".checkpoint"
+#: Name of the plan of a dry run in an attempt's folder.
+PLAN = "plan.safetensors"
 ROLES = ("scene", "style", "cameras", "photos", "mask")
 #: Roles whose files keep their folders: cameras and regions refer to them by relative paths.
 _FOLDER_ROLES = ("photos", "mask")

@@ -1,4 +1,4 @@
-"""Files derived from results on request, and stored beside them: compressed formats, and blends with other results.
+"""Files derived from results on request, and stored beside them: compressed formats, blends and videos.
 
 `service.inspection.process` creates them in a child process with resource limits, so that the API process
 never reads a scene.
@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import shutil
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,16 @@ from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
 from service.files.threads import FileThreads
-from service.inspection.inspector import LEFTOVER_SECONDS, MEMORY_PER_BYTE, InspectionProcess, findings_of
+from service.inspection.inspector import (
+    LEFTOVER_SECONDS,
+    MEMORY_PER_BYTE,
+    InspectionProcess,
+    Show,
+    findings_of,
+    threads_of_a_job,
+)
 from service.inspection.lanes import Lanes
+from service.inspection.work import WorkRequest
 from service.parameters import stored_parameters
 from service.settings import ServiceSettings
 from service.store import Store
@@ -34,6 +43,7 @@ from service.store.quotas import Quotas
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import result_name
 from sgsst_core.files.formats.scene_format import SceneFormat
+from worker.options import DEFAULT_SIDE, JobVideo
 
 #: Additional CPU seconds per byte of results, for reading, sorting, compressing, and rendering them several times.
 #: Actual use is less than a fifth.
@@ -44,7 +54,16 @@ _HEADER_BYTES = 1 << 20
 _BLEND_SIZE = 4
 #: Maximum number of blends that are stored with a job.
 MOST_BLENDS = 20
+#: Name of the video among a job's artifacts.
+VIDEO = "video.mp4"
+#: Limits per frame of a video: CPU seconds per byte of the result and per pixel, of which a fifth is needed, and bytes
+#: of the file per pixel, which H.264 does not reach even for noise. Videos take an eighth of them at most.
+_VIDEO_SECONDS_PER_BYTE, _VIDEO_SECONDS_PER_PIXEL, _VIDEO_BYTES_PER_PIXEL, _USUAL_BYTES = 4e-8, 1e-6, 1.5, 1 / 8
+#: Memory of the encoder, which looks some frames ahead.
+_ENCODER_BYTES = 1 << 30
 _BLENDS = "blends/"
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -68,10 +87,31 @@ class Blend:
         return f"{_BLENDS}{Path(RESULT).stem}_{'_'.join(parts)}{self.format.suffix}"
 
 
-class DerivedFiles:
-    """Writer of files derived from results, one at a time; owners take turns.
+@dataclass
+class _Making:
+    """File that is being made.
 
-    Concurrent requests for the same file share one task.
+    Attributes:
+        options: Options on which the file depends besides its name.
+        watchers: Callbacks that receive the progress.
+        task: Task that makes and publishes it.
+    """
+
+    options: JobVideo | None
+    watchers: list[Show] = field(default_factory=list)
+    task: asyncio.Task[None] | None = None
+
+    def show(self, now: dict[str, Any]) -> None:
+        """Pass progress on to everyone who waits for the file."""
+        for watcher in self.watchers:
+            watcher(now)
+
+
+class DerivedFiles:
+    """Writer of files derived from results: one video at a time, and one other file; owners take turns.
+
+    Concurrent requests for the same file share one task, which continues even if nobody waits for it any longer, unless
+    the service ends.
     """
 
     def __init__(
@@ -79,11 +119,13 @@ class DerivedFiles:
     ) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
         self._threads = threads
-        self._lanes = Lanes([InspectionProcess()])
-        self._tasks: dict[tuple[str, str], asyncio.Task[None]] = {}
+        self._files, self._videos = (Lanes([InspectionProcess(count)]) for count in (1, threads_of_a_job(settings)))
+        self._making: dict[tuple[str, str], _Making] = {}
         self._folder = settings.folder / "packing"
         self._folder.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(self._folder)
+        for leftover in self._folder.iterdir():  # left behind by a killed process
+            if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
+                shutil.rmtree(leftover, ignore_errors=True)
 
     async def compressed(self, job: JobRow, format: SceneFormat, quotas: Quotas) -> ArtifactRow:
         """Return a job's result in a compressed format; the compression error is stored beside it as JSON.
@@ -95,7 +137,9 @@ class DerivedFiles:
             BUSY, NoSpaceError: If the result cannot be compressed now.
         """
         name = result_name(RESULT, format)
-        return await self._derived(job, name, lambda: self._compress(job, name, quotas))
+        return await self._existing(job, name) or await self._derived(
+            job, name, lambda: self._compress(job, name, quotas)
+        )
 
     async def blended(self, job: JobRow, blend: Blend, quotas: Quotas) -> ArtifactRow:
         """Return a blend of a job's scene and results. The owner of the job must also own the others.
@@ -108,28 +152,68 @@ class DerivedFiles:
             QUOTA_EXCEEDED: If the blend exceeds the owner's quota of stored bytes.
             BUSY, NoSpaceError: If the results cannot be blended now.
         """
-        return await self._derived(job, blend.name, lambda: self._blend(job, blend, quotas))
+        return await self._existing(job, blend.name) or await self._derived(
+            job, blend.name, lambda: self._blend(job, blend, quotas)
+        )
 
-    async def _derived(self, job: JobRow, name: str, derive: Callable[[], Awaitable[None]]) -> ArtifactRow:
-        """Return the database row of a derived file, which `derive` creates from the job's result if there is none."""
+    async def video(self, job: JobRow, options: JobVideo, quotas: Quotas, show: Show = lambda now: None) -> ArtifactRow:
+        """Render a video of a job's result, which replaces an earlier one, and return it.
+
+        Args:
+            job: Job with a result.
+            options: Options of the video.
+            quotas: Quotas of the job's owner.
+            show: Callback that receives the progress: `stage`, `step`, `total`, `fraction` and `eta_s`. One step is one
+                frame.
+
+        Raises:
+            NotFoundError: If the job has no result, or was deleted meanwhile.
+            INVALID_INPUT: If the video cannot be rendered, or exceeds the limits.
+            QUOTA_EXCEEDED: If the video exceeds the owner's quota of stored bytes.
+            BUSY, NoSpaceError: If it cannot be rendered now; another video of the job may be in progress.
+        """
+        return await self._derived(job, VIDEO, lambda: self._render(job, options, quotas), options, show)
+
+    async def _existing(self, job: JobRow, name: str) -> ArtifactRow | None:
         await asyncio.to_thread(self._result, job.id)
+        return await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
+
+    async def _derived(
+        self,
+        job: JobRow,
+        name: str,
+        make: Callable[[], Coroutine[Any, Any, None]],
+        options: JobVideo | None = None,
+        show: Show = lambda now: None,
+    ) -> ArtifactRow:
+        """Return the database row of a file after `make` has made it, in a task that later requests share."""
+        key = job.id, name
+        making = self._making.get(key)
+        if making is None:
+            making = self._making[key] = _Making(options)
+            making.task = asyncio.create_task(make())
+            making.task.add_done_callback(lambda task: self._end(key, task))
+        elif making.options != options:
+            raise problems.BUSY("Another video of this job is being rendered. Try again when it is done.")
+        assert making.task is not None
+        making.watchers.append(show)
+        try:
+            with suspended():  # each part of the task has its own limit
+                await asyncio.shield(making.task)
+        except LostFileError:
+            await asyncio.to_thread(self._result, job.id)  # fails if the job was deleted meanwhile
+            raise
+        finally:
+            making.watchers.remove(show)
         row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
-        if row is None:
-            task = self._tasks.get((job.id, name))
-            if task is None:
-                task = asyncio.ensure_future(derive())
-                self._tasks[job.id, name] = task
-                task.add_done_callback(lambda done: self._tasks.pop((job.id, name), None))
-            try:
-                with suspended():  # each part of the task has its own limit
-                    await asyncio.shield(task)
-            except LostFileError:
-                await asyncio.to_thread(self._result, job.id)  # fails if the job was deleted meanwhile
-                raise
-            row = await asyncio.to_thread(self._store.jobs.artifact, job.id, name)
         if row is None:
             raise problems.NOT_FOUND(f"The results of job {job.id} are gone.")
         return row
+
+    def _end(self, key: tuple[str, str], task: asyncio.Task[None]) -> None:
+        del self._making[key]
+        if not task.cancelled() and (error := task.exception()) is not None:  # perhaps nobody waits any longer
+            _log.info("%s not made: %s", key[1], error, extra={"job": key[0]})
 
     def _result(self, job_id: str) -> ArtifactRow:
         row = self._store.jobs.artifact(job_id, RESULT)
@@ -137,138 +221,159 @@ class DerivedFiles:
             raise problems.NO_ARTIFACT(job_id=job_id, name=RESULT)
         return row
 
-    # --- compressed formats ---------------------------------------------------------------------------------------
-
     async def _compress(self, job: JobRow, name: str, quotas: Quotas) -> None:
         """Compress the result, store the files, and make them visible."""
-        async with self._turn(job) as (process, folder, result):
+        async with self._turn(self._files, job) as (process, folder, result):
             await self._threads.run(job.owner, self._blobs.ensure_space, 3 * result.size)
-            size = result.size + await input_bytes(self._store, job)
-            staged = await self._threads.run(job.owner, self._stage, folder, job, [result], size=size)
-            limits = {"name": name, "bytes": result.size + _HEADER_BYTES}  # a compressed scene is smaller
-            staged = staged.model_copy(update={"scene": Path(RESULT)})
-            request = self._request("compress", folder, job, staged, limits, result.size)
+            staged = await self._stage(folder, job, [result])
+            request = self._request(
+                "compress",
+                folder,
+                job,
+                staged.model_copy(update={"scene": Path(RESULT)}),
+                seconds=_SECONDS_PER_BYTE * result.size,
+                memory=MEMORY_PER_BYTE * result.size,
+                output=(name, result.size + _HEADER_BYTES),  # a compressed scene is smaller
+            )
             loss = json.dumps(findings_of(await process.ask(request)), indent=1) + "\n"
             loss_file = folder / "loss.json"
             await self._threads.run(job.owner, loss_file.write_text, loss)
             files = {f"{name}.json": loss_file, name: folder / name}
             await self._threads.run(job.owner, self._publish, job, result, files, quotas, size=result.size)
 
-    # --- blends ---------------------------------------------------------------------------------------------------
-
     async def _blend(self, job: JobRow, blend: Blend, quotas: Quotas) -> None:
         """Blend the results, store the file, and make it visible."""
-        async with self._turn(job) as (process, folder, result):
-            await asyncio.to_thread(self._check_count, job)
+        async with self._turn(self._files, job) as (process, folder, result):
+            artifacts = await asyncio.to_thread(self._store.jobs.artifacts, job.id)
+            if sum(row.name.startswith(_BLENDS) for row in artifacts) >= MOST_BLENDS:
+                raise problems.TOO_MANY_BLENDS(job_id=job.id, limit=MOST_BLENDS)
             others = [await asyncio.to_thread(self._result, job_id) for job_id in blend.others]
             scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
             size = (scene["size"] if scene else 0) + sum(row.size for row in (result, *others))
-            run = partial(self._threads.run, job.owner)
-            await run(self._blobs.ensure_space, size + _BLEND_SIZE * result.size)
-            size_of_all = await input_bytes(self._store, job) + size
-            staged = await run(self._stage, folder, job, [result, *others], size=size_of_all)
+            most = _BLEND_SIZE * result.size
+            await self._threads.run(job.owner, self._blobs.ensure_space, size + most)
             parts = {RESULT: blend.weight, **{_staged_name(job, row): blend.others[row.job_id] for row in others}}
-            file = f"blend{blend.format.suffix}"
-            limits = {"name": file, "parts": parts, "bytes": _BLEND_SIZE * result.size + _HEADER_BYTES}
-            findings_of(await process.ask(self._request("blend", folder, job, staged, limits, size)))
-            files = {blend.name: folder / file}
-            await run(self._publish, job, result, files, quotas, size=_BLEND_SIZE * result.size)
+            request = self._request(
+                "blend",
+                folder,
+                job,
+                await self._stage(folder, job, [result, *others]),
+                seconds=_SECONDS_PER_BYTE * size,
+                memory=MEMORY_PER_BYTE * size,
+                output=(f"blend{blend.format.suffix}", most + _HEADER_BYTES),
+                options={"parts": parts},
+            )
+            findings_of(await process.ask(request))
+            files = {blend.name: folder / request.output_file}
+            await self._threads.run(job.owner, self._publish, job, result, files, quotas, size=most)
 
-    def _check_count(self, job: JobRow) -> None:
-        if sum(row.name.startswith(_BLENDS) for row in self._store.jobs.artifacts(job.id)) >= MOST_BLENDS:
-            raise problems.TOO_MANY_BLENDS(job_id=job.id, limit=MOST_BLENDS)
-
-    # --- both -----------------------------------------------------------------------------------------------------
+    async def _render(self, job: JobRow, options: JobVideo, quotas: Quotas) -> None:
+        """Render the video, store it and make it visible."""
+        size = (await asyncio.to_thread(self._result, job.id)).size
+        side = options.resolution or DEFAULT_SIDE
+        pixels = side * side * options.frames * (2 if options.compare else 1)
+        most = round(_VIDEO_BYTES_PER_PIXEL * pixels) + _HEADER_BYTES
+        await self._threads.run(job.owner, self._blobs.ensure_space, 2 * size + round(_USUAL_BYTES * most))
+        async with self._turn(self._videos, job) as (process, folder, result):
+            staged = await self._stage(folder, job, [result])
+            request = self._request(
+                "video",
+                folder,
+                job,
+                staged.model_copy(update={"scene": Path(RESULT)}),
+                seconds=_VIDEO_SECONDS_PER_PIXEL * pixels + _VIDEO_SECONDS_PER_BYTE * size * options.frames,
+                memory=2 * MEMORY_PER_BYTE * size + _ENCODER_BYTES,
+                output=(VIDEO, most),
+                options={"video": options.model_dump(mode="json"), "unstylized": str(staged.scene)},
+            )
+            findings_of(await process.ask(request, self._making[job.id, VIDEO].show))
+            publish = partial(self._publish, replace=True)
+            await self._threads.run(job.owner, publish, job, result, {VIDEO: folder / VIDEO}, quotas, size=most)
 
     @asynccontextmanager
-    async def _turn(self, job: JobRow) -> AsyncIterator[tuple[InspectionProcess, Path, ArtifactRow]]:
+    async def _turn(
+        self, lanes: Lanes[InspectionProcess], job: JobRow
+    ) -> AsyncIterator[tuple[InspectionProcess, Path, ArtifactRow]]:
         """Wait for the owner's turn, and provide the process, an empty folder, and the job's result."""
-        async with self._lanes.turn(job.owner) as process:
+        async with lanes.turn(job.owner) as process:
             result = await asyncio.to_thread(self._result, job.id)  # the job may have been deleted meanwhile
             async with self._threads.folder(job.owner, self._folder) as folder:
                 yield process, folder, result
 
-    def _stage(self, folder: Path, job: JobRow, results: list[ArtifactRow]) -> Staged:
+    async def _stage(self, folder: Path, job: JobRow, results: Sequence[ArtifactRow]) -> Staged:
         """Stage the job's inputs, with results beside them."""
-        inputs = self._store.jobs.inputs(job.id)
-        rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in inputs}))
-        staged = stage(folder, inputs, self._blobs.fetch(rows, folder))
-        for result in results:
-            self._artifacts.fetch(result.location, folder / _staged_name(job, result), result.sha256)
-        return staged
+        inputs = await asyncio.to_thread(self._store.jobs.inputs, job.id)
+
+        def staging() -> Staged:
+            rows = self._store.inputs.hold(sorted({entry["sha256"] for entry in inputs}))
+            staged = stage(folder, inputs, self._blobs.fetch(rows, folder))
+            for result in results:
+                self._artifacts.fetch(result.location, folder / _staged_name(job, result), result.sha256)
+            return staged
+
+        size = sum(entry["size"] for entry in inputs) + sum(result.size for result in results)
+        return await self._threads.run(job.owner, staging, size=size)
 
     def _request(
-        self, work: str, folder: Path, job: JobRow, staged: Staged, limits: dict[str, Any], size: int
-    ) -> dict[str, Any]:
-        """Return a request to the inspecting process about scenes of `size` bytes in total."""
-        return {
-            "work": work,
-            "folder": str(folder),
-            "staged": staged.model_dump(mode="json"),
-            "parameters": stored_parameters(job.parameters).model_dump(mode="json"),
-            "limits": limits,
-            "seconds": self._settings.inspection_seconds + _SECONDS_PER_BYTE * size,
-            "bytes": self._settings.inspection_bytes + MEMORY_PER_BYTE * size,
-        }
+        self,
+        work: str,
+        folder: Path,
+        job: JobRow,
+        staged: Staged,
+        *,
+        seconds: float,
+        memory: int,
+        output: tuple[str, int],
+        options: dict[str, Any] | None = None,
+    ) -> WorkRequest:
+        """Return a request to the inspecting process, with limits in addition to those of every inspection."""
+        return WorkRequest(
+            work=work,
+            folder=folder,
+            staged=staged,
+            parameters=stored_parameters(job.parameters),
+            seconds=self._settings.inspection_seconds + seconds,
+            memory=self._settings.inspection_bytes + memory,
+            options=options or {},
+            output=output,
+        )
 
-    def _publish(self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas) -> None:
-        publish_derived(self._store, self._artifacts, job, result, files, quotas)
+    def _publish(
+        self, job: JobRow, result: ArtifactRow, files: dict[str, Path], quotas: Quotas, *, replace: bool = False
+    ) -> None:
+        """Charge the owner of a job for files derived from its result, store them, and make them visible.
+
+        The charge is a receipt until the files have rows. It ends if they cannot be stored, and expires if this process
+        dies.
+
+        Args:
+            files: Files by name.
+            replace: Whether files replace those of the same names.
+
+        Raises:
+            QUOTA_EXCEEDED: If they exceed the owner's quota of stored bytes; nothing is stored.
+        """
+        store, artifacts = self._store, self._artifacts
+        known = {row.name: row.size for row in store.jobs.artifacts(job.id)} if replace else {}
+        size = sum(path.stat().st_size - known.get(name, 0) for name, path in files.items())
+        receipt = store.inputs.open_receipt(job.owner, max(0, size), quotas)
+        put: list[Published] = []
+        unused: list[str] | None = None
+        try:
+            for name, path in files.items():
+                # later than the epoch of the last lease, so that the file is not swept as a leftover of an attempt
+                put.append(artifacts.put(job.id, job.lease_epoch + 1, name, path, final=True))
+            unused = store.jobs.add_derived(result, put, job.owner, quotas, replace=replace, receipt=receipt)
+        finally:
+            if unused is None:
+                store.inputs.end_receipt(receipt)
+            for location in [file.location for file in put] if unused is None else unused:
+                artifacts.objects.remove(location)
 
     async def close(self) -> None:
-        """Stop the process, which also aborts any work in progress."""
-        for process in self._lanes.slots:
+        """Stop the processes, which also aborts any work in progress."""
+        for process in (*self._files.slots, *self._videos.slots):
             await process.close()
-
-
-def publish_derived(
-    store: Store,
-    artifacts: Artifacts,
-    job: JobRow,
-    result: ArtifactRow,
-    files: dict[str, Path],
-    quotas: Quotas,
-    *,
-    replace: bool = False,
-) -> None:
-    """Charge the owner of a job for files derived from its result, store them, and make them visible.
-
-    The charge is a receipt until the files have rows. It ends if they cannot be stored, and expires if this process
-    dies.
-
-    Args:
-        files: Files by name.
-        replace: Whether files replace those of the same names.
-
-    Raises:
-        QUOTA_EXCEEDED: If they exceed the owner's quota of stored bytes; nothing is stored.
-    """
-    known = {row.name: row.size for row in store.jobs.artifacts(job.id)} if replace else {}
-    size = sum(path.stat().st_size - known.get(name, 0) for name, path in files.items())
-    receipt = store.inputs.open_receipt(job.owner, max(0, size), quotas)
-    put: list[Published] = []
-    unused: list[str] | None = None
-    try:
-        for name, path in files.items():
-            # later than the epoch of the last lease, so that the file is not swept as a leftover of an attempt
-            put.append(artifacts.put(job.id, job.lease_epoch + 1, name, path, final=True))
-        unused = store.jobs.add_derived(result, put, job.owner, quotas, replace=replace, receipt=receipt)
-    finally:
-        if unused is None:
-            store.inputs.end_receipt(receipt)
-        for location in [file.location for file in put] if unused is None else unused:
-            artifacts.objects.remove(location)
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Delete folders that a killed process has left behind."""
-    for leftover in folder.iterdir():
-        if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
-            shutil.rmtree(leftover, ignore_errors=True)
-
-
-async def input_bytes(store: Store, job: JobRow) -> int:
-    """Return the bytes of a job's inputs."""
-    return sum(entry["size"] for entry in await asyncio.to_thread(store.jobs.inputs, job.id))
 
 
 def _staged_name(job: JobRow, result: ArtifactRow) -> str:

@@ -12,6 +12,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import psutil
@@ -19,10 +20,11 @@ import psutil
 from service import problems
 from service.deadlines import suspended
 from service.files.blobs import Blobs
-from service.files.staging import stage
+from service.files.staging import PLAN, stage
 from service.files.threads import FileThreads
 from service.inspection.lanes import Lanes
 from service.inspection.sandbox import missing
+from service.inspection.work import WorkRequest
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store
@@ -47,11 +49,9 @@ _SECONDS_PER_BYTE = 120 / 1e9
 MEMORY_PER_BYTE = 6
 #: Maximum of the memory limit, as a fraction of the machine's memory.
 _MEMORY_FRACTION = 0.8
-#: Additions to the CPU time limit of planning, in seconds per Gaussian and view, per pixel of each view, and per pixel
-#: of the view that the trial visits. Actual use is less than a third of them.
-_PLAN_SECONDS_PER_GAUSSIAN = 5e-6
-_PLAN_SECONDS_PER_PIXEL = 5e-6
-_TRIAL_SECONDS_PER_PIXEL = 2e-4
+#: Maximum size of the file of a plan, in bytes per Gaussian of the refined scene and besides, and number of plans that
+#: are stored.
+_PLAN_BYTES_PER_GAUSSIAN, _PLAN_BYTES, _MAX_PLANS = 32, 1 << 20, 16
 #: Total size in bytes above which a job's files are checked in a separate process, so that small jobs do not wait.
 _LARGE_BYTES = 64 << 20
 
@@ -80,8 +80,15 @@ class InspectionProcess:
         self._lock = asyncio.Lock()
         self._waiting = 0
 
-    async def ask(self, request: dict[str, Any], show: Show = lambda now: None) -> dict[str, Any]:
-        """Return the response to a request; `show` receives the progress of planning.
+    async def ask(
+        self, request: WorkRequest, show: Show = lambda now: None, checked: Show = lambda findings: None
+    ) -> dict[str, Any]:
+        """Return the response to a request.
+
+        Args:
+            request: Request to send.
+            show: Callback for the progress.
+            checked: Callback for the findings about the inputs of a job that is then planned.
 
         Raises:
             BUSY: If too many requests wait already, or the process died twice.
@@ -92,8 +99,8 @@ class InspectionProcess:
         try:
             async with self._lock:
                 for _ in range(2):
-                    line = json.dumps({**request, "threads": self._threads}).encode() + b"\n"
-                    answer = await self._exchange(line, show)
+                    line = request.model_copy(update={"threads": self._threads}).model_dump_json().encode() + b"\n"
+                    answer = await self._exchange(line, show, checked)
                     if answer is not None:
                         return answer
         finally:
@@ -117,7 +124,7 @@ class InspectionProcess:
             )
         return self._process
 
-    async def _exchange(self, line: bytes, show: Show) -> dict[str, Any] | None:
+    async def _exchange(self, line: bytes, show: Show, checked: Show) -> dict[str, Any] | None:
         process = await self._started()
         assert process.stdin is not None
         assert process.stdout is not None
@@ -126,9 +133,12 @@ class InspectionProcess:
             await process.stdin.drain()
             while response := await process.stdout.readline():
                 answer: dict[str, Any] = json.loads(response)
-                if "planning" not in answer:
+                if "planning" in answer:
+                    show(answer["planning"])
+                elif "checked" in answer:
+                    checked(answer["checked"])
+                else:
                     return answer
-                show(answer["planning"])
             return None
         except (OSError, ValueError):
             await self.close()  # further output must not be read as the response to a later request
@@ -177,12 +187,11 @@ class Inspector:
         for leftover in self._folder.iterdir():  # left behind by a killed process
             if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
                 shutil.rmtree(leftover, ignore_errors=True)
-        self._limits = {
-            "gaussians": settings.max_gaussians,
-            "views": settings.max_views,
-            "pixels": settings.max_pixels,
-            "image_pixels": settings.max_image_pixels,
-        }
+
+    @property
+    def is_planning(self) -> bool:
+        """Whether a plan would have to wait for another one."""
+        return self._planning.full
 
     def recall(
         self, work: Work, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
@@ -192,7 +201,7 @@ class Inspector:
         Raises:
             INVALID_INPUT: If the stored finding is a rejection.
         """
-        known = self._store.inputs.inspection(self._key(work, owner, inputs, parameters))
+        known = self._store.inputs.inspection(_key(self._settings, work, owner, inputs, parameters))
         return None if known is None else findings_of(known)
 
     async def inspect(
@@ -203,17 +212,19 @@ class Inspector:
         rows: Mapping[str, BlobRow],
         parameters: JobParameters,
         show: Show = lambda now: None,
+        checked: Callable[[], None] = lambda: None,
     ) -> dict[str, Any]:
         """Return the findings of `service.inspection.process` about a job's inputs.
 
         Args:
-            work: Task; "plan" requires validated inputs.
+            work: Task; "plan" validates the inputs too.
             owner: Owner of the job; waiting owners take turns.
             inputs: `role`, `name`, `sha256` and `size` of each file.
             rows: Blob rows by digest.
             parameters: Parameters of the job.
             show: Callback that receives the progress of planning: `stage`, `step`, `total`, `fraction` and `eta_s`. One
                 step is one view.
+            checked: Callback after the inputs have been read and found usable.
 
         Raises:
             INVALID_INPUT: If the inputs cannot be used.
@@ -221,23 +232,19 @@ class Inspector:
         """
         recalled = await asyncio.to_thread(self.recall, work, owner, inputs, parameters)
         if recalled is not None:
+            checked()
             return recalled
         if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
             self._warming = asyncio.create_task(self._validating.slots[1].warm())
         with suspended():  # the process has its own limits
-            async with self._lanes(work, inputs).turn(owner) as process:
-                answer = await self._ask_process(process, work, owner, inputs, rows, parameters, show)
+            validating = self._validating_large if _size(inputs) > _LARGE_BYTES else self._validating
+            async with (self._planning if work == "plan" else validating).turn(owner) as process:
+                answer = await self._ask_process(process, work, owner, inputs, rows, parameters, show, checked)
         transient = answer.get("error", {}).get("code") in (problems.INSPECTION_LIMIT.code, WeightsError.code)
         if not transient:  # a later check may succeed
-            key = self._key(work, owner, inputs, parameters)
+            key = _key(self._settings, work, owner, inputs, parameters)
             await asyncio.to_thread(self._store.inputs.add_inspection, key, answer)
         return findings_of(answer)
-
-    def _lanes(self, work: Work, inputs: Sequence[Mapping[str, Any]]) -> Lanes[InspectionProcess]:
-        """Return the lanes of processes for a task."""
-        if work == "plan":
-            return self._planning
-        return self._validating_large if _size(inputs) > _LARGE_BYTES else self._validating
 
     async def _ask_process(
         self,
@@ -248,32 +255,41 @@ class Inspector:
         rows: Mapping[str, BlobRow],
         parameters: JobParameters,
         show: Show,
+        checked: Callable[[], None],
     ) -> dict[str, Any]:
-        seconds = await asyncio.to_thread(self._seconds, work, owner, inputs, parameters)
+        seconds = self._settings.inspection_seconds + _SECONDS_PER_BYTE * _size(inputs)
+        if work == "plan" or parameters.selects_by_images:
+            seconds += self._settings.dry_run_seconds
         async with self._threads.folder(owner, self._folder) as folder:
             paths = await self._threads.run(owner, self._blobs.fetch, rows, folder, size=_size(inputs))
             staged = await self._threads.run(owner, stage, folder, inputs, paths)
-            request = {
-                "work": work,
-                "folder": str(folder),
-                "staged": staged.model_dump(mode="json"),
-                "parameters": parameters.model_dump(mode="json"),
-                "limits": self._limits,
-                "seconds": seconds,
-                "bytes": self._memory(inputs),
-            }
-            return await process.ask(request, show)
+            most = _PLAN_BYTES_PER_GAUSSIAN * self._settings.max_gaussians + _PLAN_BYTES
+            request = WorkRequest(
+                work=work,
+                folder=folder,
+                staged=staged,
+                parameters=parameters,
+                seconds=seconds,
+                memory=self._memory(inputs),
+                limits=_limits(self._settings),
+                output=(PLAN, most) if work == "plan" else None,
+            )
+            if work != "plan":
+                return await process.ask(request, show)
+            valid: dict[str, Any] = {}
 
-    def _seconds(self, work: Work, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> float:
-        """Return the CPU time limit of a task in seconds."""
-        reading = self._settings.inspection_seconds + _SECONDS_PER_BYTE * _size(inputs)
-        if work == "validate":
-            return reading + (self._settings.dry_run_seconds if parameters.selects_by_images else 0)
-        known = self.recall("validate", owner, inputs, parameters) or {"gaussians": 0, "views": 0, "pixels": 0}
-        surveying: float = _PLAN_SECONDS_PER_GAUSSIAN * known["gaussians"] * known["views"]
-        surveying += _PLAN_SECONDS_PER_PIXEL * known["pixels"]
-        trial: float = _TRIAL_SECONDS_PER_PIXEL * known["pixels"] / max(known["views"], 1)
-        return self._settings.dry_run_seconds + reading + surveying + trial
+            def note(findings: dict[str, Any]) -> None:
+                valid.update(findings)
+                checked()
+
+            answer = await process.ask(request, show, note)
+            if valid:
+                key = _key(self._settings, "validate", owner, inputs, parameters)
+                await asyncio.to_thread(self._store.inputs.add_inspection, key, {"findings": valid})
+            if "findings" in answer:
+                target = stored_plan(self._settings, owner, inputs, parameters)
+                await self._threads.run(owner, _store_plan, folder / PLAN, target)
+            return answer
 
     def _memory(self, inputs: Sequence[Mapping[str, Any]]) -> int:
         """Return the memory limit of reading in bytes; photos do not add to it, because they are read one at a time."""
@@ -282,21 +298,54 @@ class Inspector:
         maximum = max(minimum, int(_MEMORY_FRACTION * psutil.virtual_memory().total))
         return min(minimum + MEMORY_PER_BYTE * size, maximum)
 
-    def _key(self, work: str, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters) -> str:
-        """Return the key of a finding. It includes the owner, so that no finding shows what others have inspected."""
-        files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
-        values = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
-        # style weights are matched to styles by their order
-        styles = [entry["name"] for entry in inputs if entry["role"] == "style"]
-        order = styles if len(styles) > 1 else []
-        text = json.dumps([_VERSION, work, owner, files, order, values, self._limits], sort_keys=True)
-        return f"{work}:{hashlib.sha256(text.encode()).hexdigest()}"
-
     async def close(self) -> None:
         """Stop all processes."""
         for lanes in (self._validating, self._validating_large, self._planning):
             for process in lanes.slots:
                 await process.close()
+
+
+def _limits(settings: ServiceSettings) -> dict[str, int]:
+    """Return the limits of a job's inputs."""
+    return {
+        "gaussians": settings.max_gaussians,
+        "views": settings.max_views,
+        "pixels": settings.max_pixels,
+        "image_pixels": settings.max_image_pixels,
+    }
+
+
+def _key(
+    settings: ServiceSettings, work: str, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
+) -> str:
+    """Return the key of a finding. It includes the owner, so that no finding shows what others have inspected."""
+    files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
+    values = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
+    # style weights are matched to styles by their order
+    styles = [entry["name"] for entry in inputs if entry["role"] == "style"]
+    order = styles if len(styles) > 1 else []
+    text = json.dumps([_VERSION, work, owner, files, order, values, _limits(settings)], sort_keys=True)
+    return f"{work}:{hashlib.sha256(text.encode()).hexdigest()}"
+
+
+def stored_plan(
+    settings: ServiceSettings, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
+) -> Path:
+    """Return the path of the plan of an owner's last dry run for these inputs on this machine; it may not exist.
+
+    The plan was written by a process that reads users' files: `worker.prepare` decides whether a job uses it.
+    """
+    _, _, key = _key(settings, "plan", owner, inputs, parameters).partition(":")
+    return settings.folder / "plans" / f"{key}.safetensors"
+
+
+def _store_plan(file: Path, target: Path) -> None:
+    """Move a plan to its place, and delete the oldest ones."""
+    target.parent.mkdir(exist_ok=True)
+    file.replace(target)
+    plans = sorted(target.parent.iterdir(), key=lambda path: path.stat().st_mtime)
+    for old in plans[:-_MAX_PLANS]:
+        old.unlink(missing_ok=True)
 
 
 def _size(inputs: Sequence[Mapping[str, Any]]) -> int:

@@ -30,6 +30,11 @@ class Lanes(Generic[Slot]):
         # owners in the order of their turns; the owner of a finished turn moves to the end
         self._waiting: OrderedDict[str, deque[asyncio.Future[Slot]]] = OrderedDict()
 
+    @property
+    def full(self) -> bool:
+        """Whether no slot is free."""
+        return not self._free
+
     @asynccontextmanager
     async def turn(self, owner: str) -> AsyncIterator[Slot]:
         """Wait for the owner's turn and occupy a slot for the duration of the block.

@@ -2,8 +2,9 @@
 
 The process imports slow modules once. For each request it forks a child with limits on time and memory, which reads the
 files and exits. The child is confined (`service.inspection.sandbox`): a hostile file that takes over the child can
-falsify the response to its own request, and nothing else. Requests and responses are lines of JSON on stdin and stdout,
-one request at a time. The response to a plan is preceded by lines of progress, `{"planning": ...}`.
+falsify the response to its own request and the one file that the request lets it write, and nothing else. Requests and
+responses are lines of JSON on stdin and stdout, one request at a time. The final response of work that takes long is
+preceded by lines of progress, `{"planning": ...}`, and that of a plan by the findings of the check, `{"checked": ...}`.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ import torch
 from service import problems
 from service.files.staging import ROLES, Staged
 from service.inspection.sandbox import confine, installation
+from service.inspection.work import WorkRequest
 from service.optional import install_command
 from service.parameters import JobParameters
 from service.request import job_spec
@@ -41,21 +43,16 @@ from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, Weig
 from sgsst_core.features import pooling_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.features.network_weights import list_network_weights
 from sgsst_core.features.weight_files import cache_folder
-from sgsst_core.files.blending import blend_scenes, encode_blend
-from sgsst_core.files.formats import format_of_name
 from sgsst_core.files.images import image_size
-from sgsst_core.files.scene_file import encode_scene, read_scene, write_scene
+from sgsst_core.files.scene_file import write_scene
 from sgsst_core.paintings import STARRY_NIGHT
-from sgsst_core.planning.plan import Prediction
-from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.progress import Progress
-from sgsst_core.quality.scene_difference import measure_compression
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import Settings
-from worker.capture import choose_axes, read_capture
+from worker.capture import choose_axes
+from worker.derive import blend, convert
 from worker.inputs import Inputs, errors_of, read_inputs
 from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo
@@ -75,6 +72,9 @@ MAX_ANSWER = 64 << 20
 MAX_REPORTS = 10_000
 #: Fields of a progress message; all but the first are numbers.
 _PROGRESS = {"stage", "step", "total", "fraction", "eta_s"}
+#: CPU seconds that planning may take per Gaussian and view, per pixel of each view, and per pixel of the view that the
+#: trial visits. Actual use is less than a third of them.
+_SECONDS_PER_GAUSSIAN, _SECONDS_PER_PIXEL, _TRIAL_SECONDS_PER_PIXEL = 5e-6, 5e-6, 2e-4
 #: Address space that each thread reserves but hardly uses: its stack, and an arena of the C library.
 _THREAD_BYTES = 1 << 28
 #: Remaining weight (1 minus the sum of weights) up to which it counts as zero, because floats are rounded.
@@ -116,28 +116,24 @@ class _Limits:
             raise problems.IMAGE_TOO_LARGE(name=path.name, width=width, height=height, limit=self.image_pixels)
 
 
-def validate(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> dict[str, Any]:
-    """Read every input of a job as the job would, without rendering.
-
-    Returns:
-        `gaussians`, `dropped`, `sh_degree`, `views`, `pixels` (of all views), `style` (width, height), `photos`.
-
-    Raises:
-        INVALID_INPUT, InvalidInputError: If an input cannot be used; the error's attribute `role` is the input's
-            role.
-    """
-    return _findings(_read(staged, parameters, limits))
+#: Callback for responses of a child before the final one.
+_Send = Callable[[dict[str, Any]], None]
 
 
-def _read(staged: Staged, parameters: JobParameters, limits: dict[str, Any]) -> Inputs:
-    check_steps(parameters.settings())
-    _check_network_weights(parameters.backbone)
+def _read(request: WorkRequest) -> Inputs:
+    """Read every input of a job as the job would, without rendering."""
+    check_steps(request.parameters.settings())
+    installed = [entry.name for entry in list_network_weights() if entry.path]
+    wanted = [name for name in ("vgg19", "vgg16") if request.parameters.backbone in ("auto", name)]
+    if not any(name in installed for name in wanted):
+        raise WeightsError(f"The service has no weights of {' or '.join(wanted)}: its operator has to fetch them.")
     with errors_of("style"):
-        spec = job_spec(staged, parameters)
-    return read_inputs(spec, limits=_Limits(**limits))
+        spec = job_spec(request.staged, request.parameters)
+    return read_inputs(spec, limits=_Limits(**request.limits))
 
 
 def _findings(inputs: Inputs) -> dict[str, Any]:
+    """Return `gaussians`, `dropped`, `sh_degree`, `style` (width, height), `photos`, `views`, and `pixels` of these."""
     scene, image = inputs.scene_file.scene, inputs.style.images[0]
     return {
         "gaussians": len(scene),
@@ -155,25 +151,23 @@ def _pixels(cameras: Sequence[Camera]) -> int:
     return sum(camera.width * camera.height for camera in cameras)
 
 
-def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
-    """Return the findings of `validate` and the plan of `sgsst plan`; `show` receives the progress."""
+def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
+    """Return the findings about a job's inputs and the plan of `sgsst plan`; write the plan for the job."""
     started = time.perf_counter()
-    inputs = _read(staged, parameters, limits)
-    job_plan, settings = dry_run(job_spec(staged, parameters), inputs, show), parameters.settings()
+    inputs, settings = _read(request), request.parameters.settings()
+    findings, spec = _findings(inputs), job_spec(request.staged, request.parameters)
+    send({"checked": findings})
+    job_plan = dry_run(spec, inputs, lambda now: _show(now, send), request.output and request.output_file)
     seconds = total = memory = on_device = None
-    if job_plan.prediction:
+    if expected := job_plan.prediction:
+        steps = min(expected.job - expected.measuring, settings.max_seconds or math.inf)
         # The job starts a process with the same modules as this one, then reads and plans as was done here.
-        total = (
-            _seconds_to_start()
-            + time.perf_counter()
-            - started
-            + _seconds_from_first_step(job_plan.prediction, settings)
-        )
-        memory, on_device = job_plan.prediction.peak_bytes, job_plan.prediction.device_bytes
-        coarse = job_plan.prediction.seconds_coarse or job_plan.prediction.seconds
-        seconds = job_plan.prediction.seconds * settings.steps_sos + coarse * job_plan.steps_coarse
+        total = _seconds_to_start() + time.perf_counter() - started + steps + expected.measuring + expected.ending
+        memory, on_device = expected.peak_bytes, expected.device_bytes
+        coarse = expected.seconds_coarse or expected.seconds
+        seconds = expected.seconds * settings.steps_sos + coarse * job_plan.steps_coarse
     return {
-        **_findings(inputs),
+        **findings,
         "plan": plan_json(job_plan),
         "estimated_seconds": seconds,
         "total_seconds": total,
@@ -183,12 +177,6 @@ def plan(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show
     }
 
 
-def _seconds_from_first_step(expected: Prediction, settings: Settings) -> float:
-    """Return the predicted seconds of steps, measurements and outputs."""
-    steps = expected.job - expected.measuring
-    return min(steps, settings.max_seconds or math.inf) + expected.measuring + expected.ending
-
-
 @functools.cache
 def _seconds_to_start() -> float:
     """Return the seconds from the start of this process to its first request, nearly all of them for imports."""
@@ -196,105 +184,71 @@ def _seconds_to_start() -> float:
     return _ready_at - created
 
 
-def compress(staged: Staged, parameters: JobParameters, name: str) -> dict[str, Any]:
-    """Compress a job's result, staged in place of its scene, into a file whose suffix determines the format.
-
-    Returns:
-        Loss of the compression: `CompressionLoss` as JSON.
-    """
-    source, settings = SceneRequest.of(staged.scene, staged.cameras, parameters), parameters.settings()
-    scene, format = read_scene(source.scene).scene, format_of_name(name)
-    assert format is not None
-    with Path(name).open("wb") as output:
-        encode_scene(output, scene, format, Path(name))
-    cameras = read_capture(source, scene, staged.photos).fitted(settings).cameras
-    return measure_compression(Path(name), scene, cameras, background=settings.background, near=source.near).as_dict()
+def _show(now: Progress, send: _Send) -> None:
+    send({"planning": now.model_dump(include=_PROGRESS)})
 
 
-def blend(staged: Staged, parameters: JobParameters, parts: dict[str, float], name: str) -> dict[str, Any]:
-    """Blend a job's scene with results into a file whose suffix determines the format.
+def _compress(request: WorkRequest, _send: _Send) -> dict[str, Any]:
+    """Compress a result, and return the loss of quality."""
+    settings, photos = request.parameters.settings(), request.staged.photos
+    converted = convert(
+        request.source, request.output_file, compare=True, images=photos, settings=settings, in_place=True
+    )
+    assert converted.loss is not None
+    return converted.loss.as_dict()
 
-    Args:
-        parts: Weight of each staged result, the job's own first. The scene has the remaining weight up to 1.
-        name: File to write.
 
-    Returns:
-        Nothing, as JSON.
-    """
-    source, weights = SceneRequest.of(staged.scene, staged.cameras, parameters), list(parts.values())
-    files = [read_scene(Path(path)) for path in parts]
-    rest = 1 - math.fsum(weights)
+def _blend(request: WorkRequest, _send: _Send) -> dict[str, Any]:
+    """Blend results, the job's own first, with the job's scene, which has the remaining weight up to 1."""
+    parts = [(SceneRequest(scene=Path(path)), weight) for path, weight in request.options["parts"].items()]
+    rest = 1 - math.fsum(weight for _, weight in parts)
     if abs(rest) > _ROUNDING:
-        axes, _ = choose_axes(source, staged.photos)
-        files.append(read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes))
-        weights.append(rest)
-    format = format_of_name(name)
-    assert format is not None
-    with Path(name).open("wb") as output:
-        encode_blend(output, blend_scenes(files, weights), format, Path(name))
+        axes, _ = choose_axes(request.source, request.staged.photos)
+        parts.append((request.source.model_copy(update={"spz_axes": axes}), rest))
+    blend(parts, request.output_file, in_place=True)
     return {}
 
 
-def video(staged: Staged, parameters: JobParameters, limits: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
-    """Render a video of a job's result, staged in place of its scene; `show` receives the progress.
-
-    Returns:
-        Width, height and number of the frames.
-    """
-    _check_encoder()
-    options = JobVideo(**limits["options"])
-    source = SceneRequest.of(staged.scene, staged.cameras, parameters).model_copy(
-        update={"resolution": options.resolution}
-    )
-    unstylized = Path(limits["unstylized"]) if options.compare else None
-    request = VideoRequest(
-        source, Path(limits["name"]), options, parameters.settings().background, unstylized, images=staged.photos
-    )
+def _video(request: WorkRequest, send: _Send) -> dict[str, Any]:
+    """Render a video of a result, and return the width, the height and the number of its frames."""
+    try:
+        import av  # noqa: F401
+    except ImportError as error:
+        command = install_command("video")
+        raise SettingsError(f"The service cannot encode videos: its operator has to run `{command}`.") from error
+    options = JobVideo(**request.options["video"])
+    source = request.source.model_copy(update={"resolution": options.resolution})
+    unstylized = Path(request.options["unstylized"]) if options.compare else None
+    background, photos = request.parameters.settings().background, request.staged.photos
     started = time.monotonic()
 
     def progress(done: int, total: int) -> None:
         left = (time.monotonic() - started) / done * (total - done)
-        show(Progress(stage="video", step=done, total=total, eta_s=left))
+        _show(Progress(stage="video", step=done, total=total, eta_s=left), send)
 
-    cameras = render_video(request, progress, in_place=True)
+    wanted = VideoRequest(source, request.output_file, options, background, unstylized, images=photos)
+    cameras = render_video(wanted, progress, in_place=True)
     return {"width": cameras[0].width, "height": cameras[0].height, "frames": len(cameras)}
 
 
-WORK: dict[str, Callable[[Staged, JobParameters, dict[str, Any], ShowPlanning], dict[str, Any]]] = {
-    "validate": lambda staged, parameters, limits, show: validate(staged, parameters, limits),
-    "plan": plan,
-    "compress": lambda staged, parameters, limits, show: compress(staged, parameters, limits["name"]),
-    "blend": lambda staged, parameters, limits, show: blend(staged, parameters, limits["parts"], limits["name"]),
-    "video": video,
+#: Function of each kind of work, and its title for messages.
+WORK: dict[str, tuple[Callable[[WorkRequest, _Send], dict[str, Any]], str]] = {
+    "validate": (lambda request, send: _findings(_read(request)), "Reading the files"),
+    "plan": (_plan, "Planning the job"),
+    "compress": (_compress, "Compressing the result"),
+    "blend": (_blend, "Blending the results"),
+    "video": (_video, "Rendering the video"),
 }
-
-
-def _check_network_weights(backbone: str) -> None:
-    installed = [entry.name for entry in list_network_weights() if entry.path]
-    wanted = [name for name in ("vgg19", "vgg16") if backbone in ("auto", name)]
-    if not any(name in installed for name in wanted):
-        raise WeightsError(f"The service has no weights of {' or '.join(wanted)}: its operator has to fetch them.")
-
-
-def _check_encoder() -> None:
-    try:
-        import av  # noqa: F401
-    except ImportError as error:
-        raise SettingsError(
-            f"The service cannot encode videos: its operator has to run `{install_command('video')}`."
-        ) from error
 
 
 # --- one request in a child ----------------------------------------------------------------------------------------
 
 
-def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
+def _inspect(request: WorkRequest, send: _Send) -> dict[str, Any]:
     """Return the final response of a child: `{"findings": ...}` or `{"error": {"code", "message", "input"}}`."""
     try:
-        os.chdir(request["folder"])
-        staged = Staged.model_validate(request["staged"])
-        work = WORK[request["work"]]
-        return {"findings": work(staged, JobParameters(**request["parameters"]), request["limits"], show)}
+        os.chdir(request.folder)
+        return {"findings": WORK[request.work][0](request, send)}
     except MemoryError as error:
         return _over_limit("Reading it takes more memory than allowed.", getattr(error, "role", None))
     except SgsstError as error:
@@ -307,26 +261,30 @@ def _inspect(request: dict[str, Any], show: ShowPlanning) -> dict[str, Any]:
 
 
 def _refusal(code: str, message: str, role: str | None) -> dict[str, Any]:
-    return {"error": {"code": code, "message": _without_folders(message), "input": role}}
-
-
-def _without_folders(message: str) -> str:
-    """Return the message with the users' names of files, without the folders of the staging area."""
-    return re.sub(rf"(?<!\S)(?:{'|'.join(ROLES)})/", "", message)
+    plain = re.sub(rf"(?<!\S)(?:{'|'.join(ROLES)})/", "", message)  # users did not give the folders of the staging area
+    return {"error": {"code": code, "message": plain, "input": role}}
 
 
 def _over_limit(message: str, role: str | None = None) -> dict[str, Any]:
     return _refusal(problems.INSPECTION_LIMIT.code, message, role)
 
 
-def _limit_resources(seconds: float, size: int) -> None:
+def _limit_resources(seconds: float, size: int, *, extended: bool) -> None:
+    """Limit this child's CPU time and memory; `extended` lets the parent allow more time."""
     used = psutil.Process().memory_info().vms
     resource.setrlimit(resource.RLIMIT_AS, (used + size, used + size))
     cpu = max(1, int(seconds))
-    resource.setrlimit(resource.RLIMIT_CPU, (cpu, cpu + 1))
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu, resource.RLIM_INFINITY if extended else cpu + 1))
 
 
-def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
+def _planning_seconds(findings: dict[str, Any], limits: dict[str, int]) -> float:
+    """Return the CPU seconds that planning may take, from an untrusted child's findings about the inputs."""
+    gaussians, views, pixels = (min(max(findings[name], 0), limits[name]) for name in ("gaussians", "views", "pixels"))
+    trial = _TRIAL_SECONDS_PER_PIXEL * pixels / max(views, 1)
+    return float(_SECONDS_PER_GAUSSIAN * gaussians * views + _SECONDS_PER_PIXEL * pixels + trial)
+
+
+def _inspect_in_child(request: WorkRequest) -> Iterator[bytes]:
     """Fork a confined child and yield the lines that it sends through a pipe.
 
     A child that ends without a response has exceeded one of three limits: the CPU time of all its threads, its memory,
@@ -338,10 +296,19 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
         os.close(reading)
         _run_child(request, writing)
     os.close(writing)
-    answer = None
+    answer, until = None, time.monotonic() + 2 * request.seconds
+    lines, is_planning = _lines(reading, lambda: until), False
     try:
-        for number, line in enumerate(_lines(reading, time.monotonic() + 2 * request["seconds"])):
-            if "planning" not in line:
+        for number, line in enumerate(lines):
+            if "checked" in line:
+                if request.work != "plan" or is_planning:
+                    break
+                is_planning = True
+                seconds = _planning_seconds(line["checked"], request.limits)
+                until += 2 * seconds
+                most = int((request.seconds + seconds) * request.threads)
+                resource.prlimit(child, resource.RLIMIT_CPU, (most, most + 1))
+            elif "planning" not in line:
                 answer = line
                 break
             if number < MAX_REPORTS:
@@ -360,30 +327,31 @@ def _inspect_in_child(request: dict[str, Any]) -> Iterator[bytes]:
     yield json.dumps(answer).encode()
 
 
-def _run_child(request: dict[str, Any], writing: int) -> NoReturn:
+def _run_child(request: WorkRequest, writing: int) -> NoReturn:
     """Process a request in the forked child and exit, without running cleanup code of the parent."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         die_with_parent()  # the setting is not inherited across a fork
         _close_descriptors(writing)
-        if request["threads"] > 1:  # the parent has no other threads, which a fork would not copy
-            torch.set_num_threads(request["threads"])
-        _prefer_oom_kill()
+        if request.threads > 1:  # the parent has no other threads, which a fork would not copy
+            torch.set_num_threads(request.threads)
+        with contextlib.suppress(OSError):  # if the machine runs out of memory, the kernel kills this rather than a job
+            Path("/proc/self/oom_score_adj").write_text("500")
         # RLIMIT_CPU counts all threads, even those that spin
-        _limit_resources(request["seconds"] * request["threads"], request["bytes"] + _memory_besides_reading(request))
+        memory, extended = request.memory + _memory_besides_reading(request), request.work == "plan"
+        _limit_resources(request.seconds * request.threads, memory, extended=extended)
         with os.fdopen(writing, "w") as file:
 
-            def show(now: Progress) -> None:
-                print(json.dumps({"planning": now.model_dump(include=_PROGRESS)}), file=file, flush=True)
+            def send(response: dict[str, Any]) -> None:
+                print(json.dumps(response), file=file, flush=True)
 
             try:
                 uncompiled = _confine(request)
             except OSError as error:
                 refusal = _over_limit("The files cannot be checked at the moment.")
-                print(json.dumps({**refusal, "log": f"cannot be confined: {error}"}), file=file)
+                send({**refusal, "log": f"cannot be confined: {error}"})
             else:
-                answer = _inspect(request, show)
-                print(json.dumps({**answer, "compiled": bool(uncompiled)}), file=file)
+                send({**_inspect(request, send), "compiled": bool(uncompiled)})
     finally:
         os._exit(0)
 
@@ -397,7 +365,7 @@ def _close_descriptors(retained: int = 2) -> None:
     os.closerange(max(3, retained + 1), resource.getrlimit(resource.RLIMIT_NOFILE)[0])
 
 
-def _confine(request: dict[str, Any]) -> list[None]:
+def _confine(request: WorkRequest) -> list[None]:
     """Restrict this child to reading its job's files and the installation, and to writing the derived file.
 
     Numba looks for a writable cache folder when a module with kernels is imported. This process therefore imports all
@@ -406,17 +374,17 @@ def _confine(request: dict[str, Any]) -> list[None]:
     Returns:
         List to which an entry is appended for each kernel that has to be compiled.
     """
-    folder = Path(request["folder"])
+    folder = request.folder
     links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
     linked = [path.resolve() for path in links if path.is_symlink()]
-    result, most_bytes = None, 0
-    if request["work"] in ("compress", "blend", "video"):
-        result = folder / request["limits"]["name"]
-        most_bytes = request["limits"]["bytes"]
-        result.touch()
+    output, most_bytes = None, 0
+    if request.output:
+        name, most_bytes = request.output
+        output = folder / name
+        output.touch()
     uncompiled: list[None] = []
     cache_in_memory(lambda: uncompiled.append(None))
-    confine([folder, *linked, cache_folder(), *kernel_folders(), *installation()], result, most_bytes)
+    confine([folder, *linked, cache_folder(), *kernel_folders(), *installation()], output, most_bytes)
     return uncompiled
 
 
@@ -437,49 +405,45 @@ def _compile_kernels() -> None:
             count, scene = 64, Path("scene.ply")
             shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh_dc": (3,), "sh_rest": (15, 3)}
             write_scene(scene, Scene(*(torch.rand(count, *shape) for shape in shapes.values())))
+            staged, parameters = (
+                Staged(scene=scene, styles=(STARRY_NIGHT,), cameras=None, photos=None),
+                JobParameters(orbit="3", resolution=96),
+            )
             limits = dict.fromkeys(("gaussians", "views", "pixels", "image_pixels"), 1 << 40)
-            parameters = JobParameters(orbit="3", resolution=96)
-            staged = Staged(scene=scene, styles=(STARRY_NIGHT,), cameras=None, photos=None)
-            plan(staged, parameters, limits, lambda now: None)
+            request = WorkRequest(
+                work="plan",
+                folder=Path(folder),
+                staged=staged,
+                parameters=parameters,
+                seconds=0,
+                memory=0,
+                limits=limits,
+            )
+            _plan(request, lambda response: None)
     finally:
         os._exit(0)
 
 
-def _prefer_oom_kill() -> None:
-    """Make the kernel kill this process rather than a job if the machine runs out of memory."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("500")
-
-
-def _memory_besides_reading(request: dict[str, Any]) -> int:
+def _memory_besides_reading(request: WorkRequest) -> int:
     """Return the memory limit in bytes for everything but reading: threads, and rendering or writing."""
-    threads: int = request["threads"] * _THREAD_BYTES
-    if request["work"] == "validate" and not JobParameters(**request["parameters"]).selects_by_images:
+    threads: int = request.threads * _THREAD_BYTES
+    if request.work == "validate" and not request.parameters.selects_by_images:
         return threads
     default = default_memory_limit()
-    return threads + min(request["parameters"]["memory_limit"] or default, default)
+    return threads + min(request.parameters.settings().memory_limit or default, default)
 
 
-_TITLES = {
-    "validate": "Reading the files",
-    "plan": "Planning the job",
-    "compress": "Compressing the result",
-    "blend": "Blending the results",
-    "video": "Rendering the video",
-}
+def _limit_text(request: WorkRequest) -> str:
+    what = WORK[request.work][1]
+    text = f"{what} takes more time ({request.seconds:.0f} s of a processor) or memory "
+    text += f"({request.memory / 1e9:.1f} GB) than allowed for files of this size, or crashes their reader."
+    return text if request.work != "plan" else f"{text} Ask for fewer views, or submit it without a dry run."
 
 
-def _limit_text(request: dict[str, Any]) -> str:
-    what = _TITLES[request["work"]]
-    text = f"{what} takes more time ({request['seconds']:.0f} s of a processor) or memory "
-    text += f"({request['bytes'] / 1e9:.1f} GB) than allowed for files of this size, or crashes their reader."
-    return text if request["work"] != "plan" else f"{text} Ask for fewer views, or submit it without a dry run."
-
-
-def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
+def _lines(descriptor: int, deadline: Callable[[], float]) -> Iterator[dict[str, Any]]:
     """Yield messages until the child closes the pipe or sends an invalid message, or the deadline passes."""
     incomplete = b""
-    while (left := deadline - time.monotonic()) > 0 and len(incomplete) < MAX_ANSWER:
+    while (left := deadline() - time.monotonic()) > 0 and len(incomplete) < MAX_ANSWER:
         if not select.select([descriptor], [], [], left)[0]:
             continue
         data = os.read(descriptor, 1 << 16)
@@ -498,7 +462,12 @@ def _lines(descriptor: int, deadline: float) -> Iterator[dict[str, Any]]:
 
 def _is_response(answer: Any) -> bool:
     """Return whether the message of an untrusted child has the format that the calling process accepts."""
-    if not isinstance(answer, dict) or not answer.keys() & {"planning", "findings", "error"}:
+    if not isinstance(answer, dict) or not answer.keys() & {"planning", "checked", "findings", "error"}:
+        return False
+    checked = answer.get("checked", {"gaussians": 0, "views": 0, "pixels": 0})
+    if not isinstance(checked, dict) or not all(
+        isinstance(checked.get(name), int) for name in ("gaussians", "views", "pixels")
+    ):
         return False
     planning = answer.get("planning", {})
     if not isinstance(planning, dict) or (planning and planning.keys() != set(_PROGRESS)):
@@ -520,7 +489,7 @@ def main() -> None:
     torch.set_num_threads(1)  # a child forked from a process with threads could wait for them forever
     die_with_parent()
     for line in sys.stdin.buffer:
-        for response in _inspect_in_child(json.loads(line)):
+        for response in _inspect_in_child(WorkRequest.model_validate_json(line)):
             sys.stdout.buffer.write(response + b"\n")
             sys.stdout.buffer.flush()
 

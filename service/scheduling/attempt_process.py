@@ -19,12 +19,13 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
+from service.files.staging import PLAN
 from service.scheduling.endings import OUTAGE, Ending, Report, cause_of_error, outage
 from service.scheduling.store_workplace import StoreWorkplace
 from service.states import AttemptOutcome
 from service.store.retries import Cause
 from sgsst_core.progress import Progress
-from worker.job import JobSpec, Resume
+from worker.job import JobSpec
 from worker.processes import die_with_parent
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ class AttemptProcess:
         signal.signal(signal.SIGUSR1, lambda number, frame: self._finishing.set())
         report_progress(Progress(stage="reading"))
         try:
-            result = self._run_on_ranks() if self._task.workers > 1 or self._task.cluster else self._run_alone()
+            result = self._stylize()
         except Exception as error:
             send(Report(ending=failure(error)))
             if cause_of_error(error) != Cause.JOB:
@@ -82,48 +83,31 @@ class AttemptProcess:
         if result is not None and result.stopped != "interrupted":
             send(Report(ending=Ending(AttemptOutcome.SUCCEEDED, result=result)))
 
-    def _run_alone(self) -> Result:
-        from worker.execute import execute
-        from worker.prepare import describe, prepare
-        from worker.previews import Previews
-
-        resume = Resume(self._task.spec.resume, required=False)
-        preview = Previews(_PREVIEWS, self._task.preview_seconds, log)
-        job = prepare(self._task.spec, resume=resume, warn=log, show_planning=report_progress, preview=preview)
-        report_prepared(describe(job))
-
-        return execute(
-            job,
-            progress=report_progress,
-            stop=self._stopping.is_set,
-            finish=self._finishing.is_set,
-            warn=log,
-            preview=preview,
-            checkpoint_seconds=self._task.checkpoint_seconds,
-        )
-
-    def _run_on_ranks(self) -> Result | None:
-        from worker.ranks.attempts import Listener, stylize_on_ranks
+    def _stylize(self) -> Result | None:
         from worker.ranks.rank import WorkerOptions
+        from worker.run import Listener, stylize
 
+        task = self._task
         listener = Listener(
             prepared=report_prepared,
             progress=report_progress,
-            happened=log,
             warn=log,
             stop=self._stopping.is_set,
             finish=self._finishing.is_set,
+            happened=log,
             left_out=lambda gpus: send(Report(left_out=tuple(gpus))),
             stored=lambda file: send(Report(stored=file)),
         )
         options = WorkerOptions(
-            checkpoint_seconds=self._task.checkpoint_seconds,
+            checkpoint_seconds=task.checkpoint_seconds,
             preview_folder=_PREVIEWS,
-            preview_seconds=self._task.preview_seconds,
+            preview_seconds=task.preview_seconds,
             resume_required=False,
-            workplace=self._task.workplace,
+            workplace=task.workplace,
+            plan_file=Path(PLAN),
         )
-        return stylize_on_ranks(self._task.spec, self._task.workers, listener, options=options).result
+        workers = task.workers if task.workers > 1 or task.cluster else None
+        return stylize(task.spec, workers, listener, options).result
 
 
 def report_progress(now: Progress) -> None:

@@ -23,7 +23,7 @@ from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.housekeeping import Housekeeper
 from service.scheduling.lease_keeper import RENEW_FRACTION, LeaseKeeper
 from service.scheduling.machine import Machine, is_dead, own_name
-from service.scheduling.packing import Capacity, Grant
+from service.scheduling.packing import Capacity
 from service.scheduling.running import RunningAttempt
 from service.scheduling.selection import JobSelector
 from service.scheduling.stager import Stager
@@ -31,7 +31,6 @@ from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
 from service.startup import keep_private, set_up
 from service.store import Store, open_store
-from service.store.leases import Lease
 from service.weights import check_weights
 
 #: Delay before the next round after the store could not be reached, in seconds.
@@ -113,7 +112,11 @@ class Dispatcher:
             taken = self._selector.lease_next_job([attempt.holding for attempt in self._running.values()])
             if taken is None:
                 return
-            self._start_attempt(*taken)
+            lease, grant = taken
+            folder = self._work / f"{lease.job_id}-{lease.epoch}"
+            attempt = RunningAttempt(lease, grant, folder, self._settings, self._store, self._artifacts, self._stager)
+            self._running[lease.job_id] = attempt
+            attempt.start()
 
     def _announce_alive(self) -> None:
         """Send a heartbeat if it is due."""
@@ -121,12 +124,6 @@ class Dispatcher:
             free = self._capacity.free([attempt.grant for attempt in self._running.values()])
             self._store.operations.record_heartbeat(self.name, self._capacity.size, free)
             self._announced_at = time.monotonic()
-
-    def _start_attempt(self, lease: Lease, grant: Grant) -> None:
-        folder = self._work / f"{lease.job_id}-{lease.epoch}"
-        attempt = RunningAttempt(lease, grant, folder, self._settings, self._store, self._artifacts, self._stager)
-        self._running[lease.job_id] = attempt
-        attempt.start()
 
     def _shut_down(self) -> None:
         _log.info("dispatcher stopping: running_jobs=%d", len(self._running))

@@ -79,18 +79,16 @@ class Outbox:
                 stamp = (status.st_size, status.st_mtime_ns)
                 if self._uploaded.get(name) == stamp:
                     continue
+                # later checkpoints and colors replace the file instead of overwriting it; results are never rewritten
+                final = name == CHECKPOINT or name in RESULTS or name.startswith(LIVE)
+                step = _saved_step(path) if name == CHECKPOINT else None
                 try:
-                    done.append(self._put_file(name, path))
+                    file = self._artifacts.put(self._job_id, self._epoch, name, path, final=final)
+                    done.append(replace(file, step=step))
                 except (StoreError, NoSpaceError) as error:
                     return done, error
                 self._uploaded[name] = stamp
         return done, None
-
-    def _put_file(self, name: str, path: Path) -> Published:
-        step = _saved_step(path) if name == CHECKPOINT else None
-        # later checkpoints and colors replace the file instead of overwriting its bytes; results are never rewritten
-        final = name == CHECKPOINT or name in RESULTS or name.startswith(LIVE)
-        return replace(self._artifacts.put(self._job_id, self._epoch, name, path, final=final), step=step)
 
 
 def _saved_step(checkpoint: Path) -> int | None:

@@ -8,7 +8,9 @@ from pathlib import Path
 from service.errors import DamagedFileError, LostFileError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BLOBS, Blobs
-from service.files.staging import CHECKPOINT, RESULT, stage
+from service.files.staging import CHECKPOINT, PLAN, RESULT, stage
+from service.inspection.inspector import stored_plan
+from service.parameters import stored_parameters
 from service.scheduling.attempt_process import Task
 from service.scheduling.packing import Grant
 from service.scheduling.store_workplace import StoredFile, StoreWorkplace, store_weights
@@ -68,7 +70,11 @@ class Stager:
                 self._artifacts.fetch(checkpoint.location, target, checkpoint.sha256)
             except (LostFileError, DamagedFileError) as error:
                 _log.warning("checkpoint not usable, job restarts: %s", error, extra=lease.log_fields)
-        stage(folder, lease.job.inputs, self._blobs.fetch(self._input_rows(lease), folder))
+        job = lease.job
+        stage(folder, job.inputs, self._blobs.fetch(self._input_rows(lease), folder))
+        (folder / PLAN).symlink_to(
+            stored_plan(self._settings, job.owner, job.inputs, stored_parameters(job.parameters)).absolute()
+        )
 
     def _input_rows(self, lease: Lease) -> dict[str, BlobRow]:
         return self._store.inputs.blobs(sorted({entry["sha256"] for entry in lease.job.inputs}))

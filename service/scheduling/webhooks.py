@@ -96,18 +96,15 @@ class Deliverer:
     async def _deliver_due(self) -> None:
         sending: dict[asyncio.Task[None], Delivery] = {}
         while not self._stop.is_set():
-            for delivery in await asyncio.to_thread(self._take, list(sending.values())):
+            limits = {"total": _MAX_TOTAL, "per_owner": _MAX_PER_OWNER, "per_url": _MAX_PER_URL}
+            due = self._store.operations.due_deliveries
+            for delivery in await asyncio.to_thread(due, _HOLD_SECONDS, list(sending.values()), **limits):
                 sending[asyncio.create_task(self._deliver(delivery))] = delivery
             if not sending:
                 return
             done, _ = await asyncio.wait(sending, timeout=_ROUND_SECONDS, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 del sending[task]
-
-    def _take(self, sending: list[Delivery]) -> list[Delivery]:
-        return self._store.operations.due_deliveries(
-            _HOLD_SECONDS, sending, total=_MAX_TOTAL, per_owner=_MAX_PER_OWNER, per_url=_MAX_PER_URL
-        )
 
     async def _deliver(self, delivery: Delivery) -> None:
         """Send one message and record the outcome; errors do not affect other messages."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save, save_file
 from torch import Tensor
 
 from sgsst_core.decision import Decision
@@ -189,14 +189,66 @@ def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
         for record in checkpoint.state.history
     ]
     values |= {"ranks": checkpoint.ranks, "written_by": checkpoint.written_by}
-    metadata = {"version": FORMAT_VERSION, "job": job, "run": checkpoint.run, "values": json.dumps(values)}
     try:
-        save_file(tensors, path, {**metadata, "digest": _digest(tensors, metadata)})
+        save_file(tensors, path, _metadata(tensors, job, checkpoint.run, values))
     except SafetensorError as error:  # the operating system's error is contained only in the text
         if "os error" not in str(error).lower():
             raise
         digits = str(error).lower().rpartition("os error")[2].strip(" )")  # "No space left on device (os error 28)"
         raise OSError(int(digits) if digits.isdigit() else 0, str(error)) from error
+
+
+def save_plan(path: Path, plan: Plan, job: str, conditions: str) -> None:
+    """Write a plan into an existing file, for a run of the same job that finds the same conditions.
+
+    Args:
+        path: File to write.
+        plan: Plan of the job.
+        job: Fingerprint of the job.
+        conditions: Text about everything else that the plan depends on, such as the machine.
+    """
+    tensors, values = _plan_parts(plan)
+    path.write_bytes(save(tensors, _metadata(tensors, job, conditions, values)))  # `save_file` replaces the file
+
+
+def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> tuple[Plan, str]:
+    """Return a plan from `save_plan` and its conditions. What it says about scene and views is checked.
+
+    Args:
+        path: File to read.
+        job: Fingerprint of the job.
+        scene: Scene of the job, before its refinement.
+        cameras: Cameras of the job.
+
+    Raises:
+        CheckpointError: If there is no such file, or it is corrupt or of another job.
+    """
+    tensors, metadata, values = _load(path, job)
+    try:
+        plan = _plan(tensors, values["plan"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    count, refinement, fits = len(scene), plan.refinement, True
+    if refinement is not None:
+        count = int(refinement.pieces.long().prod(dim=1).sum())
+        fits = refinement.pieces.shape == (len(scene), 3) and int(refinement.pieces.min()) >= 1
+        fits = fits and (refinement.sh_dc is None or refinement.sh_dc.shape == (count, 3))
+    fits = (
+        fits
+        and all(each.shape == (count,) and each.dtype == torch.bool for each in (plan.seen, plan.optimized))
+        and plan.survey.total_blend_weights.shape == (count,)
+        and all(0 <= index < len(cameras) for index in (*plan.covered, *plan.survey.covered))
+        and len(plan.survey.regions) == len(cameras)
+    )
+    if not fits:
+        raise CheckpointError(f"{path}: is not a plan of this scene.")
+    return plan, metadata["run"]
+
+
+def _metadata(tensors: Mapping[str, Tensor], job: str, run: str, values: Mapping[str, Any]) -> dict[str, str]:
+    """Return the metadata of a file of a job, with a digest of all its content."""
+    metadata = {"version": FORMAT_VERSION, "job": job, "run": run, "values": json.dumps(values)}
+    return {**metadata, "digest": _digest(tensors, metadata)}
 
 
 def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
@@ -208,6 +260,18 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
     Raises:
         CheckpointError: If the file is missing or corrupt, or belongs to another job or run.
     """
+    tensors, metadata, values = _load(path, job)
+    if run is not None and metadata["run"] != run:
+        raise CheckpointError(f"{path}: was written by an earlier run. Start again without --resume.")
+    try:
+        plan, state = _plan(tensors, values.pop("plan")), _state(tensors, values)
+        return Checkpoint(state, plan, values["ranks"], metadata["run"], values["written_by"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _load(path: Path, job: str) -> tuple[dict[str, Tensor], dict[str, str], dict[str, Any]]:
+    """Return the tensors, the metadata and the other values of a file of a job, after checking its digest."""
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint to resume from. Start again without --resume.")
     try:
@@ -223,15 +287,13 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
                 f"{path}: belongs to another job (scene, cameras, style, weights or settings differ). "
                 "Give the same ones as before, or start again without --resume."
             )
-        if run is not None and metadata["run"] != run:
-            raise CheckpointError(f"{path}: was written by an earlier run. Start again without --resume.")
-        values = json.loads(metadata["values"])
-        plan, state = _plan(tensors, values.pop("plan")), _state(tensors, values)
-        return Checkpoint(state, plan, values["ranks"], metadata["run"], values["written_by"])
+        return tensors, metadata, json.loads(metadata["values"])
     except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
-        raise CheckpointError(
-            f"{path}: is not a readable checkpoint ({error}). Start again without --resume."
-        ) from error
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> CheckpointError:
+    return CheckpointError(f"{path}: is not a readable checkpoint ({error}). Start again without --resume.")
 
 
 def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:

@@ -401,6 +401,27 @@ def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path
 
 
 @pytest.mark.slow
+def test_dry_run_plans_without_queueing_and_its_job_reuses_the_plan(service: Service, files: dict[str, Path]) -> None:
+    with service.client() as client:
+        before = len(client.get("/v1/jobs").json()["jobs"])
+        body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+        data = {"parameters": json.dumps(PARAMETERS | {"steps_sos": 5})}
+        answer = client.post("/v1/jobs", params={"dry_run": True}, files=body, data=data)
+        assert answer.status_code == 200, answer.text
+        plan = answer.json()
+        assert (plan["gaussians"], plan["views"], plan["sh_degree"]) == (616, 3, 1)
+        assert plan["plan"]["decisions"]
+        assert plan["estimated_seconds"] > 0
+        assert plan["memory_bytes"] > 0
+        assert plan["device_memory_bytes"] is None
+        assert len(client.get("/v1/jobs").json()["jobs"]) == before
+        job_id = submit(client, files, steps_sos=5)
+        wait_until(service, client, job_id, "succeeded")
+        reused = client.get(f"/v1/jobs/{job_id}/artifacts/plan.json").json()
+        assert reused["prediction"] == plan["plan"]["prediction"], "measured once"
+
+
+@pytest.mark.slow
 def test_deleting_job_removes_its_files(service: Service, short_job: str) -> None:
     """This test runs after all other tests that use the same job."""
     with service.client() as client:

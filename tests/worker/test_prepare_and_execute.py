@@ -16,17 +16,18 @@ from PIL import Image
 from sgsst_core.errors import CheckpointError
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.planning.plan import Plan
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import drawing_problem
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint
+from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint, save_plan
 from tests.sgsst_core.stylizing.test_refining import large_wall
 from tests.small_scenes import wall
 from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import execute
 from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume
-from worker.prepare import Job, prepare
+from worker.prepare import Job, dry_run, prepare
 from worker.previews import Previews
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -226,6 +227,53 @@ def test_report_has_seconds_before_the_first_step(request_: JobSpec) -> None:
     for name in names:
         assert report["seconds_by_part"][name] == pytest.approx(before[name] + own.get(name, 0.0), abs=0.002)
     assert "survey of the views, before the steps" in Path(request_.out).with_name("s.report.html").read_text()
+
+
+def handed_over(request: JobSpec, file: Path) -> Plan:
+    """Return the plan of a dry run, which is handed over in a file."""
+    return dry_run(request, read_inputs(request), hand_over=file)
+
+
+def test_job_reuses_the_plan_of_its_dry_run(tmp_path: Path) -> None:
+    whole, request = (small_request(tmp_path / name, 4) for name in ("whole", "again"))
+    run_job(prepare(whole))
+    plan = handed_over(request, tmp_path / "plan")
+    shown: list[Progress] = []
+    job = prepare(request, plan_file=tmp_path / "plan", show_planning=shown.append)
+    assert shown == []
+    assert job.stylizer.job.plan.prediction == plan.prediction
+    assert run_job(job).stopped == "finished"
+    assert request.out.read_bytes() == whole.out.read_bytes()
+
+
+def test_job_with_other_settings_reuses_the_survey_of_its_dry_run(request_: JobSpec, tmp_path: Path) -> None:
+    plan = handed_over(request_, tmp_path / "plan")
+    settings = request_.settings.model_copy(update={"memory_limit": 1 << 30})  # the partition depends on it
+    shown: list[Progress] = []
+    job = prepare(
+        request_.model_copy(update={"settings": settings}), plan_file=tmp_path / "plan", show_planning=shown.append
+    )
+    assert {progress.stage for progress in shown} == {"probing"}
+    assert job.stylizer.job.plan.memory_limit == 1 << 30
+    assert torch.equal(job.stylizer.job.plan.survey.total_blend_weights, plan.survey.total_blend_weights)
+
+
+@pytest.mark.parametrize("wrong", ["missing", "damaged", "other job", "other scene"])
+def test_job_plans_if_its_dry_run_is_not_usable(wrong: str, request_: JobSpec, tmp_path: Path) -> None:
+    file, asked = tmp_path / "plan", request_
+    if wrong == "other job":
+        settings = request_.settings.model_copy(update={"seed": 1})
+        asked = request_.model_copy(update={"settings": settings})
+    if wrong != "missing":
+        plan = handed_over(asked, file)
+    if wrong == "damaged":
+        file.write_bytes(file.read_bytes()[:-100])
+    if wrong == "other scene":  # as from a process that a hostile file has taken over
+        job = prepare(request_)
+        save_plan(file, replace(plan, seen=plan.seen[:-1]), job.fingerprint, "")
+    shown: list[Progress] = []
+    prepare(request_, plan_file=file, show_planning=shown.append)
+    assert [progress.step for progress in shown if progress.stage == "planning"] == [0, 1, 2, 3]
 
 
 def test_damaged_checkpoint_falls_back_to_previous(request_: JobSpec) -> None:

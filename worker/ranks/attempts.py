@@ -9,14 +9,14 @@ from __future__ import annotations
 import os
 import secrets
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from worker.ranks.cluster import Cluster, scene_bytes
 from worker.ranks.failure_policy import FailedAttempt, Failure, check_retry, first_line
-from worker.ranks.rank import RankProcess, RankStatus, RankTask, WorkerOptions, Workplace
+from worker.ranks.rank import RankProcess, RankStatus, RankTask, WorkerOptions
 from worker.ranks.rank_group import (
     AttemptFailedError,
     RankGroup,
@@ -27,90 +27,16 @@ from worker.ranks.rank_group import (
     poll_ranks,
     start_ranks,
 )
+from worker.run import Ended, Listener, LostAttempt
 
 if TYPE_CHECKING:
     from sgsst_core.progress import Progress
-    from worker.job import JobSpec, Result, Resume
-    from worker.prepare import Prepared
+    from worker.job import JobSpec, Result
 
 #: Seconds that an interrupted job has to finish its step and save a checkpoint.
 STOP_SECONDS = 10.0
 #: Seconds that the other ranks have to exit after rank 0 is done.
 _LAST_WORDS = 5.0
-
-
-@dataclass(frozen=True)
-class Listener:
-    """Callbacks of a distributed job. All are called on the thread of `stylize_on_ranks`.
-
-    Attributes:
-        prepared: Called once, after the job has been prepared.
-        progress: Called with the latest progress, a few times per second. An attempt repeats the stages before the
-            steps if no earlier attempt has saved its plan.
-        happened: Called with a sentence about each lost or resumed attempt.
-        warn: Called with each warning.
-        stop: Called a few times per second; returns True to interrupt the job.
-        finish: Called a few times per second; returns True to end the job after a step, with its present colors as the
-            result.
-        left_out: Called with the GPUs that the job released because the plan does not use them, by their names in
-            CUDA_VISIBLE_DEVICES on their machine.
-        stored: Called with the workplace's description of each stored file, in order.
-    """
-
-    prepared: Callable[[Prepared], None] = lambda prepared: None
-    progress: Callable[[Progress], None] = lambda progress: None
-    happened: Callable[[str], None] = lambda line: None
-    warn: Callable[[str], None] = lambda line: None
-    stop: Callable[[], bool] = lambda: False
-    finish: Callable[[], bool] = lambda: False
-    left_out: Callable[[Sequence[str]], None] = lambda gpus: None
-    stored: Callable[[Any], None] = lambda file: None
-
-
-@dataclass
-class LostAttempt:
-    """Lost attempt, as listed in the report.
-
-    Attributes:
-        ranks: Number of ranks.
-        first_step: Step at which the attempt started; None if it was lost before its first step.
-        last_step: Last completed step.
-        saved_step: Step of the checkpoint that the next attempt resumes from.
-        reason: Reason of the loss.
-        seconds_lost: Seconds from the last checkpoint (or the start of the job) to the first step of the next attempt.
-        seconds_to_resume: Seconds from the loss to the first step of the next attempt.
-    """
-
-    ranks: int
-    first_step: int | None
-    last_step: int
-    saved_step: int
-    reason: str
-    seconds_lost: float = 0.0
-    seconds_to_resume: float = 0.0
-
-
-@dataclass(frozen=True)
-class RanksResult:
-    """Result of a job on several ranks.
-
-    Attributes:
-        result: Result of the job; None if it was interrupted and did not finish its step in time.
-        step, total: Last completed step and number of all steps; both are 0 if the job was never prepared.
-        saved: Step of the last checkpoint; None if there is none.
-        attempts: Attempts that were lost.
-    """
-
-    result: Result | None
-    step: int
-    total: int
-    saved: int | None
-    attempts: list[LostAttempt]
-
-    @property
-    def interrupted(self) -> bool:
-        """Return whether the job is unfinished."""
-        return self.result is None or self.result.stopped == "interrupted"
 
 
 def stylize_on_ranks(
@@ -120,7 +46,7 @@ def stylize_on_ranks(
     *,
     options: WorkerOptions | None = None,
     cluster: Cluster | None = None,
-) -> RanksResult:
+) -> Ended:
     """Run one job on up to `workers` ranks, in as many attempts as necessary.
 
     Args:
@@ -158,7 +84,7 @@ class _Attempts:
         self._let_go = False  # whether GPUs were released that the local Ray would still assign to ranks
         self._lost_at = time.monotonic()
 
-    def run(self) -> RanksResult:
+    def run(self) -> Ended:
         """Start attempts until the job has ended.
 
         Raises:
@@ -166,25 +92,21 @@ class _Attempts:
             RanksFailedError: If the failure policy gives up.
         """
         while True:
-            before = self._relay.farthest
+            relay, before = self._relay, self._relay.farthest
             try:
                 return self._ended(self._attempt())
             except AttemptFailedError as error:
                 failure = error.failure
-            self._record(failure, progressed=self._relay.farthest != before)
+            self._failed.append(FailedAttempt(failure, relay.last_step, relay.farthest != before))
+            count = len(self._group.handles) or self._workers
+            self._lost.append(LostAttempt(count, relay.first_step, relay.last_step, relay.saved or 0, failure.reason))
             self._listener.happened(check_retry(self._failed))
             if self._listener.stop():
                 return self._ended(None)
 
-    def _ended(self, result: Result | None) -> RanksResult:
+    def _ended(self, result: Result | None) -> Ended:
         step = result.steps if result else self._relay.step
-        return RanksResult(result, step, self._relay.total, self._relay.saved, self._lost)
-
-    def _record(self, failure: Failure, *, progressed: bool) -> None:
-        relay = self._relay
-        self._failed.append(FailedAttempt(failure, relay.last_step, progressed))
-        count = len(self._group.handles) or self._workers
-        self._lost.append(LostAttempt(count, relay.first_step, relay.last_step, relay.saved or 0, failure.reason))
+        return Ended(result, step, self._relay.total, self._relay.saved, self._lost)
 
     # --- one attempt -----------------------------------------------------------------------------------------------
 
@@ -237,17 +159,22 @@ class _Attempts:
                 look_for_losses(self._group, self._cluster, self._options.rank_timeout)
 
     def _task(self, number: int, address: str) -> RankTask:
-        reservation = self._group.reservation
+        from worker.job import Resume
+
+        reservation, workplace = self._group.reservation, self._options.workplace
         assert reservation is not None
+        resume = Resume(self._request.resume, self._options.resume_required)
+        if self._lost:  # only checkpoints of this run, unless the user wanted to resume
+            resume = Resume(True, required=False, run=None if self._request.resume else self._run_id)
         return RankTask(
             request=self._request,
             rank=number,
             size=len(self._group.handles),
             address=address,
             threads=reservation.threads,
-            options=replace(self._options, workplace=self._workplace()),
+            options=replace(self._options, workplace=workplace and workplace.after(self._relay.stored)),
             folder=Path.cwd(),
-            resume=self._resume(),
+            resume=resume,
             run_id=self._run_id,
             workers={"requested": self._requested, "attempts": [asdict(attempt) for attempt in self._lost]},
             seconds_lost=time.monotonic() - self._relay.safe_at,
@@ -262,19 +189,6 @@ class _Attempts:
         except OSError:
             return 0
         return int(size * self._request.settings.growth)
-
-    def _resume(self) -> Resume:
-        """Return which checkpoint to resume from: the user's choice at first, then only checkpoints of this run."""
-        from worker.job import Resume
-
-        if not self._lost:
-            return Resume(self._request.resume, self._options.resume_required)
-        return Resume(True, required=False, run=None if self._request.resume else self._run_id)
-
-    def _workplace(self) -> Workplace | None:
-        """Return the workplace of the next attempt, with the files that earlier attempts have stored."""
-        workplace = self._options.workplace
-        return workplace and workplace.after(self._relay.stored)
 
     def _leave_out(self, rank: RankHandle) -> None:
         """End a rank that the plan does not use, and release its GPU."""
@@ -354,20 +268,16 @@ class Relay:
         self._reported_files = len(status.stored)
         if status.progress is not None and not status.progress.is_step:
             self._pass_on_progress(status.progress)
-        self._pass_on_prepared(status)
+        if status.prepared is not None and self.first_step is None:
+            self.first_step = self.last_step = status.prepared.step
+            self.total = status.prepared.total
+            if not self._prepared:
+                self._prepared = True
+                self._listener.prepared(status.prepared)
         if status.progress is not None and status.progress.is_step:
             self._pass_on_progress(status.progress)
         if status.saved is not None and status.saved != self.saved:
             self.saved, self.safe_at = status.saved, time.monotonic()
-
-    def _pass_on_prepared(self, status: RankStatus) -> None:
-        if status.prepared is None or self.first_step is not None:
-            return
-        self.first_step = self.last_step = status.prepared.step
-        self.total = status.prepared.total
-        if not self._prepared:
-            self._prepared = True
-            self._listener.prepared(status.prepared)
 
     def _pass_on_progress(self, progress: Progress) -> None:
         if progress == self._progress:

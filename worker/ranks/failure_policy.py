@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Literal
 
 from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedError, SgsstError
@@ -76,33 +77,18 @@ def check_retry(attempts: Sequence[FailedAttempt]) -> str:
     give_up = ClusterAwayError if failure.kind == "machine" else RanksFailedError
     if failure.kind == "job" and failure.error is not None:
         raise failure.error
-    if failure.error is not None and not last.progressed and _came_again(attempts):
+    ends = [(attempt.failure.reason, attempt.last_step) for attempt in attempts[-2:]]
+    if failure.error is not None and not last.progressed and len(ends) == 2 and ends[0] == ends[1]:
         if isinstance(failure.error, SgsstError | MemoryError | RuntimeError):
             raise failure.error
         raise give_up(f"{failure.reason}; the same happened twice at step {last.last_step}.") from failure.error
-    in_vain = _in_vain(attempts)
+    in_vain = len(list(takewhile(lambda attempt: not attempt.progressed, reversed(attempts))))
     if in_vain >= MOST_ATTEMPTS:
         farthest = max(attempt.last_step for attempt in attempts)
         raise give_up(
             f"{in_vain} attempts in a row came no further than step {farthest}. The last one: {failure.reason}."
         ) from failure.error
     return f"{failure.reason}, after step {last.last_step}."
-
-
-def _came_again(attempts: Sequence[FailedAttempt]) -> bool:
-    """Return whether the last two attempts ended at the same step for the same reason."""
-    ends = [(attempt.failure.reason, attempt.last_step) for attempt in attempts[-2:]]
-    return len(ends) == 2 and ends[0] == ends[1]
-
-
-def _in_vain(attempts: Sequence[FailedAttempt]) -> int:
-    """Count the attempts since the last one that made progress."""
-    count = 0
-    for attempt in reversed(attempts):
-        if attempt.progressed:
-            break
-        count += 1
-    return count
 
 
 def first_line(error: BaseException) -> str:

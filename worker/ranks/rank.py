@@ -98,6 +98,7 @@ class WorkerOptions:
         actor: Class of the Ray actor that runs a rank; None for `RankProcess`.
         resume_required: Whether resuming a job fails if no checkpoint can be used.
         workplace: Workplace for ranks on machines without a shared folder; None for this process's working folder.
+        plan_file: Plan of a dry run, to use if it was made for the same job; None for none.
     """
 
     rank_timeout: float = RunOptions().rank_timeout
@@ -107,6 +108,7 @@ class WorkerOptions:
     actor: type[RankProcess] | None = None
     resume_required: bool = True
     workplace: Workplace | None = None
+    plan_file: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -252,7 +254,11 @@ class RankProcess:
     def _run(self, task: RankTask) -> None:
         place: OpenWorkplace | None = None
         try:
-            _set_environment(task)
+            set_thread_variables(task.threads)
+            import ray
+
+            # If the variable is not set, a process without an assigned GPU sees all GPUs.
+            os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(str(number) for number in ray.get_gpu_ids())
             if task.options.workplace is None:
                 _enter_folder(task)
             else:
@@ -296,63 +302,40 @@ class RankProcess:
                 self._update(outcome=_failure(error))
 
     def _job(self, task: RankTask, collectives: Collectives) -> Result:
-        from worker.execute import execute
-        from worker.prepare import describe, prepare
-        from worker.previews import Previews
+        from worker.run import Listener, run_rank
 
-        started, options = time.monotonic(), task.options
-        preview = None
-        if options.preview_folder:
-            preview = Previews(options.preview_folder, options.preview_seconds, self._add_warning)
-        job = prepare(
-            task.request,
-            collectives=collectives,
-            resume=task.resume,
-            warn=self._add_warning,
-            show_planning=lambda progress: self._update(progress=progress),
-            preview=preview,
-        )
-        job.workers |= task.workers
-        if task.rank == 0:
-            self._update(prepared=describe(job))
+        started, attempts = time.monotonic(), task.workers["attempts"]
 
         def progress(current: Progress) -> None:
             latest = self._status.progress
-            if current.is_step and not (latest and latest.is_step) and job.workers["attempts"]:
+            if current.is_step and not (latest and latest.is_step) and attempts:
                 since = time.monotonic() - started
-                lost = job.workers["attempts"][-1]
-                lost["seconds_lost"] = round(task.seconds_lost + since, 3)
-                lost["seconds_to_resume"] = round(task.seconds_since_loss + since, 3)
+                attempts[-1]["seconds_lost"] = round(task.seconds_lost + since, 3)
+                attempts[-1]["seconds_to_resume"] = round(task.seconds_since_loss + since, 3)
             self._update(progress=current)
 
-        return execute(
-            job,
+        listener = Listener(
+            prepared=lambda prepared: self._update(prepared=prepared),
             progress=progress,
+            warn=lambda line: self._update(warnings=(*self._status.warnings, line)),
             stop=self._stop.is_set,
             finish=self._finish.is_set,
-            warn=self._add_warning,
-            preview=preview,
             saved=lambda step: self._update(saved=step) if task.options.workplace is None else None,
-            checkpoint_seconds=options.checkpoint_seconds,
+        )
+        return run_rank(
+            task.request,
+            listener,
+            task.options,
+            task.resume,
+            collectives=collectives,
             run_id=task.run_id,
+            about_ranks=task.workers,
         )
 
     def _add_stored(self, file: Any, step: int | None) -> None:
         with self._lock:
             saved = self._status.saved if step is None else step
             self._status = replace(self._status, stored=(*self._status.stored, file), saved=saved)
-
-    def _add_warning(self, line: str) -> None:
-        self._update(warnings=(*self._status.warnings, line))
-
-
-def _set_environment(task: RankTask) -> None:
-    """Set the environment variables for thread counts and GPUs, before the libraries that read them are imported."""
-    set_thread_variables(task.threads)
-    import ray
-
-    # If the variable is not set, a process without an assigned GPU sees all GPUs.
-    os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(str(number) for number in ray.get_gpu_ids())
 
 
 def _enter_folder(task: RankTask) -> None:

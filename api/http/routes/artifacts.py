@@ -198,6 +198,6 @@ async def make_video(
     job = await asyncio.to_thread(find, context, caller, job_id)
 
     async def work(show: Any) -> ArtifactView:
-        return artifact_view(await context.videos.make(job, options, caller.quotas, show))
+        return artifact_view(await context.derived.video(job, options, caller.quotas, show))
 
     return await answer_work(request, work, "rendering", "video")

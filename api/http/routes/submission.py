@@ -170,19 +170,23 @@ async def create_job(
         if await context.threads.run(caller.owner, recall) is None:
             size = sum(row.size for row in rows.values())
             await context.threads.run(caller.owner, _check_files, context, inputs, rows, size=size)
-            await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
+            if not dry_run or context.inspector.is_planning:  # else the files are checked and planned in one reading
+                await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
             idempotency = _idempotency(idempotency_key, inputs, parameters, webhook)
             queue_job = partial(_queue_job, context, caller, inputs, parameters, webhook)
             return await asyncio.to_thread(queue_job, idempotency, receipt)
         stack.pop_all()  # keep the files, which planning needs after this function returns
 
+    checked = asyncio.Event()
+
     async def plan(show: Show) -> PlanView:
         async with receipt:
-            findings = await context.inspector.inspect("plan", caller.owner, inputs, rows, parameters, show)
+            inspect = context.inspector.inspect
+            findings = await inspect("plan", caller.owner, inputs, rows, parameters, show, checked.set)
         return PlanView(**findings, workers=parameters.workers)
 
-    return await answer_work(request, plan, "planning", "plan")
+    return await answer_work(request, plan, "planning", "plan", checked)
 
 
 def _find_inputs(

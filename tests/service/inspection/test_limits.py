@@ -15,9 +15,11 @@ from PIL import Image
 
 from service.errors import ServiceError
 from service.files.blobs import BlobFolder
+from service.files.staging import Staged
 from service.files.threads import FileThreads
 from service.inspection.inspector import InspectionProcess, Inspector, Show
 from service.inspection.process import WORK, _memory_besides_reading
+from service.inspection.work import WorkRequest
 from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -108,11 +110,14 @@ def test_work_beyond_its_time_limit_is_refused(tmp_path: Path) -> None:
     async def ask_all() -> dict[str, Any]:
         process = InspectionProcess()
         try:
-            return {work: await process.ask(request | {"work": work}) for work in WORK}
+            return {work: await process.ask(request.model_copy(update={"work": work})) for work in WORK}
         finally:
             await process.close()
 
-    request = {"folder": str(tmp_path), "staged": {}, "parameters": {}, "limits": {}, "seconds": 0, "bytes": 0}
+    staged = Staged(scene=Path("scene.ply"), styles=(), cameras=None, photos=None)
+    request = WorkRequest(
+        work="", folder=tmp_path, staged=staged, parameters=JobParameters(), seconds=0, memory=0, output=("out.ply", 0)
+    )
     for work, answer in asyncio.run(ask_all()).items():
         assert answer["error"]["code"] == "inspection-limit", work
 
@@ -138,7 +143,15 @@ def test_requested_memory_is_at_most_the_default(
     requested: int | None, limit: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.inspection.process.default_memory_limit", lambda: 1000)
-    request = {"work": "plan", "threads": 0, "parameters": {"memory_limit": requested}}
+    request = WorkRequest(
+        work="plan",
+        folder=Path(),
+        staged=Staged(scene=Path("scene.ply"), styles=(), cameras=None, photos=None),
+        parameters=JobParameters.model_validate({"memory_limit": requested}),
+        seconds=0,
+        memory=0,
+        threads=0,
+    )
     assert _memory_besides_reading(request) == limit
 
 

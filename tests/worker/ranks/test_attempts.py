@@ -23,9 +23,10 @@ from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, name_of
 from worker.execute import execute
 from worker.job import JobSpec
 from worker.prepare import Prepared, prepare
-from worker.ranks.attempts import Listener, RanksResult, stylize_on_ranks
+from worker.ranks.attempts import stylize_on_ranks
 from worker.ranks.cluster import Cluster
 from worker.ranks.rank import WorkerOptions
+from worker.run import Ended, Listener
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "vgg16_weights"),
@@ -89,7 +90,7 @@ def run(
     events: EventRecorder | None = None,
     fault: Fault | None = None,
     workers: int = 2,
-) -> RanksResult:
+) -> Ended:
     """Run a job on ranks, optionally with a fault, with a checkpoint after almost every step."""
     if fault is not None:
         fault.write(request)
@@ -103,7 +104,7 @@ def run(
     return stylize_on_ranks(request, workers, (events or EventRecorder()).listener(), options=options, cluster=cluster)
 
 
-def loss_of(ended: RanksResult) -> float:
+def loss_of(ended: Ended) -> float:
     """Return the final loss on the evaluation views."""
     assert ended.result is not None
     assert ended.result.loss_after is not None

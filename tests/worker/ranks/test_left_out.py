@@ -11,8 +11,9 @@ import pytest
 
 from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import FaultyRank, small_request
-from worker.ranks.attempts import Listener, stylize_on_ranks
+from worker.ranks.attempts import stylize_on_ranks
 from worker.ranks.rank import WorkerOptions
+from worker.run import Listener
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread", "tiny_installed"),

@@ -1,0 +1,173 @@
+"""Runner of a job, for the command line, the service and every rank: `stylize` runs a whole job, `run_rank` one rank.
+
+Neither PyTorch nor Ray is imported before a job runs: the driver of several ranks computes nothing itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from worker.job import Resume
+from worker.ranks.rank import WorkerOptions
+
+if TYPE_CHECKING:
+    from sgsst_core.parallel.collectives import Collectives
+    from sgsst_core.progress import Progress
+    from worker.job import JobSpec, Result
+    from worker.prepare import Prepared
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Callbacks of a job. Those of a job on several ranks are called on the thread of `stylize`.
+
+    Attributes:
+        prepared: Called once, after the job has been prepared.
+        progress: Called with the latest progress. A further attempt on ranks repeats the stages before the steps if no
+            earlier attempt has saved its plan.
+        warn: Called with each warning.
+        stop: Called after each step, or a few times per second; returns True to interrupt the job.
+        finish: Called like `stop`; returns True to end the job after a step, with its present colors as the result.
+        saved: Called with the step of each checkpoint; not used for ranks.
+        happened: Called with a sentence about each lost or resumed attempt on ranks.
+        left_out: Called with the GPUs that the job released because the plan does not use them, by their names in
+            CUDA_VISIBLE_DEVICES on their machine.
+        stored: Called with the workplace's description of each stored file, in order.
+    """
+
+    prepared: Callable[[Prepared], None] = lambda prepared: None
+    progress: Callable[[Progress], None] = lambda progress: None
+    warn: Callable[[str], None] = lambda line: None
+    stop: Callable[[], bool] = lambda: False
+    finish: Callable[[], bool] = lambda: False
+    saved: Callable[[int], None] = lambda step: None
+    happened: Callable[[str], None] = lambda line: None
+    left_out: Callable[[Sequence[str]], None] = lambda gpus: None
+    stored: Callable[[Any], None] = lambda file: None
+
+
+@dataclass
+class LostAttempt:
+    """Lost attempt on ranks, as listed in the report.
+
+    Attributes:
+        ranks: Number of ranks.
+        first_step: Step at which the attempt started; None if it was lost before its first step.
+        last_step: Last completed step.
+        saved_step: Step of the checkpoint that the next attempt resumes from.
+        reason: Reason of the loss.
+        seconds_lost: Seconds from the last checkpoint (or the start of the job) to the first step of the next attempt.
+        seconds_to_resume: Seconds from the loss to the first step of the next attempt.
+    """
+
+    ranks: int
+    first_step: int | None
+    last_step: int
+    saved_step: int
+    reason: str
+    seconds_lost: float = 0.0
+    seconds_to_resume: float = 0.0
+
+
+@dataclass(frozen=True)
+class Ended:
+    """End of a job.
+
+    Attributes:
+        result: Result of the job; None if it was interrupted and did not finish its step in time.
+        step, total: Last completed step and number of all steps; both are 0 if the job was never prepared.
+        saved: Step of the last checkpoint; None if there is none.
+        attempts: Attempts that were lost.
+    """
+
+    result: Result | None
+    step: int
+    total: int
+    saved: int | None
+    attempts: Sequence[LostAttempt] = ()
+
+    @property
+    def interrupted(self) -> bool:
+        """Return whether the job is unfinished."""
+        return self.result is None or self.result.stopped == "interrupted"
+
+
+def stylize(request: JobSpec, workers: int | None, listener: Listener, options: WorkerOptions) -> Ended:
+    """Run a job in this process, or on up to `workers` ranks, each in a process of its own.
+
+    Args:
+        request: Job to run.
+        workers: Maximum number of ranks; None for this process.
+        listener: Callbacks for the events of the job.
+        options: Options of running and watching ranks.
+
+    Raises:
+        SgsstError: If the job fails.
+        RanksFailedError: If ranks are lost too often, or fail for a reason that is not an error of the job.
+    """
+    if workers is not None:
+        from worker.ranks.attempts import stylize_on_ranks
+
+        return stylize_on_ranks(request, workers, listener, options=options)
+    result = run_rank(request, listener, options, Resume(request.resume, options.resume_required))
+    return Ended(result, result.steps, result.total, result.steps)
+
+
+def run_rank(
+    request: JobSpec,
+    listener: Listener,
+    options: WorkerOptions,
+    resume: Resume,
+    *,
+    collectives: Collectives | None = None,
+    run_id: str | None = None,
+    about_ranks: dict[str, Any] | None = None,
+) -> Result:
+    """Prepare a job on this rank, and execute it. Every rank must call this function.
+
+    Args:
+        request: Job to run.
+        listener: Callbacks for the events of the job.
+        options: Options of the job's ranks.
+        resume: Choice of the checkpoint to resume from.
+        collectives: Collectives of all ranks; None for one rank.
+        run_id: Identifier of this run, stored in checkpoints. None generates one.
+        about_ranks: Requested ranks and lost attempts, as JSON for the report.
+
+    Raises:
+        SgsstError: If the job fails.
+        RankLeftOut: If the plan does not use this rank.
+    """
+    from sgsst_core.parallel.collectives import ALONE
+    from worker.execute import execute
+    from worker.prepare import describe, prepare
+    from worker.previews import Previews
+
+    preview, collectives = None, collectives or ALONE
+    if options.preview_folder:
+        preview = Previews(options.preview_folder, options.preview_seconds, listener.warn)
+    job = prepare(
+        request,
+        collectives=collectives,
+        resume=resume,
+        warn=listener.warn,
+        show_planning=listener.progress,
+        preview=preview,
+        plan_file=options.plan_file,
+    )
+    job.workers |= about_ranks or {}
+    if collectives.rank == 0:
+        listener.prepared(describe(job))
+    return execute(
+        job,
+        progress=listener.progress,
+        stop=listener.stop,
+        finish=listener.finish,
+        warn=listener.warn,
+        preview=preview,
+        saved=listener.saved,
+        checkpoint_seconds=options.checkpoint_seconds,
+        run_id=run_id,
+    )
