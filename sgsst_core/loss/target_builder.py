@@ -18,7 +18,7 @@ from sgsst_core.loss.targets import ContentFeatures, LayerTarget, StyleTarget, S
 from sgsst_core.loss.tiling import Divider
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, Size, rounds
-from sgsst_core.scene.pyramid import coverage_pyramid, downscale, resize_area, style_size
+from sgsst_core.scene.pyramid import downscale, resize_area, style_size
 from sgsst_core.settings import StyleLossName
 from sgsst_core.style import Style, chosen_positions
 from sgsst_core.timing import Timer
@@ -195,7 +195,8 @@ class TargetBuilder:
         coarsest = self._divider.tiling.scales(_size(coverage))[-1]
         levels = coarsest + 1 + layer_stride("relu5_1").bit_length()
         dtype = torch.promote_types(self._network.dtype, torch.float32)
-        return coverage_pyramid(coverage.to(self._network.device, dtype), levels)
+        finest = coverage.to(self._network.device, dtype)
+        return [downscale(finest, level) for level in range(levels)]
 
     def scaled(self, content: Tensor, scale: int) -> ScaledView:
         """Return a scale of a content image [H, W, 3]."""

@@ -64,11 +64,6 @@ def style_size(style: tuple[int, int], view: tuple[int, int], scale: float = 1.0
     return max(1, round(style[0] * factor)), max(1, round(style[1] * factor))
 
 
-def coverage_pyramid(coverage: Tensor, levels: int) -> list[Tensor]:
-    """Return coverage [H, W] box-averaged at the scales 0 to `levels` - 1."""
-    return [downscale(coverage, level) for level in range(levels)]
-
-
 def resize_area(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Downscale an image [H, W, 3] to size (height, width) with an antialiasing filter."""
     if (image.shape[0], image.shape[1]) == size:
