@@ -289,6 +289,7 @@ def test_damaged_checkpoint_falls_back_to_previous(request_: JobSpec) -> None:
     assert "not a readable checkpoint" in warnings[0]
 
 
+@pytest.mark.slow
 def test_unusable_rasterizer_in_checkpoint_is_replanned(request_: JobSpec) -> None:
     """The checkpoint is that of a machine with a GPU."""
     if drawing_problem("triton", "cuda") is None:
@@ -355,7 +356,9 @@ def test_colors_file_matches_the_result(request_: JobSpec, tmp_path: Path) -> No
             assert np.array_equal(colors, exact.numpy().astype(np.float16))
 
 
-@pytest.mark.parametrize("why", ["split", "dropped", "attenuated"])
+@pytest.mark.parametrize(
+    "why", ["split", *(pytest.param(each, marks=pytest.mark.slow) for each in ("dropped", "attenuated"))]
+)
 def test_colors_file_is_omitted_if_more_than_colors_change(tmp_path: Path, why: str) -> None:
     if why == "split":
         request = with_scene(small_request(tmp_path, 1, refine=3.0), large_wall())

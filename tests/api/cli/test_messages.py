@@ -65,7 +65,10 @@ def test_ctrl_c_while_writing_leaves_no_file(command: str, tmp_path: Path, capsy
     assert list(out.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["convert", "usd", "blend", "render", "video", "frames", "study", "plan"])
+@pytest.mark.parametrize(
+    "command",
+    ["convert", "blend", "render", "video", "frames", "study", "plan", pytest.param("usd", marks=pytest.mark.slow)],
+)
 def test_full_disk_is_one_message_and_leaves_no_file(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

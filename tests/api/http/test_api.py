@@ -328,7 +328,7 @@ def test_memory_is_constant_while_receiving_files(
     assert api is not None
     before = api.memory_info().rss
     boundary = "b0undary"
-    size = 300 * MB
+    size = 150 * MB
     block = bytes(MB)
     largest = before
 

@@ -68,7 +68,7 @@ def hanging_folder(folder: Path) -> Iterator[Hanging]:
         yield {}, hang, heal
 
 
-@pytest.mark.parametrize("kind", [pytest.param(hanging_store, marks=pytest.mark.slow), hanging_folder])
+@pytest.mark.parametrize("kind", [hanging_store, hanging_folder])
 def test_hanging_files_delay_only_requests_that_need_them(
     tmp_path: Path, kind: Callable[..., AbstractContextManager[Hanging]]
 ) -> None:

@@ -156,7 +156,8 @@ def at_once(send: Callable[[], httpx2.Response]) -> contextlib.ExitStack:
     return stack
 
 
-@pytest.mark.parametrize("kind", ["killed", pytest.param("stopped", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["killed", "stopped"])
 def test_every_operation_reports_unavailable_database(outage: Outage, files: dict[str, bytes], kind: str) -> None:
     with outage.client() as client, outage.kind(kind), ThreadPoolExecutor(len(operations())) as pool:
         for answer in pool.map(lambda each: request(client, each[0], each[1], outage, files), operations()):

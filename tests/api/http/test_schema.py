@@ -78,7 +78,7 @@ def key(store: Store) -> str:
 
 
 @schemathesis.openapi.from_dict(DOCUMENT).parametrize()
-@settings(max_examples=20, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+@settings(max_examples=8, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
 def test_every_operation_follows_schema(case: schemathesis.Case, service: Service, key: str) -> None:
     """Requests include the examples, limits of every parameter, unsupported methods and random input."""
     case.call_and_validate(

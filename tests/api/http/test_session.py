@@ -307,7 +307,7 @@ def test_parallel_sign_ins_cannot_pass_the_limit(service: Service) -> None:
     assert (statuses.count(401), statuses.count(429)) == (MOST_FAILURES, 60 - MOST_FAILURES)
 
 
-@pytest.mark.parametrize("trusted", ["10.0.0.0/8", "127.0.0.1"])
+@pytest.mark.parametrize("trusted", ["10.0.0.0/8", pytest.param("127.0.0.1", marks=pytest.mark.slow)])
 def test_only_trusted_proxy_sets_client_address(tmp_path: Path, trusted: str) -> None:
     """If any local client were trusted, it could invent an address for each attempt."""
     proxies = {"SGSST_REQUIRE_KEYS": "true", "SGSST_TRUSTED_PROXIES": trusted}

@@ -89,6 +89,7 @@ def test_blends_of_one_key_do_not_delay_another_key(stored: Stored, tmp_path: Pa
     assert order[-1] == "one"
 
 
+@pytest.mark.slow
 def test_parallel_blends_cannot_pass_their_limit(stored: Stored, tmp_path: Path) -> None:
     job = stored.finished("one", tmp_path)
     source = stored.store.jobs.artifact(job.id, RESULT)

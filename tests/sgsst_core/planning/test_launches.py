@@ -75,6 +75,7 @@ def test_launch_cost_without_graph_states_the_problem(
     assert "PyTorch 2.13 or later is needed" in str(launch_cost(planned).problem)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("capability", "chosen"), [((7, 5), "float32"), ((8, 0), "bfloat16")])
 def test_bfloat16_is_not_used_if_it_is_emulated(
     counts: Counts,
@@ -93,6 +94,7 @@ def test_bfloat16_is_not_used_if_it_is_emulated(
     assert stylizer.job.plan.precision == chosen
 
 
+@pytest.mark.slow
 def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_weights: BackboneWeights) -> None:
     for steps in (LEAST_GRAPH_VISITS, LEAST_GRAPH_VISITS - 1):
         settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16, position_weights="off")

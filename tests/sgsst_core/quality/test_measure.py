@@ -116,6 +116,7 @@ def test_initial_quality_is_measured_after_the_first_step(tiny_weights: Backbone
     assert before.measured[0]["novel_views"] == late.measured[0]["novel_views"]
 
 
+@pytest.mark.slow
 def test_interrupted_job_is_measured_at_its_start_and_end(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, level=2)  # moments 0, 1, 4 and 16
     asked = iter([True])
@@ -145,6 +146,7 @@ def test_measuring_can_be_disabled_and_does_not_change_colors(tiny_weights: Back
         assert torch.equal(nothing.stylized(), other.stylized())
 
 
+@pytest.mark.slow
 def test_resumed_job_keeps_its_moments(tiny_weights: BackboneWeights) -> None:
     """A new plan or other measured costs do not change the number of measurements that was decided initially."""
     for prediction, steps in ((LONG, [0, 1, 2, 4, 8, 16]), (EXPENSIVE, [0, 16])):

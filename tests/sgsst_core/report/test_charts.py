@@ -45,6 +45,7 @@ def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_charts_need_no_home_folder(tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("MPL", "XDG_", "HOME"))}
     environment |= {"TMPDIR": str(tmp_path), "HOME": "/proc/absent"}

@@ -81,6 +81,7 @@ def test_missing_scales_are_refused_before_the_survey(tiny_weights: BackboneWeig
         make(tiny_weights, scales=(1.0, 0.0, 0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_runs_are_bit_identical_and_reduce_the_loss(tiny_weights: BackboneWeights) -> None:
     first, second = (make(tiny_weights, steps_sos=30, scales=(0.0, 1.0, 2.0), early_stop=False) for _ in range(2))
     start = mean_loss(first.start(), first.job.loss.weights)
