@@ -19,7 +19,7 @@ Services = Callable[..., Service]
 KEYED = {"SGSST_REQUIRE_KEYS": "true", "SGSST_TRUSTED_PROXIES": ""}
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def services(tmp_path_factory: pytest.TempPathFactory, tiny_cache: Path) -> Iterator[Services]:
     """Yield a function that returns the running service with some settings; the first call starts it.
 
@@ -52,8 +52,9 @@ def whole_service(services: Services) -> Iterator[Service]:
     yield running
     with running.client() as client:
         for job in client.get("/v1/jobs", params={"limit": 200}).json()["jobs"]:
-            client.post(f"{job['links']['self']}/cancel")  # refused if it has ended
-            wait_for(lambda url=job["links"]["self"]: client.delete(url).status_code == 204, "the job to end")
+            url = job["links"]["self"]
+            client.post(f"{url}/cancel")  # refused if it has ended
+            wait_for(lambda: client.delete(url).status_code == 204, "the job to end")  # noqa: B023 (called at once)
 
 
 @pytest.fixture(scope="module")
