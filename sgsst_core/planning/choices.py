@@ -9,11 +9,12 @@ from dataclasses import replace
 from sgsst_core.budget import memory_for
 from sgsst_core.decision import ANOTHER_LOSS, VIEWS, Decision
 from sgsst_core.loss.convergence import MIN_FALL, window_length
+from sgsst_core.loss.graphs import FIRST_VISITS
 from sgsst_core.loss.nearest import MAX_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.number_format import duration
-from sgsst_core.planning.context import LEAST_VISITS, Facts, LaunchCost, NetworkPixels, precision_of
+from sgsst_core.planning.context import LEAST_VISITS, Facts, NetworkPixels, Saving, precision_of
 from sgsst_core.planning.measurement_choice import LOSS_VIEWS
 from sgsst_core.planning.plan import Plan
 from sgsst_core.rasterizer import RASTERIZERS
@@ -102,7 +103,7 @@ def considers_graphs(plan: Plan, facts: Facts, settings: Settings) -> bool:
     return plan.device == "cuda" and often and not _divides_views(facts, settings)
 
 
-def uses_graphs(plan: Plan, facts: Facts, settings: Settings, cost: LaunchCost | None) -> bool:
+def uses_graphs(plan: Plan, facts: Facts, settings: Settings, cost: Saving | None) -> bool:
     """Choose whether the loss of a view is captured as a CUDA graph, one per image size and phase.
 
     Args:
@@ -114,7 +115,7 @@ def uses_graphs(plan: Plan, facts: Facts, settings: Settings, cost: LaunchCost |
     if cost is None or cost.least_visits is None:
         return False
     phases = bool(plan.steps_coarse) + bool(settings.steps_sos)
-    return _visits_of_a_size(plan, facts, settings) >= phases * cost.least_visits
+    return _visits_of_a_size(plan, facts, settings) >= phases * (FIRST_VISITS + cost.least_visits)
 
 
 def choose_ranks(seconds: Mapping[int, float]) -> int:
@@ -156,8 +157,8 @@ def _blend_weights(plan: Plan, facts: Facts, settings: Settings) -> tuple[Cached
     of_a_view = size / len(plan.covered)
     portion = "all" if size <= budget else f"{budget // of_a_view * of_a_view / size:.0%} of the views'"
     reason = f"they take {size / 1e9:.2f} GB for all views; {budget / 1e9:.1f} GB are available for blend weights"
-    if RASTERIZERS[facts.rasterizer].on_gpu and cost.cached_seconds is not None:
-        reason += f"; {cost.text}"
+    if cost.saving.problem is None:
+        reason += f"; {cost.saving.text('cached', 'recomputed')}"
     return cached, Decision(item, f"{portion} cached in {name}", reason, error=error)
 
 
@@ -173,13 +174,12 @@ def _why_not_cached(plan: Plan, facts: Facts, settings: Settings) -> str | None:
         return None
     if not RASTERIZERS[facts.rasterizer].on_gpu:
         return visited if visits < LEAST_VISITS else None
-    if cost.cached_seconds is None:
-        return "the weights of one view do not fit"
-    if cost.least_visits is None:
-        return f"cached weights are not faster here: {cost.text}"
-    if visits < cost.least_visits:
-        return f"{visited}, but caching pays off from {cost.least_visits:.1f} visits; {cost.text}"
-    return None
+    if cost.saving.problem is not None:
+        return cost.saving.problem
+    least, measured = cost.saving.least_visits, cost.saving.text("cached", "recomputed")
+    if least is None:
+        return f"cached weights are not faster here: {measured}"
+    return f"{visited}, but caching pays off from {least:.1f} visits; {measured}" if visits < least else None
 
 
 # --- plan lines ----------------------------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ def decisions(
     settings: Settings,
     pixels: NetworkPixels,
     parts: Mapping[str, float],
-    cost: LaunchCost | None,
+    cost: Saving | None,
     seconds: Mapping[int, float],
 ) -> Iterator[Decision]:
     """Yield the decisions of a plan, with their reasons.
@@ -325,7 +325,7 @@ def _about_network(
         yield Decision("second forward", none, f"they fit in {memory}", seconds=forward)
 
 
-def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings, cost: LaunchCost | None) -> Iterator[Decision]:
+def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings, cost: Saving | None) -> Iterator[Decision]:
     """Yield the decisions about the rasterizer and kernel launches on a GPU; on the CPU there is no choice."""
     if plan.device != "cuda":
         return
@@ -339,9 +339,12 @@ def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings, cost: Launch
         reasons.append(f"{used.title} works here")
     yield Decision("rasterizer", how, "; ".join(reasons) or "requested")
     visited = f"views of one size are visited about {_visits_of_a_size(plan, facts, settings):,} times"
+    measured = ""
+    if cost is not None:
+        measured = f"{cost.text('as a graph', 'kernel by kernel')}, {1e3 * cost.once:.3g} ms to capture"
     if plan.graphs and cost is not None:
         graph = "the loss of a view is captured as a CUDA graph"
-        yield Decision("launches", graph, f"{cost.text}; {visited}", seconds=cost.saved)
+        yield Decision("launches", graph, f"{measured}; {visited}", seconds=cost.saved)
         return
     if _divides_views(facts, settings):
         reason = "a graph cannot contain communication between workers"
@@ -350,9 +353,10 @@ def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings, cost: Launch
     elif cost.problem is not None:
         reason = f"CUDA graphs are unavailable: {cost.problem}"
     elif cost.least_visits is None:
-        reason = f"a graph saves hardly any time: {cost.text}"
+        reason = f"a graph saves hardly any time: {measured}"
     else:
-        reason = f"{visited}, but one graph per phase pays off from {cost.least_visits:.1f} visits; {cost.text}"
+        least = FIRST_VISITS + cost.least_visits
+        reason = f"{visited}, but one graph per phase pays off from {least:.1f} visits; {measured}"
     yield Decision("launches", "kernel by kernel", reason)
 
 

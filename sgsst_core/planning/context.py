@@ -22,7 +22,6 @@ from sgsst_core.features.vgg import (
     use_whole_float32,
 )
 from sgsst_core.loss.gradient_error import Difference
-from sgsst_core.loss.graphs import FIRST_VISITS
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.loss.tiling import Tiling
@@ -55,77 +54,55 @@ _SAMPLED_VIEWS = 3
 #: Minimum visits of a view for which caching its blend weights pays off on a CPU. Computing them takes as long as about
 #: three renders with gradient, and each use saves two thirds of a render. On GPUs, both times are measured.
 LEAST_VISITS = 5
-#: Minimum fraction of the time of a view's loss that a CUDA graph must save to be worth its memory.
+#: Minimum fraction of a visit's time that cached weights or a CUDA graph must save to be worth their memory.
 LEAST_SAVING = 0.03
 
 
 @dataclass(frozen=True)
-class WeightCost:
-    """Cost of caching the views' blend weights. Times are measured on a GPU only.
+class Saving:
+    """Measured time that something saves at each visit of a view: cached blend weights, or a CUDA graph of its loss.
 
     Attributes:
-        bytes: Size in bytes of the cached weights of all views, float32; None if the rasterizer cannot cache them.
-        half_bytes: Size in bytes of the cached weights of all views in half precision; None as for `bytes`.
-        seconds: Time in seconds of a view's render and gradient with recomputed weights.
-        cached_seconds: Time in seconds of a view's render and gradient with cached weights; None if the weights of a
-            view do not fit in memory.
-        caching_seconds: Time in seconds to compute a view's cached weights.
+        without: Seconds of a visit without it.
+        seconds: Seconds of a visit with it.
+        once: Seconds to compute it.
+        problem: Reason why it cannot be used and nothing was measured; None if it can.
     """
 
-    bytes: int | None = None
-    half_bytes: int | None = None
+    without: float = 0.0
     seconds: float = 0.0
-    cached_seconds: float | None = None
-    caching_seconds: float = 0.0
-
-    @property
-    def least_visits(self) -> float | None:
-        """Minimum visits of a view for which cached weights save time; None if they never do, or if not measured."""
-        if self.cached_seconds is None or self.cached_seconds >= self.seconds:
-            return None
-        return self.caching_seconds / (self.seconds - self.cached_seconds)
-
-    @property
-    def text(self) -> str:
-        """The measured times, for the plan."""
-        cached, recomputed = 1e3 * (self.cached_seconds or 0), 1e3 * self.seconds
-        return f"measured per view: {cached:.3g} ms cached, {recomputed:.3g} ms recomputed"
-
-
-@dataclass(frozen=True)
-class LaunchCost:
-    """Time for a view's loss and its gradient, with and without a CUDA graph.
-
-    Attributes:
-        seconds: Seconds with kernels launched one by one.
-        replayed: Seconds as a graph.
-        capture: Seconds to capture the graph, once.
-        problem: Reason why a graph cannot be used and nothing was measured; None if it can.
-    """
-
-    seconds: float = 0.0
-    replayed: float = 0.0
-    capture: float = 0.0
+    once: float = 0.0
     problem: str | None = None
 
     @property
     def saved(self) -> float:
-        """Seconds that a graph saves per visit; 0 if too few to matter."""
-        saved = self.seconds - self.replayed
-        return saved if self.problem is None and saved > LEAST_SAVING * self.seconds else 0.0
+        """Seconds saved per visit; 0 if too few to matter."""
+        saved = self.without - self.seconds
+        return saved if self.problem is None and saved > LEAST_SAVING * self.without else 0.0
 
     @property
     def least_visits(self) -> float | None:
-        """Minimum visits of views that share a graph for which it saves time; None if it never does."""
-        return FIRST_VISITS + self.capture / self.saved if self.saved else None
+        """Minimum visits for which it saves time; None if it never does."""
+        return self.once / self.saved if self.saved else None
 
-    @property
-    def text(self) -> str:
-        """The measured times, for the plan."""
-        return (
-            f"measured per view: {1e3 * self.replayed:.3g} ms as a graph, {1e3 * self.seconds:.3g} ms kernel by "
-            f"kernel, {1e3 * self.capture:.3g} ms to capture"
-        )
+    def text(self, used: str, unused: str) -> str:
+        """Return the times as text, given descriptions of a visit with it and without it."""
+        return f"measured per view: {1e3 * self.seconds:.3g} ms {used}, {1e3 * self.without:.3g} ms {unused}"
+
+
+@dataclass(frozen=True)
+class WeightCost:
+    """Cost of caching the views' blend weights.
+
+    Attributes:
+        bytes: Size in bytes of the cached weights of all views, float32; None if the rasterizer cannot cache them.
+        half_bytes: Size in bytes of the cached weights of all views in half precision; None as for `bytes`.
+        saving: Time that cached weights save; measured on a GPU only.
+    """
+
+    bytes: int | None = None
+    half_bytes: int | None = None
+    saving: Saving = Saving(problem="the weights of one view do not fit")
 
 
 @dataclass(frozen=True)
@@ -257,7 +234,7 @@ def weight_cost(rasterizer: Rasterizer, cameras: Sequence[Camera], settings: Set
         recomputed, applied = (each.step_seconds(middle, visits=2)[1] for each in (rasterizer, cached))
     except torch.OutOfMemoryError:
         return WeightCost(total, half)
-    return WeightCost(total, half, recomputed, applied, caching)
+    return WeightCost(total, half, Saving(recomputed, applied, caching))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from sgsst_core.budget import measuring_memory, memory_for, peak_memory
 from sgsst_core.decision import Decision
 from sgsst_core.number_format import duration
 from sgsst_core.planning import choices
-from sgsst_core.planning.context import Facts, LaunchCost, NetworkPixels
+from sgsst_core.planning.context import Facts, NetworkPixels, Saving
 from sgsst_core.planning.measurement_choice import (
     LEAST_ALLOWED,
     LEVELS,
@@ -63,7 +63,7 @@ def completed_plan(
     settings: Settings,
     pixels: NetworkPixels,
     trials: Mapping[int, Trial],
-    cost: LaunchCost | None,
+    cost: Saving | None,
 ) -> Plan:
     """Choose ranks, graphs and measurements from the trials of a plan, predict its cost, and list its decisions.
 
@@ -96,7 +96,7 @@ def completed_plan(
     return replace(plan, decisions=(*lines, *([_about_measuring(plan, settings)] if plan.measured else [])))
 
 
-def _predicted_steps(plan: Plan, facts: Facts, settings: Settings, trial: Trial, cost: LaunchCost | None) -> Prediction:
+def _predicted_steps(plan: Plan, facts: Facts, settings: Settings, trial: Trial, cost: Saving | None) -> Prediction:
     """Return the prediction for the steps, with first visits and style; those of the trial have been made already."""
     views = len(plan.covered)
     saved = settings.views_per_step * cost.saved if cost and plan.graphs else 0.0

@@ -18,7 +18,7 @@ import torch
 
 from sgsst_core.budget import device_peak, memory_for
 from sgsst_core.loss.graphs import LossGraphs, graphs_problem
-from sgsst_core.planning.context import LaunchCost, NetworkPixels
+from sgsst_core.planning.context import NetworkPixels, Saving
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.stylizing.job import StylizationJob, with_second_attempt
 from sgsst_core.stylizing.optimizer import ColorOptimizer
@@ -273,11 +273,11 @@ def _resident() -> int:
     return int(psutil.Process().memory_info().rss)
 
 
-def launch_cost(job: StylizationJob) -> LaunchCost:
+def launch_cost(job: StylizationJob) -> Saving:
     """Time the loss of a job's first view on a GPU, with its gradient, with and without a graph."""
     problem = graphs_problem(job.network.device)
     if problem is not None:
-        return LaunchCost(problem=problem)
+        return Saving(problem=problem)
     index, graphs = job.views.covered[0], LossGraphs(job.loss)
     scales, style = job.scales(index), job.style_targets(job.views.cameras[index])
     target, image = job.view_targets.target(index, scales), job.views.unstylized(index)
@@ -293,12 +293,12 @@ def launch_cost(job: StylizationJob) -> LaunchCost:
         eager = min(seconds(job.loss.evaluate) for _ in range(_REPETITIONS))
         first = seconds(graphs.evaluate)
         if graphs.problem is not None:
-            return LaunchCost(problem=graphs.problem)
+            return Saving(problem=graphs.problem)
         if not graphs.captured:
-            return LaunchCost(problem="a view's activations do not fit the memory twice")
+            return Saving(problem="a view's activations do not fit the memory twice")
         replayed = min(seconds(graphs.evaluate) for _ in range(_REPETITIONS))
     except torch.OutOfMemoryError:
-        return LaunchCost(problem="the GPU's memory was not enough to evaluate the first view")
+        return Saving(problem="the GPU's memory was not enough to evaluate the first view")
     finally:
         graphs.clear()
-    return LaunchCost(eager, replayed, max(first - replayed, 0.0))
+    return Saving(eager, replayed, max(first - replayed, 0.0))

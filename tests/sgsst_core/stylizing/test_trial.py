@@ -12,7 +12,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.planning.choices import OPTIMIZER_BYTES, draft_plan
-from sgsst_core.planning.context import Facts, LaunchCost, Machine, NetworkPixels, WeightCost
+from sgsst_core.planning.context import Facts, Machine, NetworkPixels, Saving, WeightCost
 from sgsst_core.planning.measurement_choice import LEAST_ALLOWED
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
@@ -95,9 +95,7 @@ def facts(**changes: Any) -> Facts:
     return replace(known, **changes)
 
 
-def plan_of(
-    known: Facts, trials: dict[int, Trial] | None = None, cost: LaunchCost | None = None, **values: Any
-) -> Plan:
+def plan_of(known: Facts, trials: dict[int, Trial] | None = None, cost: Saving | None = None, **values: Any) -> Plan:
     settings = make_settings(**{"steps_coarse": 40, "steps_sos": 40, "coarsest_side": 300, **values})
     draft = draft_plan(known, settings, measured=True)
     return completed_plan(draft, known, settings, NetworkPixels(1e6, 0.0, 1e6, 1), trials or {1: TRIAL}, cost)
@@ -180,7 +178,7 @@ def test_job_without_steps_uses_one_rank() -> None:
 
 def test_graphs_are_used_if_they_save_time() -> None:
     gpu = facts(machine=Machine("cuda", 10 * GIGABYTE))
-    for cost, used in ((LaunchCost(1.0, 0.5, 1.0), True), (LaunchCost(1.0, 0.99), False), (None, False)):
+    for cost, used in ((Saving(1.0, 0.5, 1.0), True), (Saving(1.0, 0.99), False), (None, False)):
         plan = plan_of(gpu, {1: replace(TRIAL, device=GIGABYTE)}, cost)
         assert plan.graphs is used
         assert text_of(plan, "launches").startswith("kernel by kernel") is not used
