@@ -52,12 +52,8 @@ class VideoRequest:
     @property
     def along_cameras(self) -> bool:
         """Return whether the path leads through cameras rather than around the scene."""
-        return along_cameras(self.options, self.source)
-
-
-def along_cameras(options: VideoOptions, source: SceneRequest) -> bool:
-    """Return whether the path of a video leads through cameras rather than around the scene."""
-    return options.path == "cameras" or (options.path == "auto" and source.cameras is not None)
+        path = self.options.path
+        return path == "cameras" or (path == "auto" and self.source.cameras is not None)
 
 
 def check_video_request(request: VideoRequest) -> None:

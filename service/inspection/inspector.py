@@ -340,12 +340,12 @@ def stored_plan(
 
 
 def _store_plan(file: Path, target: Path) -> None:
-    """Move a plan to its place, and delete the oldest ones."""
-    target.parent.mkdir(exist_ok=True)
-    file.replace(target)
-    plans = sorted(target.parent.iterdir(), key=lambda path: path.stat().st_mtime)
-    for old in plans[:-_MAX_PLANS]:
-        old.unlink(missing_ok=True)
+    """Move a plan to its place, and delete the oldest ones; a job whose plan is missing plans again."""
+    with contextlib.suppress(OSError):  # another process may delete the same ones
+        target.parent.mkdir(exist_ok=True)
+        file.replace(target)
+        for old in sorted(target.parent.iterdir(), key=lambda path: path.stat().st_mtime)[:-_MAX_PLANS]:
+            old.unlink()
 
 
 def _size(inputs: Sequence[Mapping[str, Any]]) -> int:

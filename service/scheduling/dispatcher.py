@@ -103,7 +103,10 @@ class Dispatcher:
             if not attempt.alive:
                 del self._running[job_id]
         self._lease_keeper.update()
-        self._announce_alive()
+        if time.monotonic() - self._announced_at >= RENEW_FRACTION * self._settings.lease_seconds:
+            free = self._capacity.free([attempt.grant for attempt in self._running.values()])
+            self._store.operations.record_heartbeat(self.name, self._capacity.size, free)
+            self._announced_at = time.monotonic()
         try:
             check_weights()
         except DamagedWeightsError:
@@ -117,13 +120,6 @@ class Dispatcher:
             attempt = RunningAttempt(lease, grant, folder, self._settings, self._store, self._artifacts, self._stager)
             self._running[lease.job_id] = attempt
             attempt.start()
-
-    def _announce_alive(self) -> None:
-        """Send a heartbeat if it is due."""
-        if time.monotonic() - self._announced_at >= RENEW_FRACTION * self._settings.lease_seconds:
-            free = self._capacity.free([attempt.grant for attempt in self._running.values()])
-            self._store.operations.record_heartbeat(self.name, self._capacity.size, free)
-            self._announced_at = time.monotonic()
 
     def _shut_down(self) -> None:
         _log.info("dispatcher stopping: running_jobs=%d", len(self._running))

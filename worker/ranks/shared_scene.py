@@ -166,23 +166,16 @@ def _check_memory(path: Path, collectives: Collectives, sharing: int, growth: fl
     """
     problem: SgsstError | None = None
     try:
-        problem = _lack(collectives.rank, sharing, *(int(size * growth) for size in _size_by_header(path, growth)))
+        header = read_scene_header(path)
+        rest = 3 * header.coefficients
+        held = 0 if stays_in_file(header, _held_bytes(growth)) else rest  # in memory
+        sizes = header.count, header.count * 4 * (14 + held), header.count * 4 * (14 + rest)
+        problem = _lack(collectives.rank, sharing, *(int(size * growth) for size in sizes))
     except SgsstError as error:
         problem = error
     for raised in collectives.all_gather(problem):
         if raised is not None:
             raise raised
-
-
-def _size_by_header(path: Path, growth: float) -> tuple[int, int, int]:
-    """Return the number of Gaussians that a file declares, and their bytes in memory and on a GPU.
-
-    The bytes in memory exclude spherical harmonics that stay in the file.
-    """
-    header = read_scene_header(path)
-    rest = 3 * header.coefficients
-    held = 0 if stays_in_file(header, _held_bytes(growth)) else rest
-    return header.count, header.count * 4 * (14 + held), header.count * 4 * (14 + rest)
 
 
 def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: int) -> SceneTooLargeError | None:
