@@ -14,8 +14,8 @@ LARGEST_GROWTH = 1 << 30
 
 
 def parameters(cases: Sequence[Case | str]) -> list[Any]:
-    """Return all cases as parameters of a test; three of four are for the slow tests."""
-    return [case if place % 4 == 0 else pytest.param(case, marks=pytest.mark.slow) for place, case in enumerate(cases)]
+    """Return all cases as parameters of a test; five of six are for the slow tests."""
+    return [case if place % 6 == 0 else pytest.param(case, marks=pytest.mark.slow) for place, case in enumerate(cases)]
 
 
 def check(case: Case) -> None:
