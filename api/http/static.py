@@ -112,8 +112,6 @@ def _filled_modules() -> dict[str, tuple[bytes, object]]:
             "name": each.name,
             "suffix": each.suffix,
             "title": each.title,
-            "shown": each.shown,
-            "magic": list(each.magic),
             "result": each in RESULT_FORMATS,
         }
         for each in FORMATS

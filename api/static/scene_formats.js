@@ -6,8 +6,6 @@
  * @property {string} name name in requests
  * @property {string} suffix file name suffix, such as ".compressed.ply"
  * @property {string} title
- * @property {boolean} shown whether the viewer reads the format
- * @property {number[]} magic first bytes of a file that the viewer does not read; empty if they vary
  * @property {boolean} result whether results can be downloaded in this format
  */
 
@@ -31,13 +29,4 @@ export const accepted = [...new Set(sceneFormats.map(({ suffix }) => suffix.slic
 export function sceneSuffix(name) {
   const fitting = sceneFormats.map(({ suffix }) => suffix).filter((suffix) => name.toLowerCase().endsWith(suffix));
   return fitting.reduce((longest, suffix) => (suffix.length > longest.length ? suffix : longest), "");
-}
-
-/**
- * Return the format of a file that the service reads but the viewer does not.
- *
- * @param {Uint8Array} start first bytes of the file
- */
-export function notShown(start) {
-  return sceneFormats.find(({ shown, magic }) => !shown && magic.length && magic.every((byte, i) => byte === start[i]));
 }

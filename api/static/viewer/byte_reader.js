@@ -58,6 +58,20 @@ export class ByteReader {
   }
 
   /**
+   * Take all remaining bytes.
+   *
+   * @returns {Promise<Uint8Array<ArrayBuffer>>}
+   */
+  async all() {
+    const parts = [this.rest];
+    for (;;) {
+      const { value, done } = await this.reader.read();
+      if (done) return new Uint8Array(await new Blob(/** @type {BlobPart[]} */ (parts)).arrayBuffer());
+      parts.push(value);
+    }
+  }
+
+  /**
    * Return a reader of the remaining bytes, piped through another stream.
    *
    * @param {ReadableWritablePair<Uint8Array, any>} through

@@ -15,14 +15,14 @@ import { words } from "../words.js";
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
-const SH_C0 = 0.28209479177387814;
+export const SH_C0 = 0.28209479177387814;
 const NAMES = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
 export const OPACITY = 3, SCALES = 4, ROTATION = 7, COLOR = 11, HARMONICS = NAMES.length;
 /**
  * Logits of opacities in steps of 1/255. Opacities of exactly 0 and 1 have no finite logit; they are read as 0.25/255
  * and 1 - 0.25/255.
  */
-const LOGITS = Float32Array.from({ length: 256 }, (_, i) => {
+export const LOGITS = Float32Array.from({ length: 256 }, (_, i) => {
   const share = Math.min(Math.max(i / 255, 0.25 / 255), 1 - 0.25 / 255);
   return Math.log(share / (1 - share));
 });
@@ -59,7 +59,7 @@ export function unpacked(count, degree, unpack, rendering = CLASSIC) {
  * @param {number[]} three the other components
  * @param {number} [turn] cyclic shift of the components
  */
-function setRotation(row, o, largest, three, turn = 0) {
+export function setRotation(row, o, largest, three, turn = 0) {
   const [a, b, c] = three;
   OTHERS[largest].forEach((part, i) => { row[o + ((part + turn) & 3)] = three[i]; });
   row[o + ((largest + turn) & 3)] = Math.sqrt(Math.max(0, 1 - a * a - b * b - c * c));
@@ -276,7 +276,7 @@ function unpackSpz([positions, opacities, colors, scales, rotations], i, version
 }
 
 /** @param {number} half bits of a half */
-function fromHalf(half) {
+export function fromHalf(half) {
   const sign = half & 0x8000 ? -1 : 1, exponent = (half >> 10) & 31, fraction = half & 1023;
   if (exponent === 31) return fraction ? NaN : sign * Infinity;
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024));

@@ -4,9 +4,10 @@
  */
 import { ByteReader, SceneError } from "./byte_reader.js";
 import { glb } from "./glb.js";
+import { isKsplat, ksplat } from "./ksplat.js";
 import { compressedPly, isSplat, splat, spz, spz4 } from "./packed.js";
-import { notShown } from "../scene_formats.js";
 import { checkLength, plainPly, readHeader } from "./ply.js";
+import { sog } from "./sog.js";
 import { words } from "../words.js";
 
 /**
@@ -35,8 +36,8 @@ export async function openScene(reader, size) {
   if (start[0] === 0x1f && start[1] === 0x8b) return spz(reader.piped(/** @type {any} */ (new DecompressionStream("gzip"))));
   if (magic === "NGSP") return start[4] < 4 ? spz(reader) : spz4(reader);
   if (magic === "glTF") return glb(reader);
-  const other = notShown(start);
-  if (other) throw new SceneError(words.scene.notShown(other.title));
+  if (magic === "PK\x03\x04") return sog(reader);
+  if (isKsplat(start)) return ksplat(reader);
   if (isSplat(start, size)) return splat(reader, size);
   throw new SceneError(words.scene.notScene);
 }

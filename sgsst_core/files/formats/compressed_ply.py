@@ -245,4 +245,4 @@ def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[Any]:
     return packed
 
 
-COMPRESSED_PLY = SceneFormat("compressed.ply", "compressed PLY", 61, _matches, _read_header, _read, _write, shown=True)
+COMPRESSED_PLY = SceneFormat("compressed.ply", "compressed PLY", 61, _matches, _read_header, _read, _write)

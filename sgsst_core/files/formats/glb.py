@@ -441,4 +441,4 @@ def _matches(start: FileStart) -> bool:
     return start.head.startswith(_MAGIC)
 
 
-GLB = SceneFormat("glb", "GLB", 240, _matches, _read_header, _read, _write, shown=True, media_type="model/gltf-binary")
+GLB = SceneFormat("glb", "GLB", 240, _matches, _read_header, _read, _write, media_type="model/gltf-binary")

@@ -202,4 +202,4 @@ def _harmonics(values: NDArray[np.generic], header: KsplatHeader, section: Kspla
     return np.concatenate(bands, axis=1)
 
 
-KSPLAT = SceneFormat("ksplat", ".ksplat", 44, _matches, _read_header, _read, magic=_MAGIC)
+KSPLAT = SceneFormat("ksplat", ".ksplat", 44, _matches, _read_header, _read)

@@ -153,4 +153,4 @@ def _matches(start: FileStart) -> bool:
     return start.head.startswith(b"ply") and not COMPRESSED_PLY.matches(start)
 
 
-PLY = SceneFormat("ply", "PLY", 248, _matches, _read_header, write=_write, shown=True)
+PLY = SceneFormat("ply", "PLY", 248, _matches, _read_header, write=_write)

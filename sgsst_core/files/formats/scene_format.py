@@ -115,8 +115,6 @@ class SceneFormat:
             for non-finite values. None for PLY, which `scene_file` reads, because its other data is written back.
         write: Writer of a scene's arrays and its render mode, if the format can state one. It raises an OutputError
             without path if it cannot represent the arrays. None if the format is only read.
-        shown: Whether the page shows scenes of this format (`api/static/viewer`).
-        magic: First bytes of all files of a format that the page detects but cannot show.
         media_type: Media type of downloads.
     """
 
@@ -127,8 +125,6 @@ class SceneFormat:
     read_header: Callable[[FileStart], SceneHeader]
     read: Callable[[OpenScene, SceneHeader, Arrays], tuple[str, ...] | None] | None = None
     write: Callable[[BinaryIO, Arrays, Rendering], None] | None = None
-    shown: bool = False
-    magic: bytes = b""
     media_type: str = "application/octet-stream"
 
     @property

@@ -432,4 +432,4 @@ def _webp(pixels: NDArray[np.uint8], width: int) -> bytes:
     return file.getvalue()
 
 
-SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write, magic=_ZIP_MAGIC)
+SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write)

@@ -50,4 +50,4 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
         into["quats"][block] = (rows["rotation"].astype(np.float64) - 128) / 128
 
 
-SPLAT = SceneFormat("splat", ".splat", 32, _matches, _read_header, _read, shown=True)
+SPLAT = SceneFormat("splat", ".splat", 32, _matches, _read_header, _read)

@@ -519,5 +519,5 @@ def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-SPZ = SceneFormat("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write, shown=True)
-SPZ_3 = SceneFormat("v3.spz", "SPZ 3", 25, _is_old_version, _old_header, _read, _write_version_3, shown=True)
+SPZ = SceneFormat("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write)
+SPZ_3 = SceneFormat("v3.spz", "SPZ 3", 25, _is_old_version, _old_header, _read, _write_version_3)

@@ -27,6 +27,7 @@ from sgsst_core.scene.rendering import Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.page.browser import Watched, decoded, psnr, rendered, serve_files, view_script
 from tests.real_scenes import scene_path
+from tests.sgsst_core.files.formats.samples import ksplat
 from tests.sgsst_core.files.test_filtered_and_flat_scenes import with_filter, without_thickness
 from tests.small_scenes import cameras, wall, write_files
 
@@ -77,6 +78,11 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
         ("v3.spz", "snowmiku_plush"),
         ("glb", "snowmiku_plush"),
         ("splat", "broche"),
+        ("sog", "snowmiku_plush"),
+        ("sog", "broche"),
+        ("ksplat0", "playbot_synthetic_sh2"),
+        ("ksplat1", "broche"),
+        ("ksplat2", "playbot_synthetic_sh2"),
     ],
 )
 def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path, form: str, name: str) -> None:
@@ -85,6 +91,8 @@ def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path
     ply.unlink()  # the browser and `sgsst render` read only the compressed scene, whose name is no hint
     if form == "splat":
         ply.write_bytes(splat_bytes(scene))
+    elif form.startswith("ksplat"):
+        ply.write_bytes(ksplat(scene, int(form[-1])))
     else:
         write_scene(tmp_path / f"scene.{form}", scene, by_name(form))
         (tmp_path / f"scene.{form}").rename(ply)
@@ -96,7 +104,7 @@ def test_packed_scenes_are_shown(visit: Visit, shared_data: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("eps2d", [0.3, 0.1])
-@pytest.mark.parametrize("form", ["ply", "compressed.ply", "spz", "v3.spz", "glb"])
+@pytest.mark.parametrize("form", ["ply", "compressed.ply", "spz", "v3.spz", "glb", "sog"])
 def test_antialiased_scenes_are_shown_as_such(visit: Visit, tmp_path: Path, form: str, eps2d: float) -> None:
     scene = replace(dust(), rendering=Rendering("antialiased", eps2d))
     ply, _, _ = write_files(tmp_path, scene, cameras(2, 120, 90))

@@ -1,0 +1,136 @@
+// @ts-check
+/**
+ * Reader of PlayCanvas' SOG, a ZIP archive of WebP images, as `sgsst_core/files/formats/sog.py` describes it.
+ *
+ * Pixel i of each image belongs to Gaussian i. Images are decoded by the browser and read back from a texture, because
+ * a canvas would round the colors of transparent pixels.
+ */
+import { SceneError } from "./byte_reader.js";
+import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, setRotation, unpacked } from "./packed.js";
+import { extrasRendering } from "./render_tag.js";
+import { unzipped } from "./zip.js";
+import { words } from "../words.js";
+
+/** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
+/** @typedef {import("./scene_file.js").SceneFile} SceneFile */
+
+/** SH coefficients per color channel by the width of the palette's image, which has 64 vectors in a row. */
+const COEFFICIENTS = /** @type {Record<number, number>} */ ({ 192: 3, 512: 8, 960: 15 });
+/** Alpha of the rotations' image for w as the largest component; x, y and z follow. */
+const FIRST_TAG = 252;
+const MAX_PALETTE_PIXELS = 65536 * 15;
+
+/**
+ * @param {ByteReader} reader
+ * @returns {Promise<SceneFile>}
+ */
+export async function sog(reader) {
+  const files = await unzipped(await reader.all()), meta = files.get("meta.json");
+  if (!meta) throw new SceneError(words.scene.notScene);
+  try {
+    return await sogScene(files, JSON.parse(new TextDecoder().decode(await meta())));
+  } catch (error) {
+    throw error instanceof SceneError ? error : new SceneError(words.scene.unreadable); // values are missing or wrong
+  }
+}
+
+/**
+ * @param {import("./zip.js").Files} files
+ * @param {any} meta
+ * @returns {Promise<SceneFile>}
+ */
+async function sogScene(files, meta) {
+  const { version = 1, means, scales, quats, sh0, shN } = meta, table = version === 2 ? codebook : steps;
+  if (version !== 1 && version !== 2) throw new SceneError(words.scene.newSog);
+  const count = version === 2 ? meta.count : means.shape[0];
+  if (!(Number.isInteger(count) && count > 0)) throw new SceneError(words.scene.notGaussians);
+  const image = async (/** @type {any} */ entry, index = 0) => (await decoded(files, entry.files[index], count, 2 * count + 65536)).bytes;
+  const palette = shN && await decoded(files, shN.files[0], 1, MAX_PALETTE_PIXELS);
+  const coefficients = palette ? COEFFICIENTS[palette.width] : 0;
+  if (coefficients === undefined) throw new SceneError(words.scene.unreadable);
+  const [low, high] = [means.mins, means.maxs].map((side) => Float64Array.from(side));
+  const scaleOf = table(scales, 3), colorOf = table(sh0, 4), harmonicOf = shN && table(shN, 1);
+  const opacityOf = version === 2 ? LOGITS : colorOf[3];
+  const all = async () => ({
+    lows: await image(means), highs: await image(means, 1), scale: await image(scales), rotation: await image(quats),
+    color: await image(sh0), label: shN ? await image(shN, 1) : new Uint8Array(0),
+  });
+  /** @type {Awaited<ReturnType<typeof all>> | null} */
+  let read = null;
+  return unpacked(count, Math.sqrt(coefficients + 1) - 1, async (begin, into, width, some) => {
+    const { lows, highs, scale, rotation, color, label } = read ??= await all();
+    for (let i = 0, p = 4 * begin, o = 0; i < some; i++, p += 4, o += width) {
+      for (let axis = 0; axis < 3; axis++) {
+        const step = (lows[p + axis] | (highs[p + axis] << 8)) / 65535, value = low[axis] + (high[axis] - low[axis]) * step;
+        into[o + axis] = Math.sign(value) * Math.expm1(Math.abs(value));
+        into[o + SCALES + axis] = scaleOf[axis][scale[p + axis]];
+        into[o + COLOR + axis] = colorOf[axis][color[p + axis]];
+      }
+      into[o + OPACITY] = opacityOf[color[p + 3]];
+      const largest = rotation[p + 3] - FIRST_TAG;
+      if (largest < 0) throw new SceneError(words.scene.unreadable);
+      setRotation(into, o + ROTATION, largest, [0, 1, 2].map((part) => (rotation[p + part] / 255 - 0.5) * Math.SQRT2));
+      for (let n = 0; n < coefficients; n++) {
+        const v = 4 * ((label[p] | (label[p + 1] << 8)) * coefficients + n);
+        if (v >= palette.bytes.length) throw new SceneError(words.scene.unreadable);
+        for (let c = 0; c < 3; c++) into[o + HARMONICS + c * coefficients + n] = harmonicOf[0][palette.bytes[v + c]];
+      }
+    }
+  }, extrasRendering({ ...meta.extras, model: meta.model }));
+}
+
+/**
+ * Return the values of each byte, the same for all channels. Older writers left the first value empty: it is the second
+ * one less the mean step of the others.
+ *
+ * @param {any} entry
+ * @param {number} channels
+ * @returns {Float32Array[]}
+ */
+function codebook({ codebook: values }, channels) {
+  const numbers = Float32Array.from(values), last = numbers.length - 1;
+  if (values[0] === null) numbers[0] = values[1] + (values[1] - values[last]) / 255;
+  return Array(channels).fill(numbers);
+}
+
+/**
+ * Return the values of each byte in version 1, by channel.
+ *
+ * @param {any} entry
+ * @param {number} channels
+ * @returns {Float32Array[]}
+ */
+function steps({ mins, maxs }, channels) {
+  const low = [mins].flat(), high = [maxs].flat();
+  return Array.from({ length: channels }, (_, c) => Float32Array.from({ length: 256 }, (_, i) => low[c] + (high[c] - low[c]) * (i / 255)));
+}
+
+/** @type {WebGL2RenderingContext | null} */
+let context = null;
+
+/**
+ * Decode a lossless WebP image.
+ *
+ * @param {import("./zip.js").Files} files
+ * @param {string} name
+ * @param {number} least minimum number of pixels
+ * @param {number} most maximum number of pixels
+ * @returns {Promise<{width: number, bytes: Uint8Array}>} RGBA
+ */
+async function decoded(files, name, least, most) {
+  const content = await files.get(name)?.();
+  if (!content) throw new SceneError(words.scene.unreadable);
+  const image = await createImageBitmap(new Blob([content]), { premultiplyAlpha: "none", colorSpaceConversion: "none" });
+  const { width, height } = image, gl = context ??= new OffscreenCanvas(1, 1).getContext("webgl2");
+  if (!gl || width * height < least || width * height > most) throw new SceneError(words.scene.unreadable);
+  const texture = gl.createTexture(), frame = gl.createFramebuffer(), bytes = new Uint8Array(4 * width * height);
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+  gl.deleteFramebuffer(frame);
+  gl.deleteTexture(texture);
+  image.close();
+  return { width, bytes };
+}
