@@ -19,7 +19,7 @@ export class SelectPanel {
     this.leaving = new AbortController();
     /** @type {Tool} */
     this.tool = "move";
-    /** @type {"add" | "subtract"} */
+    /** @type {import("./viewer/selector.js").Mode} */
     this.mode = "add";
     /** @type {Selection | null} */
     this.selection = null;
@@ -78,9 +78,10 @@ export class SelectPanel {
     this.parts.apply = button(say.apply, () => this.applyShape());
     this.parts.undo = button(say.undo, () => this.ask("undo"));
     this.parts.redo = button(say.redo, () => this.ask("redo"));
+    this.parts.modeRadios = radios(say.mode, say.modes, (mode) => (this.mode = mode));
     this.parts.toolRadios = radios(say.tool, say.tools, (tool) => this.choose(tool));
     put(this.element = h("section.selecting", { hidden: true }), h("div.row", this.parts.title, this.counted),
-      h("div.row", this.parts.toolRadios, radios(say.mode, say.modes, (mode) => (this.mode = mode))), this.parts.toolHelp,
+      h("div.row", this.parts.toolRadios, this.parts.modeRadios), this.parts.toolHelp,
       h("div.row", this.parts.radius.element, this.parts.through.element, this.parts.tolerance.element, this.parts.connected.element, this.parts.middle, this.parts.numbers, this.parts.apply),
       h("div.row", this.parts.undo, this.parts.redo, button(say.invert, () => this.ask("invert")), button(say.grow, () => this.ask("grow")), button(say.clear, () => this.ask("clear")),
         h("span.spring"), button(say.cancel, () => this.close(null)), button(say.done, () => this.done(), "primary")));
@@ -117,6 +118,7 @@ export class SelectPanel {
     this.selection.ask("load", { bits: mask?.bits ?? new Uint8Array(Math.ceil((scene.header?.count ?? 0) / 8)) });
     put(this.parts.title, say.of(name));
     this.element.hidden = false;
+    this.stage.setHelp(say.help);
     this.choose("brush");
     this.element.scrollIntoView({ block: "nearest" });
     /** @type {HTMLInputElement} */ (this.parts.toolRadios.querySelector("input:checked")).focus();
@@ -140,6 +142,7 @@ export class SelectPanel {
     this.selection = null;
     this.finish = null;
     this.element.hidden = true;
+    this.stage.setHelp();
     finish?.(mask);
   }
 
@@ -202,20 +205,26 @@ export class SelectPanel {
 
   up() {
     if (this.tool === "lasso" && this.drawn.length >= 6) this.ask("lasso", { points: this.inView(this.drawn), ...this.how });
+    if (this.tool === "brush" && this.how.mode === "intersect" && this.drawn.length) this.stroke(this.drawn);
     this.drawn = [];
     this.paint();
   }
 
   /** Apply the brush to a part of a stroke; parts that arrive before the next frame are sent together. @param {number[]} points */
   draw(points) {
-    if (this.tool !== "brush") return;
+    if (this.tool !== "brush" || this.how.mode === "intersect") return; // intersects with the whole stroke at its end
     this.waiting.push(...points);
     this.requested ||= requestAnimationFrame(() => {
-      if (!this.selection) return;
-      const radius = (Number(this.parts.radius.input.value) * this.selection.size[0]) / this.stage.canvas.clientWidth;
-      this.ask("stroke", { points: this.inView(this.waiting), radius, change: this.change, ...this.how });
+      this.stroke(this.waiting);
       [this.waiting, this.requested] = [[], 0];
     });
+  }
+
+  /** @param {number[]} points */
+  stroke(points) {
+    if (!this.selection) return;
+    const radius = (Number(this.parts.radius.input.value) * this.selection.size[0]) / this.stage.canvas.clientWidth;
+    this.ask("stroke", { points: this.inView(points), radius, change: this.change, ...this.how });
   }
 
   /** @param {PointerEvent} event */
@@ -232,8 +241,8 @@ export class SelectPanel {
   }
 
   get how() {
-    const subtracts = (this.mode === "subtract") !== !!this.erasing;
-    return { mode: subtracts ? "subtract" : "add", through: this.parts.through.input.checked };
+    const opposite = this.mode === "subtract" ? "add" : "subtract";
+    return { mode: this.erasing ? opposite : this.mode, through: this.parts.through.input.checked };
   }
 
   /** @param {number[]} at */
@@ -318,14 +327,19 @@ export class SelectPanel {
     }
   }
 
-  /** Undo or redo, except while a text outside of the panel is edited. @param {KeyboardEvent} event */
+  /** Handle the shortcuts of the panel, except while a text is edited. @param {KeyboardEvent} event */
   key(event) {
-    const text = event.target instanceof HTMLInputElement && !["radio", "checkbox", "range"].includes(event.target.type);
-    if (!this.selection || !(event.ctrlKey || event.metaKey) || (text && !this.element.contains(event.target))) return;
-    const key = event.key.toLowerCase(), redo = key === "y" || (key === "z" && event.shiftKey);
-    if (!redo && key !== "z") return;
+    const { target } = event, text = target instanceof HTMLInputElement && !["radio", "checkbox", "range"].includes(target.type);
+    const key = event.key.toLowerCase(), controlled = event.ctrlKey || event.metaKey;
+    if (!this.selection || event.altKey || (text && !(controlled && this.element.contains(target)))) return;
+    const { input } = this.parts.radius;
+    /** @type {Record<string, () => void>} */
+    const actions = controlled
+      ? { y: () => this.ask("redo"), z: () => this.ask(event.shiftKey ? "redo" : "undo"), i: () => this.ask("invert") }
+      : { v: () => this.choose("move"), b: () => this.choose("brush"), l: () => this.choose("lasso"), r: () => this.choose("box"), "[": () => (input.value -= 4), "]": () => (input.value = Number(input.value) + 4) };
+    if (!actions[key]) return;
     event.preventDefault();
-    this.ask(redo ? "redo" : "undo");
+    actions[key]();
   }
 
   /** Keep the handles where the camera shows the shape. */

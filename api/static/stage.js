@@ -53,6 +53,7 @@ export class Stage {
     this.controls = new Controls(this.viewer, { moved: () => this.leaveCamera(), toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home(), hold: (held) => this.hold(held) });
     this.makeTools();
     this.canvas.addEventListener("pointerdown", () => this.leaveCamera());
+    this.divider.addEventListener("wheel", (/** @type {WheelEvent} */ event) => this.controls?.wheel(event), { passive: false });
     this.divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => event.buttons && this.wipeTo(event.clientX));
     this.divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => this.divider.setPointerCapture(event.pointerId));
   }
@@ -63,16 +64,29 @@ export class Stage {
     this.slider = h("input", { type: "range", id: wipeId, min: 0, max: 1000, step: 1, value: 500, oninput: () => this.setWipe(Number(this.slider.value) / 1000) });
     this.wipe = h("div.wipe", { hidden: true }, h("label", { htmlFor: wipeId }, say.wipe), this.slider, button("swap", say.toggle, () => this.toggle()));
     const group = newId(), mode = (/** @type {string} */ name, /** @type {boolean} */ orbit) =>
-      h("label", h("input", { type: "radio", name: group, checked: orbit, onchange: () => this.controls && (this.controls.orbit = orbit) }), h("span", name));
+      h("label", h("input", { type: "radio", name: group, checked: orbit, onchange: () => this.controls && this.setMode(orbit) }), h("span", name));
     this.framesButton = h("button.tool", { type: "button", hidden: true, "aria-pressed": "true", title: say.frames, "aria-label": say.frames, onclick: () => this.toggleFrames() }, icon("cameras"));
     this.chooser = h("select", { "aria-label": say.camera, onchange: () => this.stand(Number(this.chooser.value)) });
     this.cameraTools = h("div.cameras", { hidden: true },
       button("left", say.previous, () => this.stand(this.stood - 1)), this.chooser, button("right", say.next, () => this.stand(this.stood + 1)));
-    const help = h("details.help", h("summary", { title: say.keys, "aria-label": say.keys }, icon("help")),
-      h("dl", say.help.map(([keys, what]) => h("div", h("dt", keys), h("dd", what)))));
+    this.helpList = h("dl");
+    const help = h("details.help", h("summary", { title: say.keys, "aria-label": say.keys }, icon("help")), this.helpList);
+    this.setHelp();
     help.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && (help.open = false));
     put(this.tools, this.wipe, this.cameraTools, h("fieldset.segments", h("legend.away", say.movement), mode(say.orbit, true), mode(say.fly, false)),
       h("div.buttons", this.framesButton, button("home", say.home, () => this.home()), button("picture", say.screenshot, () => this.save()), button("full", say.full, () => this.full()), help));
+  }
+
+  /** @param {boolean} orbit whether to rotate about the scene; otherwise about the eye */
+  setMode(orbit) {
+    if (this.controls) this.controls.orbit = orbit;
+    this.setHelp();
+  }
+
+  /** Show the keys of the mode, and those of another part. @param {string[][]} [others] */
+  setHelp(others = []) {
+    const mode = this.controls?.orbit === false ? say.flyHelp : say.orbitHelp;
+    put(this.helpList, [...mode, ...others, ...say.help].map(([keys, what]) => h("div", h("dt", keys), h("dd", what))));
   }
 
   /** Update the stage after a change in the viewer. */

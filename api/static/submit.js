@@ -55,6 +55,8 @@ export class SubmitView {
     this.selecting = new SelectPanel(this.stage);
     this.regions = new RegionList(() => this.paintingsChanged(), this.stage.viewer ? (row) => this.selectRegion(row) : undefined);
     this.created = false;
+    /** Whether the user has chosen between cameras and an orbit; otherwise the files decide. */
+    this.viewsChosen = false;
     /** Masks of regions, from an earlier job. @type {Chosen[]} */
     this.masks = [];
     /** Idempotency keys of requests for jobs, by their bodies. @type {Map<string, string>} */
@@ -106,8 +108,9 @@ export class SubmitView {
     this.presets = h("fieldset.presets", h("legend", say.preset));
     this.main = h("div.options");
     this.ring = h("div.options");
-    this.around = this.choice("views", say.around, false);
-    this.fromFiles = this.choice("views", say.fromFiles, true);
+    this.around = this.choice("views", say.around, false, () => this.chooseViews());
+    this.fromFiles = this.choice("views", say.fromFiles, true, () => this.chooseViews());
+    this.automatic = h("p.help", say.noCameras, " ", h("button.quiet.small", { type: "button", onclick: () => this.slots.cameras.input.click() }, say.chooseCameras));
     this.viewsBody = h("div.views-body");
     this.found = h("p.quiet");
     this.gallery = new Gallery((painting) => this.slots.style.add([painting]), this.leaving.signal);
@@ -145,9 +148,9 @@ export class SubmitView {
    * @param {string} group
    * @param {string} name
    * @param {boolean} checked
-   * @param {() => void} [changed]
+   * @param {() => void} changed
    */
-  choice(group, name, checked, changed = () => this.showViews()) {
+  choice(group, name, checked, changed) {
     const input = h("input", { type: "radio", name: group, checked, onchange: changed });
     return { input, element: h("label", input, h("span", name)) };
   }
@@ -156,9 +159,18 @@ export class SubmitView {
     return this.around?.input.checked ?? false;
   }
 
+  chooseViews() {
+    this.viewsChosen = true;
+    this.showViews();
+  }
+
+  /** Show what belongs to the choice of views. Without it, a scene without cameras is orbited. */
   showViews() {
-    put(/** @type {Element} */ (this.viewsBody), this.orbiting ? this.ring : [this.slots.cameras.element, this.slots.photos.element]);
-    this.camerasChanged();
+    const { scene, cameras, photos } = this.slots, open = !this.viewsChosen, orbits = open && scene.files.length > 0 && !cameras.files.length;
+    if (open && this.around && this.fromFiles) (orbits ? this.around : this.fromFiles).input.checked = true;
+    const parts = orbits ? [this.automatic, cameras.element, this.ring] : this.orbiting ? [this.ring] : [cameras.element, photos.element];
+    if (this.viewsBody) put(this.viewsBody, parts);
+    this.showCameras();
   }
 
   showUnfinished() {
@@ -192,7 +204,7 @@ export class SubmitView {
     put(this.ring, ...elements(this.groups.Views));
     put(this.lookOptions, ...elements(this.groups.Look));
     put(this.expertOptions, ...elements(this.groups.Expert));
-    this.ring.addEventListener("input", () => this.camerasChanged());
+    this.ring.addEventListener("input", () => this.showCameras());
     const followStrength = addPictures(/** @type {Control} */ (this.controls.get("content_weight")));
     this.schema = schema;
     this.restoreOptions();
@@ -287,17 +299,16 @@ export class SubmitView {
       /** @type {any} */ (preset).checked = true;
       this.choosePreset(draft.preset);
     }
-    if (draft.orbiting && this.around) this.around.input.checked = true;
+    if (draft.orbiting && this.around) {
+      this.around.input.checked = true;
+      this.viewsChosen = this.slots.cameras.files.length > 0;
+    }
     this.showViews();
   }
 
   /** @param {File[]} files */
   take(files) {
     const found = sorted(files);
-    if (found.cameras.length && this.fromFiles) {
-      this.fromFiles.input.checked = true;
-      this.showViews();
-    }
     for (const role of /** @type {const} */ (["cameras", "photos", "style", "scene"])) this.slots[role].add(found[role]);
     this.tellUnused(found.unknown.map(({ name }) => name));
   }
@@ -318,6 +329,7 @@ export class SubmitView {
     this.opened?.end();
     this.opened = null;
     if (this.invite) this.invite.hidden = !!file;
+    this.showViews();
     const { viewer } = this.stage;
     if (!viewer) return;
     viewer.touched = false;
@@ -334,7 +346,7 @@ export class SubmitView {
       const header = await scene.headerRead;
       this.slots.scene.say(words.scene.header(header));
       await scene.ready;
-      this.camerasChanged();
+      this.showCameras();
     } catch (error) {
       if (this.opened !== scene) return;
       this.stage.bar.hidden = true;
@@ -375,7 +387,13 @@ export class SubmitView {
     return this.apart?.input.checked ? Math.max(1, this.ownStyles.length) : 1;
   }
 
-  async camerasChanged() {
+  /** Follow the camera files, or their absence. */
+  camerasChanged() {
+    if (this.slots.cameras.files.length) this.viewsChosen = false;
+    this.showViews();
+  }
+
+  async showCameras() {
     const { cameras: slot } = this.slots, turn = (this.camerasTurn = (this.camerasTurn ?? 0) + 1);
     slot.wrong("");
     let cameras = /** @type {import("./cameras.js").JobCamera[]} */ ([]), told = "";

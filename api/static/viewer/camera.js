@@ -43,7 +43,6 @@ export class ViewCamera {
     const level = unit(difference(aside, times(this.up, dot(aside, this.up))));
     const from = unit(sum(level, times(this.up, 0.18)));
     this.size = radius;
-    this.target = center;
     this.eye = sum(center, times(from, 2.6 * radius));
     this.focal = [FOCAL, FOCAL];
     this.shape = 0;
@@ -52,8 +51,9 @@ export class ViewCamera {
 
   /** @param {Vector} target */
   lookAt(target) {
-    const forward = unit(difference(target, this.eye));
-    const right = unit(cross(forward, this.up));
+    this.target = target;
+    const forward = unit(difference(target, this.eye)), level = cross(forward, this.up);
+    const right = unit(Math.hypot(...level) > 1e-6 ? level : this.axes[0]); // straight along the up direction
     this.axes = [right, cross(forward, right), forward];
     this.number++;
   }

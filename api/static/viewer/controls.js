@@ -1,54 +1,99 @@
 // @ts-check
-/** Controls of the viewer: mouse, touch, pen, wheel and keys. */
+/** Controls of the viewer: mouse, touch, pen, wheel and keys. Movements depend on time, not on the number of events. */
+import { Motion } from "./motion.js";
 
 /** @typedef {import("./viewer.js").Viewer} Viewer */
+/** @typedef {{moved?: () => void, toggle?: () => void, camera?: (by: number) => void, home?: () => void, hold?: (held: boolean) => void}} Actions `moved` is called when the camera leaves its place, `hold` when O is pressed and released */
 
-/** @type {Record<string, [number, number]>} */
-const TURNS = { ArrowLeft: [-0.08, 0], ArrowRight: [0.08, 0], ArrowUp: [0, -0.08], ArrowDown: [0, 0.08] };
-/** Steps along right, down and forward. @type {Record<string, number[]>} */
-const STEPS = { a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0], w: [0, 0, 1], s: [0, 0, -1] };
+/** Milliseconds after the last movement of a pointer during which its release lets the scene glide. */
+const THROWN = 60;
+/** Fraction of the newest movement in the speed of a pointer. */
+const NEWEST = 0.4;
 
 export class Controls {
   /**
    * @param {Viewer} viewer
-   * @param {{moved?: () => void, toggle?: () => void, camera?: (by: number) => void, home?: () => void, hold?: (held: boolean) => void}} keys actions of other keys; `moved` is called when keys or the wheel move the camera, `hold` is called when O is pressed and released
+   * @param {Actions} keys actions of other keys
    */
   constructor(viewer, keys = {}) {
     this.viewer = viewer;
     this.keys = keys;
-    /** Whether to rotate about the scene; otherwise about the eye. */
-    this.orbit = true;
+    this.motion = new Motion(viewer);
     /** @type {Map<number, {x: number, y: number}>} */
     this.hands = new Map();
+    /** Speed of the last drag in CSS pixels per millisecond, and its time. */
+    this.thrown = { x: 0, y: 0, at: 0, pans: false };
+    /** Last position of the pointer, in the window. @type {{x: number, y: number} | null} */
+    this.pointer = null;
     const { canvas } = viewer;
     canvas.addEventListener("pointerdown", (event) => this.down(event));
     canvas.addEventListener("pointermove", (event) => this.move(event));
-    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => this.hands.delete(/** @type {PointerEvent} */ (event).pointerId));
+    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => this.up(/** @type {PointerEvent} */ (event)));
+    canvas.addEventListener("pointerleave", () => (this.pointer = null));
+    canvas.addEventListener("dblclick", (event) => this.focus(event.clientX, event.clientY));
+    canvas.addEventListener("mousedown", (event) => event.button === 1 && event.preventDefault()); // no automatic scrolling
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("keydown", (event) => this.key(event));
-    canvas.addEventListener("keyup", (event) => event.key.toLowerCase() === "o" && this.keys.hold?.(false));
-    canvas.addEventListener("blur", () => this.keys.hold?.(false));
+    canvas.addEventListener("keyup", (event) => this.released(event));
+    canvas.addEventListener("blur", () => this.blur());
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  }
+
+  /** Whether to rotate about the scene; otherwise about the eye. */
+  get orbit() {
+    return this.motion.orbit;
+  }
+
+  set orbit(orbit) {
+    this.motion.orbit = orbit;
   }
 
   /** @param {PointerEvent} event */
   down(event) {
+    this.motion.stop();
     this.viewer.canvas.setPointerCapture(event.pointerId);
     this.hands.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    this.thrown = { x: 0, y: 0, at: 0, pans: false };
   }
 
   /** @param {PointerEvent} event */
   move(event) {
+    this.pointer = { x: event.clientX, y: event.clientY };
     const before = this.hands.get(event.pointerId);
     if (!before) return;
-    const now = { x: event.clientX, y: event.clientY };
+    const now = this.pointer, dx = now.x - before.x, dy = now.y - before.y;
     const others = [...this.hands].filter(([id]) => id !== event.pointerId).map(([, place]) => place);
     this.hands.set(event.pointerId, now);
-    const dx = now.x - before.x, dy = now.y - before.y;
+    const pans = Boolean(event.buttons & 6) || event.shiftKey;
     if (others.length) this.pinch(before, now, others[0], dx, dy);
-    else if (event.buttons & 2 || event.shiftKey) this.shift(dx, dy);
-    else this.viewer.camera.turn(dx / 180, dy / 180, this.orbit);
+    else this.motion.drag(dx, dy, pans);
+    this.track(dx, dy, others.length ? NaN : event.timeStamp, pans);
     this.viewer.moved();
+  }
+
+  /**
+   * Follow the speed of a drag.
+   *
+   * @param {number} dx CSS pixels
+   * @param {number} dy
+   * @param {number} at milliseconds; NaN with two fingers, which do not glide
+   * @param {boolean} pans
+   */
+  track(dx, dy, at, pans) {
+    const { thrown } = this, elapsed = Math.max(1, at - thrown.at);
+    if (thrown.at && elapsed < THROWN) {
+      thrown.x += NEWEST * (dx / elapsed - thrown.x);
+      thrown.y += NEWEST * (dy / elapsed - thrown.y);
+    } else [thrown.x, thrown.y] = [0, 0];
+    [thrown.at, thrown.pans] = [at || 0, pans];
+  }
+
+  /** @param {PointerEvent} event */
+  up(event) {
+    const { thrown } = this;
+    if (this.hands.delete(event.pointerId) && event.type === "pointerup" && event.timeStamp - thrown.at < THROWN) {
+      this.motion.glide(thrown.x, thrown.y, thrown.pans);
+    }
   }
 
   /**
@@ -62,60 +107,69 @@ export class Controls {
    */
   pinch(before, now, other, dx, dy) {
     const was = Math.hypot(before.x - other.x, before.y - other.y), is = Math.hypot(now.x - other.x, now.y - other.y);
-    if (was > 1 && is > 1) this.approach(was / is);
-    this.shift(dx / 2, dy / 2);
-  }
-
-  /**
-   * @param {number} dx pixels
-   * @param {number} dy
-   */
-  shift(dx, dy) {
-    const { camera, canvas } = this.viewer;
-    const unit = camera.distance / camera.pixels(canvas.clientWidth, canvas.clientHeight)[1];
-    camera.move([-dx * unit, -dy * unit, 0]);
-  }
-
-  /** @param {number} factor */
-  approach(factor) {
-    const { camera } = this.viewer;
-    if (this.orbit) camera.approach(factor);
-    else camera.move([0, 0, (1 - factor) * camera.size]);
+    if (was > 1 && is > 1) this.motion.approach(was / is);
+    this.motion.drag(dx / 2, dy / 2, true);
   }
 
   /** @param {WheelEvent} event */
   wheel(event) {
     event.preventDefault();
     const pixels = event.deltaY * (event.deltaMode === 1 ? 16 : 1);
-    this.approach(Math.exp(Math.max(-400, Math.min(400, pixels)) / 900));
+    this.motion.approach(Math.exp(Math.max(-400, Math.min(400, pixels)) / 900));
     this.keys.moved?.();
     this.viewer.moved();
   }
 
-  /** @param {KeyboardEvent} event */
-  key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const { viewer } = this, { camera } = viewer, key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-    if (TURNS[key]) camera.turn(...TURNS[key], this.orbit);
-    else if (STEPS[key]) camera.move(STEPS[key].map((part) => part * 0.06 * camera.size));
-    else if (key === "+" || key === "=") this.approach(0.9);
-    else if (key === "-") this.approach(1 / 0.9);
-    else if (key === " ") return this.other(event, this.keys.toggle);
-    else if (key === "o") return this.other(event, () => event.repeat || this.keys.hold?.(true));
-    else if (key === "Home") return this.other(event, this.keys.home);
-    else if (key === "," || key === ".") return this.other(event, () => this.keys.camera?.(key === "," ? -1 : 1));
-    else return;
-    event.preventDefault();
+  /**
+   * Turn to what is visible at a point of the window.
+   *
+   * @param {number} x
+   * @param {number} y
+   */
+  async focus(x, y) {
+    const { left, top } = this.viewer.canvas.getBoundingClientRect(), point = await this.viewer.pointAt(x - left, y - top);
+    if (!point) return;
     this.keys.moved?.();
-    viewer.moved();
+    this.motion.turnTo(point);
   }
 
-  /**
-   * @param {Event} event
-   * @param {(() => void) | undefined} act
-   */
-  other(event, act) {
+  /** @param {KeyboardEvent} event */
+  key(event) {
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, moves = this.motion.moves(key);
+    if (key === "Shift" || key === "Control") return this.motion.hurry(event.shiftKey, event.ctrlKey);
+    if ((event.ctrlKey || event.metaKey || event.altKey) && !(moves && event.repeat)) return;
+    if (moves) {
+      this.motion.press(key);
+      this.keys.moved?.();
+    } else if (key === "+" || key === "=" || key === "-") {
+      this.motion.approach(key === "-" ? 1 / 0.9 : 0.9);
+      this.keys.moved?.();
+      this.viewer.moved();
+    } else if (key === " ") this.keys.toggle?.();
+    else if (key === "o") event.repeat || this.keys.hold?.(true);
+    else if (key === "Home") this.keys.home?.();
+    else if (key === "f") this.focusPointer();
+    else if (key === "," || key === ".") this.keys.camera?.(key === "," ? -1 : 1);
+    else return;
     event.preventDefault();
-    act?.();
+  }
+
+  /** Focus what is under the pointer, or in the middle. */
+  focusPointer() {
+    const { left, top, width, height } = this.viewer.canvas.getBoundingClientRect();
+    const { x, y } = this.pointer ?? { x: left + width / 2, y: top + height / 2 };
+    this.focus(x, y);
+  }
+
+  /** @param {KeyboardEvent} event */
+  released(event) {
+    this.motion.hurry(event.shiftKey, event.ctrlKey);
+    this.motion.release(event.key.length === 1 ? event.key.toLowerCase() : event.key);
+    if (event.key.toLowerCase() === "o") this.keys.hold?.(false);
+  }
+
+  blur() {
+    this.motion.stop();
+    this.keys.hold?.(false);
   }
 }

@@ -35,6 +35,26 @@ void main() {
   found = who + 1u;
 }`;
 
+/**
+ * Return the Gaussian at a pixel, or the nearest one within 8 pixels; -1 if there is none.
+ *
+ * @param {{ids: Uint32Array, width: number, height: number}} view
+ * @param {number} x
+ * @param {number} y
+ */
+export function gaussianAt({ ids, width, height }, x, y) {
+  let found = -1, nearest = Infinity;
+  for (let dy = -8; dy <= 8; dy++) {
+    for (let dx = -8; dx <= 8; dx++) {
+      const px = Math.floor(x) + dx, py = Math.floor(y) + dy, away = dx * dx + dy * dy;
+      if (px < 0 || py < 0 || px >= width || py >= height || away >= nearest) continue;
+      const id = ids[(height - 1 - py) * width + px];
+      if (id) [found, nearest] = [id - 1, away];
+    }
+  }
+  return found;
+}
+
 export class PickPass {
   /** @param {Viewer} viewer */
   constructor(viewer) {

@@ -18,6 +18,8 @@ port.onmessage = async (/** @type {MessageEvent} */ { data }) => {
   if (data.kind === "sort") {
     const order = depthOrder(centers, reach, count, data.pose);
     port.postMessage({ kind: "order", order, number: data.number, of: count }, [order.buffer]);
+  } else if (data.kind === "center") {
+    port.postMessage({ kind: "center", center: [...centers.subarray(3 * data.index, 3 * data.index + 3)] });
   } else if (data.kind === "select") {
     selector ??= new Selector(centers, reach, colors, middle().radius);
     port.postMessage({ kind: "selected", ...selector.answer(data) });

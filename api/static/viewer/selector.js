@@ -7,9 +7,10 @@
  * this depth comes from an image of visible Gaussians (`PickPass`).
  */
 import { CellGrid } from "./cell_grid.js";
+import { gaussianAt } from "./pick_pass.js";
 
 /** @typedef {{axes: number[][], eye: number[], focal: number[], near: number, ids: Uint32Array, width: number, height: number}} PickedView `ids`: one more than the index of the Gaussian that a pixel shows, or 0; rows from bottom to top */
-/** @typedef {"add" | "subtract"} Mode */
+/** @typedef {"add" | "subtract" | "intersect"} Mode `intersect` deselects what does not pass */
 
 /** Side of the squares of pixels that share a depth. */
 const SQUARE = 4;
@@ -160,8 +161,8 @@ export class Selector {
 
   /** Return the Gaussians that pass a test and whose flag a mode changes. @param {Mode} mode @param {(i: number) => boolean} passes */
   changing(mode, passes) {
-    const before = mode === "add" ? 0 : 1, { flags } = this;
-    return this.all((i) => flags[i] === before && passes(i));
+    const before = mode === "add" ? 0 : 1, wanted = mode !== "intersect", { flags } = this;
+    return this.all((i) => flags[i] === before && passes(i) === wanted);
   }
 
   /** Compute where the view shows the Gaussians, and which of them are visible. @param {PickedView} view @returns {Uint32Array[]} */
@@ -249,28 +250,14 @@ export class Selector {
    * @param {{point: number[], tolerance: number, connected: boolean, mode: Mode}} request `tolerance`: 0 to 1
    */
   similar({ point, tolerance, connected, mode }) {
-    const seed = this.at(point), { colors } = this;
+    const seed = gaussianAt(this, point[0], point[1]), { colors } = this;
     if (seed < 0) return [];
     const [r, g, b] = colors.subarray(3 * seed, 3 * seed + 3), most = 3 * (255 * tolerance) ** 2;
     const alike = (/** @type {number} */ i) => (colors[3 * i] - r) ** 2 + (colors[3 * i + 1] - g) ** 2 + (colors[3 * i + 2] - b) ** 2 <= most;
     if (!connected) return this.changing(mode, alike);
-    const before = mode === "add" ? 0 : 1;
-    return this.cells().flood(seed, alike).filter((i) => this.flags[i] === before);
-  }
-
-  /** Return the Gaussian at a pixel, or the nearest one within 8 pixels; -1 if there is none. @param {number[]} point */
-  at([x, y]) {
-    const { ids, width, height } = this;
-    let found = -1, nearest = Infinity;
-    for (let dy = -8; dy <= 8; dy++) {
-      for (let dx = -8; dx <= 8; dx++) {
-        const px = Math.floor(x) + dx, py = Math.floor(y) + dy, away = dx * dx + dy * dy;
-        if (px < 0 || py < 0 || px >= width || py >= height || away >= nearest) continue;
-        const id = ids[(height - 1 - py) * width + px];
-        if (id) [found, nearest] = [id - 1, away];
-      }
-    }
-    return found;
+    const reached = new Uint8Array(this.count);
+    for (const i of this.cells().flood(seed, alike)) reached[i] = 1;
+    return this.changing(mode, (i) => reached[i] === 1);
   }
 
   grow() {

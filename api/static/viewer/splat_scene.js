@@ -39,6 +39,8 @@ export class SplatScene {
     this.marks = null;
     /** Called with the worker's answers to changes of the selection. @type {((changed: import("./selection.js").Changed) => void) | undefined} */
     this.onSelected = undefined;
+    /** Functions that take the answers to requests for centers. @type {((center: number[]) => void)[]} */
+    this.centers = [];
     this.order = gl.createBuffer();
     this.room = 0;
     this.busy = false;
@@ -62,6 +64,7 @@ export class SplatScene {
     if (told.kind === "header") this.allocate(told.header, told.degree);
     else if (told.kind === "batch") this.take(told);
     else if (told.kind === "order") this.takeOrder(told);
+    else if (told.kind === "center") this.centers.shift()?.(told.center);
     else if (told.kind === "selected") this.onSelected?.(told);
     else if (told.kind === "done") {
       this.whole = true;
@@ -159,6 +162,17 @@ export class SplatScene {
     }
     this.colors.set(name, texture);
     this.changed();
+  }
+
+  /**
+   * Return the center of a Gaussian.
+   *
+   * @param {number} index
+   * @returns {Promise<number[]>}
+   */
+  centerOf(index) {
+    this.worker.postMessage({ kind: "center", index });
+    return new Promise((done) => this.centers.push(done));
   }
 
   /**

@@ -1,6 +1,7 @@
 // @ts-check
 /** Viewer of one or two scenes with two color sets and a wipe between them. It draws only after a change. */
 import { ViewCamera } from "./camera.js";
+import { gaussianAt, PickPass } from "./pick_pass.js";
 import { CLASSIC } from "./render_tag.js";
 import { lineFragment, lineVertex, overBackground, splatFragment, splatVertex, wholeVertex } from "./shaders.js";
 import { SplatScene } from "./splat_scene.js";
@@ -418,6 +419,19 @@ export class Viewer {
     this.scale = 1;
     this.render(); // a canvas drops its content when the task ends
     return new Promise((done, wrong) => this.canvas.toBlob((blob) => (blob ? done(blob) : wrong(new Error(words.viewer.noPicture))), "image/png"));
+  }
+
+  /**
+   * Return the center of the Gaussian that is visible at or near a point of the canvas; null if there is none.
+   *
+   * @param {number} x CSS pixels
+   * @param {number} y
+   * @returns {Promise<number[] | null>}
+   */
+  async pointAt(x, y) {
+    const view = new PickPass(this).draw(), { clientWidth, clientHeight } = this.canvas;
+    const index = view ? gaussianAt(view, (x * view.width) / clientWidth, (y * view.height) / clientHeight) : -1;
+    return index < 0 ? null : /** @type {Side} */ (this.sides?.left).scene.centerOf(index);
   }
 
   /** @param {Event} event */
