@@ -260,8 +260,16 @@ def test_drawn_selections_take_what_is_visible(visit: Visit, tmp_path: Path) -> 
     page.get_by_label("Select through").check()
     drag(watched, *loop)
     some_selected(watched)
-    assert selected(watched) > 1.15 * near
+    through = selected(watched)
+    assert through > 1.15 * near
     assert near > 50
+    page.get_by_label("Intersect").check()
+    drag(watched, (0.5, 0.3), (0.9, 0.3), (0.9, 0.7), (0.5, 0.7), (0.5, 0.3))
+    page.locator(".selecting output").filter(has_not_text=f"{through} of").wait_for()
+    assert 0 < selected(watched) < 0.8 * through
+    page.keyboard.press("b")
+    assert page.get_by_label("Brush", exact=True).is_checked()
+    assert page.locator("details.help").get_by_text("brush, lasso, box").count() == 1
     page.get_by_role("button", name="Use selection").click()
     region = page.get_by_role("group", name="Region 1")
     region.get_by_text("Gaussians selected by hand").wait_for()

@@ -335,3 +335,47 @@ def test_files_that_cannot_be_shown(visit: Visit, tmp_path: Path, content: bytes
     watched.page.get_by_label("Scene", exact=True).set_input_files(file)
     watched.page.locator(".frame .note").filter(has_text=said).wait_for()
     watched.check()
+
+
+def test_camera_follows_keys_and_double_clicks(visit: Visit, tmp_path: Path) -> None:
+    """A scene without cameras is orbited, keys move while they are held, and a double click turns to what is there."""
+    scene = dust()
+    side = torch.where(torch.arange(len(scene)) % 2 == 0, -1.0, 1.0)
+    means = scene.means * 0.15
+    means[:, 0] += side
+    red = torch.tensor([1.7, -1.7, -1.7])
+    colors = torch.where(side[:, None] > 0, red, red.flip(0))
+    ply, _, _ = write_files(tmp_path, replace(scene, means=means, sh_dc=colors), cameras(2, 120, 90))
+    watched = visit("/#/", reduced_motion="reduce")
+    page = watched.page
+    page.get_by_label("Scene", exact=True).set_input_files(ply)
+    page.get_by_text("No cameras were given, so the views orbit the object.").wait_for()
+    assert page.get_by_label("Orbit the object").is_checked()
+    page.get_by_role("button", name="Show cameras").click()  # hides them
+    view = page.locator("canvas.view")
+    view.scroll_into_view_if_needed()
+    across, image = place_of_red(watched)
+    assert abs(across - 0.5) > 0.1
+    box = view.bounding_box()
+    page.mouse.dblclick(box["x"] + across * box["width"], box["y"] + box["height"] / 2)
+    middle, turned = place_of_red(watched)
+    assert abs(middle - 0.5) < 0.05
+    view.focus()
+    page.keyboard.down("d")
+    page.evaluate("async () => { for (let i = 0; i < 8; i++) await new Promise(requestAnimationFrame); }")
+    page.keyboard.up("d")
+    moved, _ = place_of_red(watched)
+    assert moved < middle - 0.02, "the camera has moved to the right"
+    view.focus()
+    page.keyboard.press("Home")
+    assert np.abs(watched.pixels() - image).mean() < 1
+    assert np.abs(turned - image).mean() > 1
+    watched.check()
+
+
+def place_of_red(watched: Watched) -> tuple[float, Any]:
+    """Return where the view is red, as a fraction of its width, and the view's image."""
+    image = watched.pixels()
+    weights = (image[..., 0] - image[..., 2]).clip(0).sum(axis=0)
+    assert weights.sum() > 0
+    return float((weights * np.arange(len(weights))).sum() / weights.sum() / len(weights)), image
