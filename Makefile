@@ -26,6 +26,7 @@ demo: $(VENV)/installed
 # Run all checks of `lint`, and the tests that are not marked as slow.
 test: lint
 	$(BIN)/sgsst weights fetch vgg16
+	$(BIN)/python -m tests.compile_kernels
 	$(PYTEST) -m "not slow"
 
 # Run the slow tests: kills, chains of requests, whole runs, the wheel.

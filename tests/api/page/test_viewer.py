@@ -79,8 +79,6 @@ def test_view_is_that_of_the_renderer(visit: Visit, shared_data: Path, tmp_path:
         ("glb", "snowmiku_plush"),
         ("splat", "broche"),
         ("sog", "snowmiku_plush"),
-        ("sog", "broche"),
-        ("ksplat0", "playbot_synthetic_sh2"),
         ("ksplat1", "broche"),
         ("ksplat2", "playbot_synthetic_sh2"),
     ],
