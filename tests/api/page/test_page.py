@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.camera import resized
 from tests.api.page.actions import (
@@ -35,7 +36,7 @@ from tests.api.page.actions import (
 )
 from tests.api.page.browser import Watched, psnr, rendered
 from tests.api.service import ROOT, Service, wait_for
-from tests.small_scenes import wall, write_files
+from tests.small_scenes import ball, wall, write_files
 
 pytestmark = pytest.mark.slow
 
@@ -272,6 +273,23 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     watched.check()
 
 
+def test_packed_scene_is_wiped_against_its_result(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """Geometry comes from the compressed file, colors from the result, in the order of the file."""
+    packed = files["scene"].with_name("scene.sog")
+    write_scene(packed, read_scene(files["scene"]).scene, SOG)
+    job_id = done(service, submit(service, files | {"scene": packed}, name="packed"))
+    result = files["scene"].with_name("stylized.ply")
+    result.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply").content)
+    watched = visit(f"/#/jobs/{job_id}", width=600, height=500)
+    watched.page.get_by_label("Camera", exact=True).select_option("1")
+    camera = resized(read_cameras(files["cameras"])[1], 384)
+    for key, path in (("End", packed), ("Home", result)):
+        wanted = rendered(path, camera)
+        watched.wipe(key)
+        assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered image
+    watched.check()
+
+
 def test_keyboard_alone(visit: Visit, service: Service, files: dict[str, Path]) -> None:
     """Open a finished job from the list and use its view, without a pointer."""
     job_id = done(service, submit(service, files, name="by keyboard"))
@@ -415,6 +433,41 @@ def test_several_styles_and_regions(visit: Visit, service: Service, files: dict[
     assert moved[side].float().mean() in (0, 1)
     assert moved[~side].float().mean() == 1 - moved[side].float().mean()
     watched.check()
+
+
+def test_fingers_turn_and_pinch(browser: Any, service: Service, tmp_path: Path) -> None:
+    """On a phone, one finger rotates the scene, a pinch moves it away, and the page does not scroll."""
+    watched = Watched(browser, service.url, width=360, height=640, has_touch=True, is_mobile=True)
+    page = watched.page
+    page.goto(service.url)
+    ply, _, _ = write_files(tmp_path, ball())
+    page.get_by_text("Tap to choose a scene").wait_for()
+    assert page.get_by_text("Drop your scene here").is_hidden()
+    page.get_by_label("Scene", exact=True).set_input_files(ply)
+    page.locator("canvas.view").scroll_into_view_if_needed()
+    first = watched.pixels()
+    box = page.locator("canvas.view").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    scrolled = page.evaluate("() => scrollY")
+    touch(watched, [[(x - 40 + 8 * i, y)] for i in range(10)])
+    rotated = watched.pixels()
+    assert np.abs(rotated - first).mean() > 1
+    touch(watched, [[(x - 60 + 4 * i, y), (x + 60 - 4 * i, y)] for i in range(10)])
+    assert 0 < shown(watched.pixels()) < 0.6 * shown(rotated)
+    assert page.evaluate("() => scrollY") == scrolled
+    watched.check()
+    watched.context.close()
+
+
+def touch(watched: Watched, places: list[list[tuple[float, float]]]) -> None:
+    """Simulate fingers that touch the screen, move from position to position, and are lifted."""
+    device = watched.context.new_cdp_session(watched.page)
+    for number, fingers in enumerate(places):
+        points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(fingers)]
+        device.send(
+            "Input.dispatchTouchEvent", {"type": "touchMove" if number else "touchStart", "touchPoints": points}
+        )
+    device.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
 
 def shown(pixels: NDArray[np.float64]) -> int:

@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 from skimage import data
 from torch import Tensor
 
 from sgsst_core.errors import WeightsError
+from sgsst_core.features.network_weights import load_perceptual
 from sgsst_core.quality.lpips import MIN_SIDE, Lpips, load_lpips_or_none
 from tests.sgsst_core.synthetic_images import synthetic_image
+
+Array = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +92,73 @@ def test_agrees_with_the_published_code(alex: Lpips, name, changed, expected):
     result = alex.distance(image, changed(image))
     assert result.mean == pytest.approx(expected, rel=1e-6)  # the published code rounds its input scaling to float32
     assert float(result.map.mean()) == pytest.approx(expected, rel=2e-3)  # upsampling weighs the border differently
+
+
+def test_prefers_a_small_warp_to_a_blur_unlike_squared_error(alex: Lpips):
+    """In figure 1 of the paper, people prefer the warped patch, whereas L2 and PSNR prefer the blurred one."""
+    image = photo("coffee")[100:300, 150:450]
+    rows, columns = torch.meshgrid(torch.linspace(-1, 1, 200), torch.linspace(-1, 1, 300), indexing="ij")
+    wave = torch.stack([columns + 0.009 * torch.sin(9 * rows), rows + 0.0135 * torch.sin(7 * columns)], dim=-1)
+    planes = image.permute(2, 0, 1)[None]
+    warped = F.grid_sample(planes, wave[None].double(), padding_mode="border", align_corners=True)
+    warped = warped[0].permute(1, 2, 0)
+    blurred = box_blurred(image, 5)
+    assert (blurred - image).square().mean() < (warped - image).square().mean()
+    assert alex.distance(image, warped).mean < 0.3 * alex.distance(image, blurred).mean
+
+
+def test_agrees_with_a_direct_formulation_in_numpy(alex: Lpips):
+    first, second = synthetic_image(47, 63, seed=5), synthetic_image(47, 63, seed=6)
+    expected_mean, expected_map = lpips_directly(first.numpy(), second.numpy())
+    result = alex.distance(first, second)
+    assert result.mean == pytest.approx(expected_mean, rel=1e-6)
+    np.testing.assert_allclose(result.map.numpy(), expected_map, rtol=1e-5, atol=1e-9)
+
+
+def lpips_directly(first: Array, second: Array) -> tuple[float, Array]:
+    """Compute LPIPS with AlexNet by equation 1 of the paper, with input from -1 to 1 as in the published code."""
+    tensors = {name: tensor.double().numpy() for name, tensor in load_perceptual().items()}
+    total, spatial = 0.0, np.zeros(first.shape[:2])
+    pairs = zip(alexnet_directly(first, tensors), alexnet_directly(second, tensors), strict=True)
+    for layer, (x, y) in enumerate(pairs, start=1):
+        x, y = (f / (np.sqrt((f * f).sum(axis=2, keepdims=True)) + 1e-10) for f in (x, y))
+        distances = ((x - y) ** 2 * tensors[f"linear{layer}.weight"]).sum(axis=2)
+        total += distances.mean()
+        spatial += upsampled(distances, first.shape[:2])
+    return total, spatial
+
+
+def alexnet_directly(rgb: Array, tensors: dict[str, Array]) -> list[Array]:
+    x = (2 * rgb - 1 - np.array([-0.030, -0.088, -0.188])) / np.array([0.458, 0.448, 0.450])
+    outputs = []
+    for layer, (side, stride, padding) in enumerate([(11, 4, 2), (5, 1, 2), (3, 1, 1), (3, 1, 1), (3, 1, 1)], start=1):
+        if layer in (2, 3):
+            x = sliding_window_view(x, (3, 3), axis=(0, 1))[::2, ::2].max(axis=(3, 4))
+        x = np.pad(x, ((padding, padding), (padding, padding), (0, 0)))
+        windows = sliding_window_view(x, (side, side), axis=(0, 1))[::stride, ::stride]
+        x = np.tensordot(windows, tensors[f"conv{layer}.weight"], axes=([2, 3, 4], [1, 2, 3]))
+        x = np.maximum(x + tensors[f"conv{layer}.bias"], 0)
+        outputs.append(x)
+    return outputs
+
+
+def upsampled(values: Array, size: tuple[int, ...]) -> Array:
+    """Upsample bilinearly, with pixel centers at half-integers and replicated borders."""
+
+    def matrix(cells: int, pixels: int) -> Array:
+        positions = np.clip((np.arange(pixels) + 0.5) * cells / pixels - 0.5, 0, cells - 1)
+        return np.maximum(0, 1 - np.abs(positions[:, None] - np.arange(cells)))
+
+    return matrix(values.shape[0], size[0]) @ values @ matrix(values.shape[1], size[1]).T
+
+
+def test_map_is_large_where_the_images_differ(alex: Lpips):
+    image = photo("coffee")[:160, :240]
+    changed = image.clone()
+    changed[40:80, 150:200] = changed[40:80, 150:200].flip(0)
+    spatial = alex.distance(image, changed).map
+    assert spatial[40:80, 150:200].mean() > 5 * spatial[:, :80].mean()
+    assert spatial.amin() >= 0
 
 
 def test_constant_images_are_finite(alex: Lpips):
