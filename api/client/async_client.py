@@ -114,7 +114,8 @@ class AsyncClient:
         """Plan a job without queueing it, and return the plan. The other arguments are the same as for `submit`.
 
         Args:
-            planning: Callback that receives the number of surveyed views and the number of all views.
+            planning: Callback that receives the number of completed views and of all, first of the survey and
+                then of the trial.
         """
         files = _files(scene, style, cameras, photos, masks)
         return await uploads.plan_job(self._transport, files, parameters, progress=progress, planning=planning)

@@ -284,7 +284,7 @@ def test_plan_reports_progress(connect: Any, service: Service, files: dict[str, 
             **options,
         )
         assert (plan["gaussians"], plan["views"]) == (616, 3)
-        assert reported[-1] == (3, 3)
+        assert (3, 3) in reported
         frozen = {"name": "middle", "select": "sphere=0,0,3,2.5", "freeze": True}
         with pytest.raises(RequestError, match="that a view sees is frozen") as caught:
             client.plan(files["scene"], files["style"], regions=[frozen], **options)

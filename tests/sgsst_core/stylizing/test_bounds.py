@@ -52,7 +52,6 @@ def bright_wall() -> Scene:
         (ball, {"training_background": "palette", "warm_start": True}),
         (bright_wall, {"views_per_step": 2}),
     ],
-    ids=str,
 )
 def test_changed_colors_stay_in_the_range_of_screens(
     tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any]
@@ -100,7 +99,6 @@ def distance_from(style_image: Tensor, sh_dc: Tensor, axes: int) -> float:
 @pytest.mark.parametrize(
     ("make_scene", "values"),
     [(bright_wall, {"warm_start": False}), (ball, {"style_loss": "nnfm"})],
-    ids=str,
 )
 @pytest.mark.parametrize(("of", "axes", "form"), [(gray, 1, "a line"), (few_hues, 2, "a plane")])
 def test_colors_stay_in_the_subspace(

@@ -55,7 +55,6 @@ def chroma_off(stylized: torch.Tensor, scene: Scene) -> float:
         (wall, {"content_weight": 0, "views_per_step": 2}),
         (ball, {"unseen": "freeze"}),
     ],
-    ids=str,
 )
 def test_every_gaussian_keeps_its_chroma(
     tiny_weights: BackboneWeights, make_scene: Any, values: dict[str, Any]
