@@ -329,7 +329,7 @@ export class SubmitView {
     this.opened?.end();
     this.opened = null;
     if (this.invite) this.invite.hidden = !!file;
-    this.showViews();
+    if (file) this.showViews();
     const { viewer } = this.stage;
     if (!viewer) return;
     viewer.touched = false;
