@@ -174,7 +174,7 @@ def _handed_over(file: Path, fingerprint: str, inputs: Inputs, settings: Setting
     """Return the plan of a dry run of the same job; None if there is none.
 
     The fingerprint covers the content of all inputs, and the settings that determine the course of the job. What a
-    plan measured holds for the same settings, machine, threads and versions alone, and if the memory that it plans with
+    plan measured holds for the same settings, machine, threads and versions alone, and if the memory that it predicts
     is free now; otherwise, the job makes a trial of its own.
     """
     try:
@@ -182,8 +182,8 @@ def _handed_over(file: Path, fingerprint: str, inputs: Inputs, settings: Setting
     except CheckpointError:
         return None
     limit = settings.memory_limit or default_memory_limit()
-    same = conditions == _conditions(settings) and plan.memory_limit <= limit and plan.spare <= limit
-    return _HandedOver(plan, int(same))
+    fits = plan.prediction is not None and plan.prediction.peak_bytes <= limit
+    return _HandedOver(plan, int(fits and conditions == _conditions(settings)))
 
 
 def _conditions(settings: Settings) -> str:
