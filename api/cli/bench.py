@@ -24,7 +24,7 @@ from sgsst_core.scene.camera import Camera
 from worker.inputs import read_scene_and_capture
 from worker.job import SceneRequest, check_choice
 
-Result = TypeVar("Result")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class _Inputs:
         ensure_writable_folder(request.out)
         return _Inputs(file, capture.cameras, style, weights, variants)
 
-    def run(self, measure: Callable[..., Result], request: VariantsRequest, progress: Any) -> Result:
+    def run(self, measure: Callable[..., T], request: VariantsRequest, progress: Any) -> T:
         """Call `measure` with the arguments of `error_time`, and return its result."""
         arguments = (self.file.scene, self.cameras, self.style, self.variants, request.seconds)
         return measure(*arguments, weights=self.weights, progress=progress, **request.settings)

@@ -83,7 +83,7 @@ class State(BaseModel):
     page: str
 
 
-class Result(BaseModel):
+class JobResult(BaseModel):
     """Result of a job."""
 
     job_id: str
@@ -127,7 +127,7 @@ class Tools:
         with _messages():
             return self._state(await self._client.job(job_id))
 
-    async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, Result]:
+    async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, JobResult]:
         """Show the newest image of a job and the addresses of its files, and write its scene to a file."""
         with _messages():
             job = await self._client.job(job_id)
@@ -140,7 +140,7 @@ class Tools:
                     file = await self._client.download(job_id, Path(folder) / "preview.jpg", preview)
                     image = Image(data=await anyio.to_thread.run_sync(file.read_bytes), format="jpeg")
         urls = {each["name"]: self._address(job_id, each["name"]) for each in artifacts}
-        result = Result(job_id=job_id, status=job.status, urls=urls, path=path)
+        result = JobResult(job_id=job_id, status=job.status, urls=urls, path=path)
         text = TextContent(type="text", text=result.model_dump_json())
         content = [text] if image is None else [text, image.to_image_content()]
         return CallToolResult(content=content, structured_content=result.model_dump(mode="json"))

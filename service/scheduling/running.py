@@ -49,7 +49,7 @@ _FILE_SECONDS = 60.0
 #: unnoticed, and on a large fleet they are most of the database's load.
 _PROGRESS_SECONDS = (1.0, 5.0)
 
-Result = TypeVar("Result")
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -139,7 +139,7 @@ class RunningAttempt:
             wait([removed], _CANCEL_SECONDS)  # if the folder hangs, it is removed afterwards
             self._files.shutdown(wait=False)
 
-    def _within(self, work: Callable[[], Result], seconds: float | None = None, size: int = 0) -> Result:
+    def _within(self, work: Callable[[], T], seconds: float | None = None, size: int = 0) -> T:
         """Return the result of work on files, after all earlier work.
 
         Raises:

@@ -7,7 +7,7 @@ import time
 
 from service.errors import DatabaseUnavailableError
 from service.settings import ServiceSettings
-from service.store.access import Keys, Sessions, Shares
+from service.store.access import Keys, Sessions, ShareLinks
 from service.store.clocks import Clock
 from service.store.database import ANSWER_SECONDS, Database
 from service.store.inputs import InputRows
@@ -37,7 +37,7 @@ class Store:
         self.inputs = InputRows(self.database)
         self.keys = Keys(self.database)
         self.sessions = Sessions(self.database, settings.session_seconds)
-        self.shares = Shares(self.database)
+        self.shares = ShareLinks(self.database)
         self.operations = Operations(self.database, settings.lease_seconds)
 
     def close(self) -> None:

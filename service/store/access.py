@@ -140,8 +140,8 @@ class Shared:
     job: JobRow
 
 
-class Shares:
-    """Shares of results."""
+class ShareLinks:
+    """Links to shared results."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

@@ -106,7 +106,7 @@ class WeightCost:
 
 
 @dataclass(frozen=True)
-class Machine:
+class Hardware:
     """Facts about the machine and its ranks.
 
     Attributes:
@@ -156,7 +156,7 @@ class Facts:
     harmonics_energy: float
     sizes: tuple[Size, ...]
     survey: Survey
-    machine: Machine
+    machine: Hardware
     rasterizer: str
     weights: WeightCost
     frozen: Tensor | None = None
@@ -256,7 +256,7 @@ class PlanningContext:
     scene: Scene
     cameras: tuple[Camera, ...]
     settings: Settings
-    machine: Machine
+    machine: Hardware
     weights: BackboneWeights
     network: FeatureNetwork
     precision_ratio: float | None
@@ -288,7 +288,7 @@ def equip(
     ratio = precision_ratio(settings.precision, device, collectives)
     network = make_network(weights, settings, precision_of(settings.precision, ratio), device)
     limit = settings.memory_limit or default_memory_limit(network.device)
-    machine = Machine(
+    machine = Hardware(
         device,
         # The partition, and thereby rounding, depends on the limit, so it must be identical on all ranks.
         memory_limit=min(collectives.all_gather(limit)),

@@ -12,7 +12,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.planning.choices import OPTIMIZER_BYTES, draft_plan
-from sgsst_core.planning.context import Facts, Machine, NetworkPixels, Saving, WeightCost
+from sgsst_core.planning.context import Facts, Hardware, NetworkPixels, Saving, WeightCost
 from sgsst_core.planning.measurement_choice import LEAST_ALLOWED
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
@@ -91,7 +91,7 @@ def facts(**changes: Any) -> Facts:
     survey = Survey(
         weights, list(range(VIEWS)), [Rectangle(0, 0, HEIGHT, WIDTH)] * VIEWS, changes.pop("uncovered", 0.0)
     )
-    known = Facts(6, 3, 3, 0.0, ((HEIGHT, WIDTH),) * VIEWS, survey, Machine("cpu", 10 * GIGABYTE), "cpu", WeightCost())
+    known = Facts(6, 3, 3, 0.0, ((HEIGHT, WIDTH),) * VIEWS, survey, Hardware("cpu", 10 * GIGABYTE), "cpu", WeightCost())
     return replace(known, **changes)
 
 
@@ -160,7 +160,7 @@ def test_blend_weights_are_cached_as_memory_and_visits_allow() -> None:
 )
 def test_smallest_number_of_ranks_near_the_fastest_is_used(seconds: dict[int, float], chosen: int) -> None:
     trials = {ranks: replace(TRIAL, sos=replace(TRIAL.sos, seconds=own)) for ranks, own in seconds.items()}
-    plan = plan_of(facts(machine=Machine("cpu", GIGABYTE, 4, 4)), trials, steps_coarse=0)
+    plan = plan_of(facts(machine=Hardware("cpu", GIGABYTE, 4, 4)), trials, steps_coarse=0)
     assert plan.ranks == chosen
     assert expected(plan).seconds == seconds[chosen]
     assert expected(plan).seconds_one_rank == seconds.get(1)
@@ -170,14 +170,14 @@ def test_smallest_number_of_ranks_near_the_fastest_is_used(seconds: dict[int, fl
 
 
 def test_job_without_steps_uses_one_rank() -> None:
-    for machine in (Machine("cpu", GIGABYTE, 4, 4), Machine("cpu", GIGABYTE)):
+    for machine in (Hardware("cpu", GIGABYTE, 4, 4), Hardware("cpu", GIGABYTE)):
         plan = plan_of(facts(machine=machine), {1: TRIAL, machine.ranks: TRIAL}, steps_coarse=0, steps_sos=0)
         assert plan.ranks == 1
         assert expected(plan).job == expected(plan).measuring
 
 
 def test_graphs_are_used_if_they_save_time() -> None:
-    gpu = facts(machine=Machine("cuda", 10 * GIGABYTE))
+    gpu = facts(machine=Hardware("cuda", 10 * GIGABYTE))
     for cost, used in ((Saving(1.0, 0.5, 1.0), True), (Saving(1.0, 0.99), False), (None, False)):
         plan = plan_of(gpu, {1: replace(TRIAL, device=GIGABYTE)}, cost)
         assert plan.graphs is used
