@@ -51,6 +51,7 @@ from sgsst_core.report.document import plan_json
 from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.stylizing.checkpoint import versions
 from worker.capture import choose_axes
 from worker.derive import blend, convert
 from worker.inputs import Inputs, errors_of, read_inputs
@@ -377,6 +378,7 @@ def _confine(request: WorkRequest) -> list[None]:
     folder = request.folder
     links = [*folder.rglob("*"), *cache_folder().glob("*.safetensors")]
     linked = [path.resolve() for path in links if path.is_symlink()]
+    versions()  # is cached: the files that it reads may not be among those of the installation
     output, most_bytes = None, 0
     if request.output:
         name, most_bytes = request.output

@@ -6,6 +6,7 @@ older one is used.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -119,8 +120,12 @@ class Checkpoints:
         self.previous.unlink(missing_ok=True)
 
 
+@functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of this program ("unknown" if it is not installed) and of PyTorch."""
+    """Return the versions of this program ("unknown" if it is not installed) and of PyTorch.
+
+    They are cached, because a confined process may not read the files of an installation from source.
+    """
     try:
         program = version("sgsst-service")
     except PackageNotFoundError:
