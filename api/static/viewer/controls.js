@@ -137,7 +137,7 @@ export class Controls {
   key(event) {
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, moves = this.motion.moves(key);
     if (key === "Shift" || key === "Control") return this.motion.hurry(event.shiftKey, event.ctrlKey);
-    if ((event.ctrlKey || event.metaKey || event.altKey) && !(moves && event.repeat)) return;
+    if ((event.ctrlKey || event.metaKey || event.altKey) && !this.motion.held.has(key)) return; // a shortcut of the browser
     if (moves) {
       this.motion.press(key);
       this.keys.moved?.();
@@ -170,6 +170,7 @@ export class Controls {
 
   blur() {
     this.motion.stop();
+    this.motion.hurry(false, false);
     this.keys.hold?.(false);
   }
 }

@@ -30,6 +30,11 @@ def store(settings: ServiceSettings) -> Iterator[Store]:
 
 @pytest.fixture
 def lease(store: Store) -> Lease:
+    return new_lease(store)
+
+
+def new_lease(store: Store) -> Lease:
+    """Create a job, and return its lease."""
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
     taken = store.leases.take("one")

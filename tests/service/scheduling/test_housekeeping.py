@@ -9,19 +9,10 @@ import pytest
 from service.files.artifacts import Artifacts
 from service.scheduling import housekeeping
 from service.settings import ServiceSettings
-from service.store import Store, open_store
-from service.store.jobs import NewJob
-from service.store.leases import Lease, Published
-
-SHA = "a" * 64
-
-
-def lease(store: Store) -> Lease:
-    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
-    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    taken = store.leases.take("one")
-    assert taken is not None
-    return taken
+from service.store import open_store
+from service.store.leases import Published
+from tests.service.scheduling.conftest import new_lease
+from tests.service.store.helpers import SHA
 
 
 def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,7 +25,7 @@ def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def put(job_id: str, epoch: int) -> Published:
         return artifacts.put(job_id, epoch, "plan.json", source)
 
-    done, running = lease(store), lease(store)
+    done, running = new_lease(store), new_lease(store)
     referenced = put(done.job_id, 1)
     store.leases.succeed(done, [referenced], {})
     late, unknown = put(done.job_id, 1), put("job_0123456789", 1)
