@@ -113,10 +113,10 @@ def _stylize(
         bar = stack.enter_context(job_bar(error_console))
 
         def prepared(summary: Prepared) -> None:
-            for heading, line in summary.lines:
-                print_field(heading, line)
             if workers is None:
                 stack.enter_context(stop.on_signal(_announce_stop))
+            for heading, line in summary.lines:
+                print_field(heading, line)
 
         listener = Listener(prepared, bar.show, warn=notify, stop=stop, happened=notify)
         ended = stylize(request, workers, listener, options or WorkerOptions())
