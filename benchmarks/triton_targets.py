@@ -166,7 +166,7 @@ KERNELS: dict[str, Target] = {
             kernel,
             {"CHANNELS": 64, "MASK": torch.iinfo(integers).max, "BLOCK": pooling_kernels.BLOCK.value},
             4,
-            {"gradient": types, "source": types, "out": types, "height": "i32", "entries": "i32"},
+            {"gradient": types, "source": types, "out": types, "height": "i32", "windows": "i32"},
         )
         for kernel in (pooling_kernels.max_pool, pooling_kernels.max_pool_backward)
         for form, integers, types in (("float32", torch.int32, "*i32"), ("bfloat16", torch.int16, "*i16"))

@@ -68,10 +68,10 @@ def fused_max_pool(source: Tensor) -> Tensor:
     cells = _cells(source).view(_INTEGERS[source.element_size()])
     height, width, channels = cells.shape
     out, block = source.new_empty((height // 2, width // 2, channels)), kernels.BLOCK.value
-    if entries := out.numel():
+    if out.numel():
         with on_device(source.device):
-            kernels.max_pool[(-(-entries // block),)](
-                cells, out.view(cells.dtype), width, width // 2, entries,
+            kernels.max_pool[(-(-out.numel() // block),)](
+                cells, out.view(cells.dtype), width, width // 2, out.numel() // channels,
                 CHANNELS=channels, MASK=torch.iinfo(cells.dtype).max, BLOCK=block,
             )  # fmt: skip
     return out.permute(2, 0, 1).unsqueeze(0)
@@ -84,11 +84,11 @@ def fused_max_pool_backward(gradient: Tensor, source: Tensor) -> Tensor:
     cells, slopes = (_cells(values).view(_INTEGERS[values.element_size()]) for values in (source, gradient))
     height, width, channels = cells.shape
     out, block = source.new_empty(cells.shape), kernels.BLOCK.value
-    entries = -(-height // 2) * -(-width // 2) * channels
-    if entries:
+    windows = -(-height // 2) * -(-width // 2)
+    if windows:
         with on_device(source.device):
-            kernels.max_pool_backward[(-(-entries // block),)](
-                slopes, cells, out.view(cells.dtype), height, width, entries,
+            kernels.max_pool_backward[(-(-windows * channels // block),)](
+                slopes, cells, out.view(cells.dtype), height, width, windows,
                 CHANNELS=channels, MASK=torch.iinfo(cells.dtype).max, BLOCK=block,
             )  # fmt: skip
     return out.permute(2, 0, 1).unsqueeze(0)

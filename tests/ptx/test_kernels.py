@@ -107,6 +107,19 @@ def test_pooling_and_its_gradients_are_those_of_the_reference(
     assert torch.equal(actual, expected)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_threads_that_pool_move_16_bytes_at_a_time(dtype: torch.dtype) -> None:
+    source, gradient = (torch.ones((1, side, side, 64), dtype=dtype).permute(0, 3, 1, 2) for side in (7, 3))
+    with compiled_kernels(80) as driver:
+        fused_max_pool(source)
+        fused_max_pool_backward(gradient, source)
+        for name in ("max_pool", "max_pool_backward"):
+            opcodes = [one.opcode for one in driver.kernels[name].program.instructions]
+            accesses = [opcode for opcode in opcodes if opcode[0] in ("ld", "st") and opcode[1] == "global"]
+            assert len(accesses) >= 5
+            assert all("v4" in opcode for opcode in accesses)
+
+
 def sparse(shape: tuple[int, ...], strides: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """Return zeros with large strides; only accessed pages take memory."""
     count = sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True)) + 1
