@@ -50,7 +50,7 @@ def home() -> tuple[str, ...]:
     Processes that can see each other have the same one.
     """
     if not sys.platform.startswith("linux"):
-        return socket.gethostname(), str(os.geteuid())
+        return socket.gethostname(), psutil.Process().username()
     boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     return boot, str(Path("/proc/self/ns/pid").readlink()), str(os.geteuid())
 

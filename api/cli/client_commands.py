@@ -27,10 +27,10 @@ from api.cli.console import (
 )
 from api.cli.options import with_arguments, with_options
 from api.client.inputs import different_names, path_or_url
-from service.files.cache import file_digest
 from service.parameters import JobParameters
 from service.states import ACTIONS, STEPPING, Transition
 from sgsst_core.errors import OutputError, SettingsError
+from sgsst_core.files.atomic import file_digest
 from sgsst_core.files.formats import EXTRA_FORMATS, RESULT_SUFFIXES, ExtraName, by_name, format_of_name, result_name
 from sgsst_core.number_format import duration
 from sgsst_core.progress import Progress

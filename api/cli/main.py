@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import sys
@@ -101,6 +102,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Expected errors become one message on stderr and an exit code, without a traceback."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     warnings.formatwarning = _format_warning
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":  # file names hold any characters
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = app(args=arguments, prog_name="sgsst", obj=arguments, standalone_mode=False)
         return code if isinstance(code, int) else 0

@@ -39,9 +39,10 @@ def serve(
     """Run the service on this machine: HTTP API and dispatcher. Environment variables SGSST_... configure it."""
     chosen = {"SGSST_HOST": host, "SGSST_PORT": port}
     os.environ.update({name: str(value) for name, value in chosen.items() if value is not None})
+    settings = _service_settings(data)
     from api.cli.supervisor import serve as run
 
-    run(_service_settings(data), error_console.print)
+    run(settings, error_console.print)
 
 
 def fsck(
@@ -153,10 +154,16 @@ COMMANDS = (serve, fsck)
 
 def _service_settings(data: Path | None) -> ServiceSettings:
     """Return the settings from the environment, to which a data folder is added for other processes."""
+    from sgsst_core.errors import SettingsError
+
+    if os.name != "posix":
+        raise SettingsError(
+            "The service does not run on Windows itself. Run this command in WSL2 (`wsl --install`), or run the "
+            "container image; `sgsst submit` and the page reach both from here."
+        )
     from pydantic import ValidationError
 
     from service.settings import ServiceSettings
-    from sgsst_core.errors import SettingsError
     from sgsst_core.options import reason
 
     if data is not None:

@@ -17,7 +17,7 @@ import stamina
 
 from api.client.answers import ApiError, RequestError, checked, is_temporary, refusal
 from sgsst_core.errors import OutputError
-from sgsst_core.files.atomic import disk_errors
+from sgsst_core.files.atomic import disk_errors, replace
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
@@ -117,6 +117,7 @@ class Download:
 
         Raises:
             ApiError: If the SHA-256 differs from the service's. The partial file is then deleted.
+            OutputError: If another program holds the target open.
         """
         expected = self._stamp.read_text() if self._stamp.exists() else ""
         self._stamp.unlink(missing_ok=True)
@@ -128,7 +129,7 @@ class Download:
         if self._digest.hexdigest() != expected:
             self._part.unlink()
             raise ApiError(f"{self.path}: the download was damaged in transit. Try again.", 460)
-        self._part.replace(self._target)
+        replace(self._part, self._target)
 
     def discard(self) -> None:
         """Delete the partial file."""

@@ -14,10 +14,9 @@ from pathlib import Path
 
 from service import problems
 from service.files.blobs import disk_errors
-from service.files.cache import file_digest
 from service.files.objects import ObjectStore
 from service.store.leases import Published
-from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.atomic import atomic_path, file_digest
 from sgsst_core.files.formats import RESULT_FORMATS
 
 #: Error numbers that mean that a hard link is impossible: different file systems, or no support for hard links.

@@ -12,11 +12,12 @@ from pathlib import Path
 from service.errors import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.blobs import BLOBS, UPLOADS, BlobFolder, Blobs, PartWriter, write_all
-from service.files.cache import FileCache, file_digest
+from service.files.cache import FileCache
 from service.files.objects import ObjectStore
 from service.settings import ServiceSettings
 from service.store.inputs import InputRows
 from service.store.tables import BlobRow, UploadPartRow, UploadRow
+from sgsst_core.files.atomic import file_digest
 
 #: Age in seconds at which objects without a database row are removed; younger objects may not have their row yet.
 _ORPHAN_SECONDS = 6 * 3600.0

@@ -24,7 +24,6 @@ from typing import Any
 from service import problems
 from service.errors import DamagedFileError, LostFileError, ServiceError
 from service.files.artifacts import Artifacts
-from service.files.cache import file_digest
 from service.files.objects import ObjectStore
 from service.files.staging import CHECKPOINT, RESULT, stage
 from service.files.stored_blobs import open_cache
@@ -34,6 +33,7 @@ from service.startup import keep_private
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.weight_files import cache_folder
+from sgsst_core.files.atomic import file_digest
 from worker.ranks.cluster import scene_bytes
 from worker.ranks.rank import Stored
 

@@ -11,6 +11,7 @@ import importlib
 import importlib.metadata
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -148,7 +149,8 @@ def _gpu() -> Diagnosis:
         name, library = torch.cuda.get_device_name(device), torch.version.cuda or torch.version.hip
         text = f"{torch.cuda.device_count()} x {name}, compute capability {capability}, CUDA {library}, driver {driver}"
         return Diagnosis("GPU", "works", text)
-    if not any(Path(path).exists() for path in ("/dev/nvidia0", "/proc/driver/nvidia/version", "/dev/kfd")):
+    devices = ("/dev/nvidia0", "/proc/driver/nvidia/version", "/dev/kfd")
+    if not any(Path(path).exists() for path in devices) and shutil.which("nvidia-smi") is None:
         return Diagnosis("GPU", "works", "there is none; jobs run on the CPU")
     if torch.version.cuda is None and torch.version.hip is None:
         text = "there is one, but this PyTorch is built for CPUs only. Install a build for its CUDA or ROCm version."

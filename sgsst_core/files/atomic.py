@@ -1,4 +1,4 @@
-"""Atomic writing of output files."""
+"""Atomic writing of output files, and their digests."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import json
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,8 @@ from sgsst_core.errors import OutputError
 
 #: Error numbers of a full disk, of an exhausted quota and of a file that may not grow further.
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+#: Seconds for which replacing a file is tried again while another program holds it open, which Windows forbids.
+HELD_SECONDS = 5.0
 
 
 @contextmanager
@@ -25,12 +28,14 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
     The temporary file is created empty in the folder of the target, with the same suffix. If the block raises, it is
     deleted. Otherwise it is flushed to disk and renamed over the target, then the folder is flushed. After a power
-    failure, the target is therefore either the old or the new file.
+    failure, the target is therefore either the old or the new file. On Windows, the target cannot be replaced
+    while another program holds it open; see `replace`.
 
     If the target is a symbolic link, the file it points to is replaced. An existing target's permissions are retained.
 
     Raises:
-        OutputError: If the folder is missing or not writable, the target is a folder, or the disk is full.
+        OutputError: If the folder is missing or not writable, the target is a folder or held open by another program,
+            or the disk is full.
     """
     final = Path(os.path.realpath(target))
     if final.is_dir():
@@ -43,11 +48,50 @@ def atomic_path(target: Path) -> Iterator[Path]:
                 shutil.copymode(final, temporary)
             with temporary.open("r+b") as file:  # fsync requires write access on some systems
                 os.fsync(file.fileno())
-            temporary.replace(final)
+            replace(temporary, final)
+    except HeldOpenError:
+        raise
     except BaseException:  # includes KeyboardInterrupt: no partial file may remain
         temporary.unlink(missing_ok=True)
         raise
     _flush_folder(final.parent)
+
+
+class HeldOpenError(OutputError):
+    """A file cannot be replaced, because another program holds it open; the new file is complete and kept beside it."""
+
+
+def replace(temporary: Path, final: Path) -> None:
+    """Rename a complete file over another one in its folder, which another program may hold open for a moment.
+
+    Raises:
+        HeldOpenError: If it cannot be replaced for `HELD_SECONDS`. The message names the new file.
+    """
+    deadline = time.monotonic() + HELD_SECONDS
+    while True:
+        try:
+            temporary.replace(final)
+            return
+        except PermissionError as error:
+            problem = error
+        if time.monotonic() > deadline:
+            break
+        time.sleep(0.1)
+    kept = final.with_name(f"{final.stem}.new{final.suffix}")
+    try:
+        temporary.replace(kept)
+    except OSError:
+        kept = temporary
+    raise HeldOpenError(
+        f"{final}: cannot be replaced: {problem.strerror}. Another program may have it open. Nothing is lost: the new "
+        f"file is {kept}."
+    ) from problem
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:

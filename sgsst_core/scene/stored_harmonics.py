@@ -13,6 +13,7 @@ them.
 from __future__ import annotations
 
 import os
+import threading
 import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -69,15 +70,16 @@ class RowFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0))
+            self._file = path.open("rb", buffering=0)
         except OSError as error:
             raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
-        weakref.finalize(self, os.close, self._descriptor)
+        self._reading = threading.Lock()
+        weakref.finalize(self, self._file.close)
 
     @property
     def stamp(self) -> tuple[int, int]:
         """Size in bytes and modification time in ns."""
-        status = os.fstat(self._descriptor)
+        status = os.fstat(self._file.fileno())
         return status.st_size, status.st_mtime_ns
 
     def check_unchanged(self, stamp: tuple[int, int]) -> None:
@@ -94,12 +96,19 @@ class RowFile:
         left = buffer.data
         while left:
             try:
-                count = os.preadv(self._descriptor, [left], offset)
+                count = self._read(left, offset)
             except OSError as error:
                 raise SceneError(f"{self.path}: cannot be read: {error.strerror}. Run again.") from error
             if not count:
                 raise changed(self.path)
             left, offset = left[count:], offset + count
+
+    def _read(self, buffer: memoryview, offset: int) -> int:
+        if hasattr(os, "preadv"):
+            return os.preadv(self._file.fileno(), [buffer], offset)
+        with self._reading:  # Windows reads only at the position, which all threads share
+            self._file.seek(offset)
+            return self._file.readinto(buffer)
 
 
 def changed(path: Path) -> SceneError:

@@ -30,9 +30,9 @@ from worker.ranks.failure_policy import first_line
 #: Size of Ray's object store in bytes. The default is 30 % of all memory, but the store holds almost nothing here:
 #: torch.distributed exchanges tensors, and scenes are read from files.
 OBJECT_STORE_BYTES = 512 << 20
-#: Maximum length of the path of Ray's temporary folder. It keeps the paths of Ray's sockets within the system's limit
-#: of 107 bytes.
-_LONGEST_FOLDER = 40
+#: Length of a folder's path from which it cannot hold Ray's temporary folder: the paths of Ray's sockets would exceed
+#: the system's limit of 107 bytes.
+_LONGEST_PARENT = 24
 #: Token of every Ray instance that this process starts. Ray reads the token only once.
 _SECRET = secrets.token_hex(32)
 #: Seconds in which a cluster must answer, and type of the frame that starts every HTTP/2 connection.
@@ -117,8 +117,8 @@ class Cluster:
 
         _silence_ray()
         parent = tempfile.gettempdir()
-        self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir=parent if len(parent) < 24 else "/tmp"))
-        assert len(str(self._folder)) <= _LONGEST_FOLDER
+        too_long = len(parent) >= _LONGEST_PARENT and os.name == "posix"  # elsewhere Ray has no sockets with paths
+        self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir="/tmp" if too_long else parent))
         self._sweeper = sweeper.beside(self._folder)
         earlier = set(psutil.Process().children())
         try:

@@ -3,6 +3,7 @@
 The lowest rank of a machine reads the scene and copies its arrays to an anonymous memory file (memfd). The other ranks
 open that file through the /proc entry of the reader and map it copy-on-write: ranks share the pages, but cannot change
 each other's data. The system frees the memory when the last process that uses it ends, so it cannot leak.
+Where there are no such files (Windows, macOS), every rank reads the scene.
 
 The spherical harmonics of a large scene stay in its file, which every rank opens. The system's page cache holds them
 once for all ranks.
@@ -13,6 +14,7 @@ from __future__ import annotations
 import mmap
 import os
 import socket
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -88,7 +90,7 @@ def read_shared_scene(
     if collectives.rank == reader:
         try:
             own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
-            if sharing > 1:
+            if sharing > 1 and hasattr(os, "memfd_create"):
                 own, shared = _share(own)
         except SgsstError as raised:
             error = raised
@@ -97,13 +99,12 @@ def read_shared_scene(
         for _, problem in offers:
             if problem is not None:
                 raise problem
-        if own is None:
-            offer = offers[reader][0]
-            assert offer is not None
-            try:
+        offer = offers[reader][0]
+        if own is None and offer is not None:
+            with suppress(OSError):  # some systems hide even the user's own processes in /proc
                 own = _mapped(offer, f"/proc/{offer.process}/fd/{offer.descriptor}")
-            except OSError:  # some systems hide even the user's own processes in /proc
-                own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
+        if own is None:
+            own = read_scene(path, drop_invalid=drop_invalid, held_bytes=_held_bytes(growth), spz_axes=spz_axes)
         collectives.all_gather(None)  # barrier: the reader closes its memory file after all ranks have opened it
     finally:
         if shared is not None:

@@ -20,13 +20,13 @@ from safetensors.numpy import save_file
 
 from service.errors import LostFileError, StoreError
 from service.files.artifacts import Artifacts
-from service.files.cache import file_digest
 from service.files.staging import CHECKPOINT
 from service.scheduling import publishing, store_workplace
 from service.scheduling.store_workplace import StoredFile, StoreWorkplace, store_weights
 from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.network_weights import load_network_weights
+from sgsst_core.files.atomic import file_digest
 from tests.api.service import wait_for
 from tests.service.files.s3 import FaultyS3, environment_of, s3_server
 

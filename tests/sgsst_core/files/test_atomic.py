@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from sgsst_core.errors import OutputError
-from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, remove_leftovers
+from sgsst_core.files import atomic
+from sgsst_core.files.atomic import HeldOpenError, atomic_path, ensure_writable_folder, remove_leftovers
 
 
 def test_target_appears_only_when_complete(tmp_path: Path) -> None:
@@ -121,3 +122,23 @@ def test_existing_entries_do_not_make_a_folder_unwritable(tmp_path: Path) -> Non
         (tmp_path / name).mkdir()
     ensure_writable_folder(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["part", "sgsst", "trial"]
+
+
+def test_file_that_cannot_replace_its_target_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows refuses while another program has the target open; tests/api/windows does so on Windows' Python."""
+    target, replace = tmp_path / "scene.ply", Path.replace
+    target.write_text("old")
+
+    def refuse(path: Path, final: Path) -> Path:
+        if final == target:
+            raise PermissionError(errno.EACCES, "Access is denied")
+        return replace(path, final)
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    monkeypatch.setattr(atomic, "HELD_SECONDS", 0.2)
+    problem = r"scene\.ply: cannot be replaced: Access is denied.*scene\.new\.ply"
+    with pytest.raises(HeldOpenError, match=problem), atomic_path(target) as temporary:
+        temporary.write_text("new")
+    assert target.read_text() == "old"
+    assert (tmp_path / "scene.new.ply").read_text() == "new"
+    assert len(list(tmp_path.iterdir())) == 2
