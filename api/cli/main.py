@@ -17,7 +17,7 @@ from api.cli import client_commands, operator_commands
 from api.cli.bench_commands import bench_app
 from api.cli.console import BAD_INPUT, CONFLICT, FAILURE, INTERRUPTED, NOT_FOUND, error_console, out_console
 from api.cli.machine_commands import doctor, weights_app
-from api.cli.scene_commands import blend, check, convert, plan, render
+from api.cli.scene_commands import blend, check, convert, plan, render, view
 from api.cli.study_commands import study_app
 from api.cli.stylize_commands import demo, stylize
 from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
@@ -75,6 +75,7 @@ _COMMANDS: tuple[Callable[..., Any], ...] = (
     render,
     convert,
     blend,
+    view,
     demo,
     doctor,
     *client_commands.COMMANDS,

@@ -23,13 +23,14 @@ from api.cli.arguments import (
 )
 from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
-from sgsst_core.errors import SettingsError
+from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
 from sgsst_core.number_format import clock, duration
 from sgsst_core.stylizing.progress_bar import job_bar, live_bar
 from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
+    from sgsst_core.files.scene_file import SceneFile
     from sgsst_core.planning.plan import Plan
     from worker.video import VideoRequest
 
@@ -221,6 +222,45 @@ def convert(
     if converted.loss is not None:
         print_field("compared", converted.loss.text(scene.name))
     print_field("scene", f"{out}, {converted.scene}")
+
+
+@with_options(ViewOptions, only=("drop_invalid", "spz_axes", "render_mode", "eps2d"))
+def view(
+    scene: SceneArgument,
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="HTML file to write.", callback=file_to_write, show_default=False, rich_help_panel=ESSENTIALS
+        ),
+    ],
+    original: Annotated[
+        Path | None,
+        typer.Option(
+            parser=local_path,
+            metavar="PATH",
+            help="Unstylized scene to compare with, by a wipe and a blend.",
+            rich_help_panel=ESSENTIALS,
+        ),
+    ] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the page. [default: the name of the scene]")] = None,
+    *,
+    options: ViewOptions,
+) -> None:
+    """Write a scene as one HTML file, which shows it in 3D in a browser, without a server."""
+    from api.exported_page import write_page
+    from sgsst_core.files.scene_file import read_scene
+
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise OutputError(f"{out}: not the name of an HTML file. Give one, such as scene.html.")
+
+    def read(path: Path) -> SceneFile:
+        file = read_scene(path, drop_invalid=options.drop_invalid, spz_axes=options.spz_axes)
+        return file.rendered(options.render_mode, options.eps2d)
+
+    with spinner("Compressing the scene"):
+        before = None if original is None else read(original)
+        write_page(out, read(scene), before, title or scene.name.partition(".")[0])
+    print_field("page", f"{out}, {out.stat().st_size / 1e6:.1f} MB: open it in a browser")
 
 
 @with_options(ViewOptions, only=("drop_invalid", "spz_axes"))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-import json
 import mimetypes
 import re
 from dataclasses import dataclass
@@ -21,13 +20,9 @@ from fastapi import FastAPI, Request, Response
 
 from api.http.addresses import path_of
 from api.http.sending import names_etag
+from api.static_files import FOLDER, read_static
 from service import problems
-from service.optional import installed_extras
-from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
-from sgsst_core.files.formats import FORMATS, RESULT_FORMATS
-from sgsst_core.options import STRENGTHS
 
-FOLDER = Path(__file__).parents[1] / "static"
 #: Placeholder in pages for the URL prefix of the files.
 _PREFIX = b"{{static}}"
 _DIGEST_LETTERS = 16
@@ -87,14 +82,7 @@ class StaticFiles:
 @cache
 def static_files(folder: Path = FOLDER) -> StaticFiles:
     """Read and compress the files of a folder."""
-    contents = {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    }
-    for name, (placeholder, value) in _filled_modules().items():
-        if name in contents:
-            contents[name] = contents[name].replace(placeholder, json.dumps(value).encode())
+    contents = read_static(folder)
     whole = hashlib.sha256()
     for name, body in contents.items():
         whole.update(f"{name}\0{len(body)}\0".encode() + body)
@@ -103,30 +91,6 @@ def static_files(folder: Path = FOLDER) -> StaticFiles:
     return StaticFiles(
         digest, *({name: _file(name, body) for name, body in part.items()} for part in (contents, pages))
     )
-
-
-def _filled_modules() -> dict[str, tuple[bytes, object]]:
-    """Return the placeholder in each module that contains a table of the server, with the table as JSON."""
-    formats = [
-        {
-            "name": each.name,
-            "suffix": each.suffix,
-            "title": each.title,
-            "result": each in RESULT_FORMATS,
-        }
-        for each in FORMATS
-    ]
-    actions = [
-        {"name": name, "title": name.capitalize(), "statuses": action.statuses} for name, action in ACTIONS.items()
-    ]
-    groups = {"unfinished": UNFINISHED, "working": WORKING, "stepping": STEPPING}
-    states = {"titles": TITLES, **groups, "actions": actions}
-    return {
-        "scene_formats.js": (b'"{{scene_formats}}"', formats),
-        "installed.js": (b'"{{installed_extras}}"', installed_extras()),
-        "strength.js": (b'"{{strengths}}"', STRENGTHS),
-        "statuses.js": (b'"{{job_states}}"', states),
-    }
 
 
 def _file(name: str, body: bytes) -> StaticFile:

@@ -14,8 +14,9 @@ export class Blend {
    * @param {any[]} jobs one or two finished jobs of one scene
    * @param {string[]} names their names
    * @param {() => void} changed called after each change of the weights
+   * @param {boolean} stored whether the service can store the blend
    */
-  constructor(jobs, names, changed) {
+  constructor(jobs, names, changed, stored = true) {
     this.jobs = jobs;
     this.changed = changed;
     /** Fraction of style, 0 to 1.5, and of the second result in it, 0 to 1. */
@@ -29,7 +30,7 @@ export class Blend {
     this.button = h("button.quiet", { type: "button", onclick: () => this.save() }, say.save);
     this.note = h("p.help", { role: "status" });
     const sliders = h("div.sliders", this.styleSlider.element, jobs.length > 1 && this.secondSlider.element);
-    this.element = h("fieldset.blend", h("legend", say.title), jobs.length > 1 && this.triangle(names), sliders, h("div.row", this.button, this.format), this.note);
+    this.element = h("fieldset.blend", h("legend", say.title), jobs.length > 1 && this.triangle(names), sliders, h("div.row", { hidden: !stored }, this.button, this.format), this.note);
     this.weigh();
   }
 

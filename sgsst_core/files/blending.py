@@ -48,10 +48,10 @@ def blend_scenes(files: Sequence[SceneFile], weights: Sequence[float]) -> SceneF
     fractions = normalized(weights)
     first = files[0]
     for file in files[1:]:
-        _check_same_shape(first, file)
+        check_same_shape(first, file)
     scenes = [file.scene for file in files]
     scene = replace(first.scene, sh_dc=_weighted_sum([scene.sh_dc for scene in scenes], fractions))
-    rests = _rests(scenes)
+    rests = common_rests(scenes)
     if all(torch.equal(rest, rests[0]) for rest in rests[1:]):
         return replace(first, scene=scene)
     # `write_stylized`, which preserves the bytes of a PLY, changes only colors
@@ -91,7 +91,8 @@ def normalized(weights: Sequence[float]) -> list[float]:
     return [weight / total for weight in weights]
 
 
-def _check_same_shape(first: SceneFile, file: SceneFile) -> None:
+def check_same_shape(first: SceneFile, file: SceneFile) -> None:
+    """Raise a SceneError if two scenes differ in more than color."""
     if len(file.scene) != len(first.scene):
         raise SceneError(
             f"{file.path}: has {len(file.scene):,} Gaussians, but {first.path} has {len(first.scene):,}. Blend scenes "
@@ -105,7 +106,7 @@ def _check_same_shape(first: SceneFile, file: SceneFile) -> None:
             )
 
 
-def _rests(scenes: Sequence[Scene]) -> list[Tensor]:
+def common_rests(scenes: Sequence[Scene]) -> list[Tensor]:
     """Return the coefficients above degree 0 of each scene, with zeros for bands that only others have."""
     most = max(scene.sh_rest.shape[1] for scene in scenes)
     rests = []

@@ -1,0 +1,94 @@
+"""Tests of `sgsst view`: one HTML file that shows a scene in a browser, opened from disk."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from api.cli.main import main
+from sgsst_core.constants import SH_C0
+from sgsst_core.files.scene_file import write_scene
+from sgsst_core.scene.gaussians import Scene
+from tests.api.page.browser import Watched
+from tests.small_scenes import wall
+
+
+def painted(red: float, green: float, blue: float, *, harmonics: float = 0.0) -> Scene:
+    """Return the wall in one color, with spherical harmonics of degree 1 and this size."""
+    scene = wall(sh_degree=1)
+    color = (torch.tensor([red, green, blue]) - 0.5) / SH_C0
+    rest = torch.linspace(-harmonics, harmonics, scene.sh_rest.numel()).reshape(scene.sh_rest.shape)
+    return replace(scene, sh_dc=color.expand(len(scene), 3).clone(), sh_rest=rest)
+
+
+def export(folder: Path, stylized: Scene, original: Scene | None, *options: str) -> int:
+    """Export scenes to page.html in a folder, and return the exit code."""
+    for name, scene in (("stylized.ply", stylized), ("scene.ply", original)):
+        if scene is not None:
+            write_scene(folder / name, scene)
+    compared = ["--original", str(folder / "scene.ply")] if original else []
+    return main(["view", str(folder / "stylized.ply"), *compared, "--out", str(folder / "page.html"), *options])
+
+
+@pytest.mark.slow
+def test_exported_page_wipes_between_both_colors(tmp_path: Path, browser: Any) -> None:
+    assert export(tmp_path, painted(0.9, 0.1, 0.1), painted(0.1, 0.1, 0.9), "--title", "Red <&> blue") == 0
+    page = Watched(browser, (tmp_path / "page.html").as_uri())
+    page.page.goto(page.url)
+    assert page.page.title() == "Red <&> blue"
+    page.wipe("Home")
+    red = page.pixels().max(axis=(0, 1))
+    page.wipe("End")
+    blue = page.pixels().max(axis=(0, 1))
+    assert red[0] > 200 > 60 > red[2]
+    assert blue[2] > 200 > 60 > blue[0]
+    style = page.page.get_by_label("Amount of style")
+    style.fill("0")
+    page.wipe("Home")
+    assert page.pixels().max(axis=(0, 1)) == pytest.approx(blue, abs=3)
+    page.check()
+    page.context.close()
+
+
+@pytest.mark.slow
+def test_exported_page_of_one_scene(tmp_path: Path, browser: Any) -> None:
+    assert export(tmp_path, painted(0.1, 0.9, 0.1, harmonics=0.01), None) == 0
+    page = Watched(browser, (tmp_path / "page.html").as_uri())
+    page.page.goto(page.url)
+    assert page.pixels().max(axis=(0, 1))[1] > 200
+    assert not page.page.get_by_label("Wipe", exact=True).is_visible()
+    page.check()
+    page.context.close()
+
+
+def test_attenuated_harmonics_are_those_of_the_original(tmp_path: Path) -> None:
+    original = painted(0.2, 0.2, 0.2, harmonics=0.3)
+    attenuated = replace(painted(0.7, 0.2, 0.2), sh_rest=0.4 * original.sh_rest)
+    assert export(tmp_path, attenuated, original) == 0
+    assert '"fade": 0.6' in (tmp_path / "page.html").read_text(encoding="utf-8").replace("0.59999", "0.6")
+
+
+@pytest.mark.parametrize(
+    ("original", "problem"),
+    [
+        (wall(20, 20, sh_degree=1), "Gaussians"),
+        (replace(wall(sh_degree=1), means=wall().means + 1), "positions"),
+        (painted(0.2, 0.2, 0.2, harmonics=0.3), "view-dependent colors are not those of"),
+    ],
+)
+def test_other_scene_is_refused(
+    tmp_path: Path, original: Scene, problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(tmp_path, wall(sh_degree=1), original) == 2
+    assert problem in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_page_must_be_an_html_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_scene(tmp_path / "stylized.ply", wall())
+    assert main(["view", str(tmp_path / "stylized.ply"), "--out", str(tmp_path / "page.ply")]) == 2
+    assert "not the name of an HTML file" in capsys.readouterr().err
