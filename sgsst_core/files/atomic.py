@@ -77,14 +77,14 @@ def replace(temporary: Path, final: Path) -> None:
         if time.monotonic() > deadline:
             break
         time.sleep(0.1)
-    kept = final.with_name(f"{final.stem}.new{final.suffix}")
+    new = final.with_name(f"{final.stem}.new{final.suffix}")
     try:
-        temporary.replace(kept)
+        temporary.replace(new)
     except OSError:
-        kept = temporary
+        new = temporary
     raise HeldOpenError(
         f"{final}: cannot be replaced: {problem.strerror}. Another program may have it open. Nothing is lost: the new "
-        f"file is {kept}."
+        f"file is {new}."
     ) from problem
 
 
