@@ -235,6 +235,13 @@ class Settings(BaseModel):
         description="Weight of each scale in the loss, starting at full size, each scale half as large as the one "
         "before; scales without a weight, or with weight 0, are not computed.",
     )
+    scale_sampling: Annotated[int, Option(unit="visits", metavar="N")] = Field(
+        1,
+        ge=1,
+        le=16,
+        description="In phase 2, evaluate a scale other than the coarsest in one of N visits of a view that evaluate "
+        "the next coarser scale, drawn at random, with N times the weight; 1 evaluates all scales in every step.",
+    )
     refine: Annotated[RefineFactor | Literal["auto"], Option(unit="factor", metavar="N", parse=parse_growth)] = Field(
         1.0,
         description="Split Gaussians that are large on screen, for finer strokes: up to N times as many in total "

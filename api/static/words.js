@@ -139,7 +139,7 @@ export const words = {
       up: "Up direction", elevation: "Height of the orbit", radius: "Distance of the orbit",
       near: "Near plane", drop_invalid: "Skip broken Gaussians", spz_axes: "Axes of an SPZ file", render_mode: "Antialiasing", eps2d: "Pixel blur", steps_coarse: "Steps for rough colors", steps_sos: "Steps for detail", learning_rate: "Learning rate",
       feature_scale: "Layer weighting", style_loss: "Style comparison", position_weights: "Ignore empty background", precision: "Precision", training_background: "Background while painting",
-      scales: "Scale weights", seed: "Random seed", memory_limit: "Memory limit", coarsest_side: "Smallest view size", warm_start: "Start from the painting's colors",
+      scales: "Scale weights", scale_sampling: "Fine details in one visit of", seed: "Random seed", memory_limit: "Memory limit", coarsest_side: "Smallest view size", warm_start: "Start from the painting's colors",
       clamp_aware_gradient: "Recover clamped colors", bounded: "Keep colors displayable", early_stop: "Stop when nothing changes", target_loss: "Stop at this loss", cached_weights: "Cached blend weights",
       views_per_step: "Views per step", rebalance: "Balance the workers", measure: "Quality check", backbone: "Feature network", workers: "Workers",
     }),

@@ -6,7 +6,7 @@ addresses, so inputs that differ between views are first copied to these address
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,11 +54,15 @@ def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
 
 @dataclass(frozen=True)
 class _Key:
-    """Cache key of a graph: all properties that must match for a replay. `style` is the `id` of the style targets."""
+    """Cache key of a graph: all properties that must match for a replay. `style` is the `id` of the style targets.
+
+    `weights` are those of the scales in the gradient; empty for the loss's own.
+    """
 
     size: tuple[int, ...]
     dtype: torch.dtype
     tiles: tuple[tuple[int, PartitionTile], ...]
+    weights: tuple[float, ...]
     coverage: tuple[int, ...] | None
     regions: int
     content_weights: bool
@@ -127,7 +131,9 @@ class LossGraphs:
         self._static.clear()
         self._visited.clear()
 
-    def evaluate(self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: Sequence[int]) -> SosResult:
+    def evaluate(
+        self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: Sequence[int] | Mapping[int, float]
+    ) -> SosResult:
         """Evaluate the loss and its gradient, as `SosLoss.evaluate` does.
 
         The next evaluation overwrites the image gradient of the result. `style` must never be changed in place.
@@ -149,7 +155,9 @@ class LossGraphs:
         with self.loss.timer("network"):
             return graph.replay(image, view)
 
-    def _key(self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: Sequence[int]) -> _Key | None:
+    def _key(
+        self, image: Tensor, style: StyleTargets, view: ViewTarget, scales: Sequence[int] | Mapping[int, float]
+    ) -> _Key | None:
         """Return the graph key of an evaluation; None if the evaluation cannot be captured."""
         division = view.division
         if division is None or division.tiles.keys() != set(scales):
@@ -162,14 +170,14 @@ class LossGraphs:
         if not can_be_captured(self.loss.tiling, [tile.outer.pixels for _, tile in tiles]):
             return None
         coverage = tuple(view.coverage[0].shape) if view.coverage else None
-        regions = len(view.regions or ())
-        return _Key(
-            tuple(image.shape), image.dtype, tiles, coverage, regions, view.content_weights is not None, id(style)
-        )
+        weights = tuple(scales.values()) if isinstance(scales, Mapping) else ()
+        regions, weighted = len(view.regions or ()), view.content_weights is not None
+        return _Key(tuple(image.shape), image.dtype, tiles, weights, coverage, regions, weighted, id(style))
 
     def _capture(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph:
         loss, device = self.loss, self.loss.network.device
         scales = [scale for scale, _ in key.tiles]
+        weighted = dict(zip(scales, key.weights, strict=True)) if key.weights else scales
         static_image, static_view = self._static_inputs(key, image, view)
         values = torch.empty((len(scales), len(TERMS)), dtype=torch.float64, device=device)
         dtype = torch.promote_types(loss.network.dtype, torch.float32)
@@ -183,7 +191,7 @@ class LossGraphs:
                 torch.cuda.stream(self._stream),
                 torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"),
             ):
-                result = loss.evaluate(static_image, style, static_view, scales)
+                result = loss.evaluate(static_image, style, static_view, weighted)
                 assert result.image_gradient is not None
                 # Copy to memory that other graphs do not reuse for activations.
                 values.copy_(result.values)

@@ -47,6 +47,28 @@ class ScaleWeights:
             raise ValueError(f"none of the scales {sorted(weights)} has a weight")
         return {scale: weight / total for scale, weight in weights.items()}
 
+    def sampled(self, chosen: Sequence[int], drawn: Iterable[int], period: int) -> dict[int, float]:
+        """Return the weights of drawn scales whose mean over all draws (`schedule.drawn_scales`) is `fractions`.
+
+        Args:
+            chosen: Scales of a view with a positive weight, finest first.
+            drawn: Those of them that a step evaluates.
+            period: Number of steps with a scale of which one has the next finer scale.
+        """
+        fractions = self.fractions(chosen)
+        return {scale: fractions[scale] * period ** (len(chosen) - 1 - chosen.index(scale)) for scale in drawn}
+
+    def sampled_cost(self, count: int, period: int) -> float:
+        """Return the cost of all scales but the coarsest in a mean step with `sampled` weights, relative to all of it.
+
+        Args:
+            count: Number of scales of a view.
+            period: See `sampled`.
+        """
+        *finer, _ = self.chosen(count)
+        costs = [(4.0**-scale, period ** -(len(finer) - place)) for place, scale in enumerate(finer)]
+        return sum(cost * fraction for cost, fraction in costs) / sum(cost for cost, _ in costs) if costs else 1.0
+
     def mean(self, losses: Mapping[int, float]) -> float:
         """Return E, the weighted mean of losses by scale. Every scale in `losses` must have a positive weight."""
         total = sum(self.of(scale) for scale in losses)

@@ -137,7 +137,7 @@ class SosLoss:
         image: Tensor,
         style: StyleTargets,
         view: ViewTarget,
-        scales: Sequence[int] | None = None,
+        scales: Sequence[int] | Mapping[int, float] | None = None,
         *,
         gradient: bool = True,
     ) -> SosResult:
@@ -145,14 +145,15 @@ class SosLoss:
 
         Args:
             image: Image of the view at full size, or of the rectangle that this rank renders (`Division.shares`).
-            scales: Scales to evaluate, each with a positive weight; phase 1 passes only the coarsest. None for the full
-                SOS loss.
+            scales: Scales to evaluate, each with a positive weight; phase 1 passes only the coarsest. A mapping gives
+                their weights in the gradient, for scales that were drawn. None for the full SOS loss.
         """
         shares = view.division.shares if view.division else None
         height, width = shares.size if shares else (image.shape[0], image.shape[1])
         scales = self.tiling.scales((height, width)) if scales is None else scales
         sizes = {scale: (height >> scale, width >> scale) for scale in scales}
-        division, weights = self._division(view, sizes), self.weights.fractions(sizes)
+        division = self._division(view, sizes)
+        weights = scales if isinstance(scales, Mapping) else self.weights.fractions(sizes)
         images = ViewImages(image.to(self.network.device), division, view.background, self.collectives, self.timer)
         values: dict[int, Tensor] = {}
         for some in rounds(list(sizes), self.collectives.size):

@@ -200,8 +200,8 @@ def plan_json(plan: Plan) -> dict[str, Any]:
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:
     """Return the measured values that correspond to the plan's prediction.
 
-    `seconds` and `seconds_coarse` are the median seconds of a step on a view visited before, in the phase on all scales
-    and on the coarsest one. `first_visit` and `first_visit_coarse` are the additional seconds of first visits.
+    `seconds` and `seconds_coarse` are the seconds of a step on a view visited before, in the phase on all scales and on
+    the coarsest one. `first_visit` and `first_visit_coarse` are the additional seconds of first visits.
     `communication` is the median seconds per step spent waiting for other ranks, in the phase on all scales. `speed_up`
     is relative to the predicted time of one rank. `measuring` is the total seconds spent on measurements. Peak memory
     is that of the process and of its GPU, in bytes.
@@ -224,30 +224,39 @@ def _measured(stylizer: Stylizer) -> dict[str, float | None]:
 
 
 def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float | None]:
-    """Return the median seconds of a phase's steps on views visited before, and the extra seconds of first visits.
+    """Return the `_typical` seconds of a phase's steps on views visited before, and the extra seconds of first visits.
 
     The extra seconds are averaged over first visits. The job's first step is excluded if the phase has other first
     visits, because it also prepares the style. If no view is visited twice, or if steps use several views (records name
-    only one of them), the first value is the median over all steps without their recorded preparation, and the second
-    value is None.
+    only one of them), the first value is that of all steps without their recorded preparation, and the second value is
+    None.
     """
-    again: list[float] = []
+    again: list[tuple[int, float]] = []
     first: list[float] = []
-    bare: list[float] = []
+    bare: list[tuple[int, float]] = []
     visited: set[int] = set()
     before = 0.0
     for record in stylizer.history:
         if record.stage == stage:
-            seconds = record.seconds - before
-            (again if record.view in visited else first).append(seconds)
+            seconds, scales = record.seconds - before, len(record.evaluated)
+            if record.view in visited:
+                again.append((scales, seconds))
+            else:
+                first.append(seconds)
             visited.add(record.view)
-            bare.append(sum(seconds for name, seconds in record.parts.items() if name != "prepare"))
+            bare.append((scales, sum(own for name, own in record.parts.items() if name != "prepare")))
         before = record.seconds
     if stylizer.job.settings.views_per_step > 1 or not again:
-        return (median(bare) if bare else None), None
-    known = median(again)
+        return (_typical(bare) if bare else None), None
+    known = _typical(again)
     first = first[1:] if stylizer.history[0].stage == stage and len(first) > 1 else first
     return known, max(mean(first) - known, 0.0)
+
+
+def _typical(steps: Sequence[tuple[int, float]]) -> float:
+    """Return the mean over steps (number of scales, seconds) of the median of the steps with as many scales."""
+    medians = {count: median(seconds for scales, seconds in steps if scales == count) for count, _ in steps}
+    return mean(medians[scales] for scales, _ in steps)
 
 
 def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
@@ -334,6 +343,7 @@ def _record_json(record: StepRecord, before: Evaluation, weights: ScaleWeights) 
         "loss": record.loss,
         "relative": ratio(record.loss, start),
         "scales": _evaluation_json(record.terms, weights)["scales"],
+        "evaluated": list(record.evaluated),
         "parts": {name: round(seconds, 4) for name, seconds in record.parts.items()},
         "memory_bytes": record.memory,
         "device_memory_bytes": record.device_memory,

@@ -315,7 +315,13 @@ def _state(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> StylizerSta
     """Return the state of a checkpoint from its tensors and other values."""
     stored = {**values, **tensors, "generator": tensors["generator"].to(torch.uint8)}
     stored["history"] = [
-        StepRecord(**{**entry, "terms": {int(scale): LossTerms(**terms) for scale, terms in entry["terms"].items()}})
+        StepRecord(
+            **{
+                **entry,
+                "terms": {int(scale): LossTerms(**terms) for scale, terms in entry["terms"].items()},
+                "evaluated": tuple(entry["evaluated"]),
+            }
+        )
         for entry in values["history"]
     ]
     return StylizerState(**{field.name: stored[field.name] for field in fields(StylizerState)})

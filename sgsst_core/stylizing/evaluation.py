@@ -57,6 +57,34 @@ def mean_evaluation(evaluations: Sequence[Evaluation]) -> Evaluation:
     return {scale: terms / counts[scale] for scale, terms in total.items()}
 
 
+def completed(evaluation: Evaluation, scales: Sequence[int], view: int, history: Sequence[StepRecord]) -> Evaluation:
+    """Return the loss of a step on a view, with estimates for the scales that it has not evaluated.
+
+    An estimate is the loss of the coarsest scale times the ratio of both at the latest step that evaluated both: on the
+    same view, or on any if there is none. Before the first of these steps, a scale is missing. Means over rounds are
+    thereby comparable from round to round, whichever scales were drawn.
+
+    Args:
+        evaluation: Loss of the evaluated scales.
+        scales: Scales of the view with a positive weight.
+        view: Index of the view.
+        history: Records of the earlier steps.
+    """
+    result, coarsest = dict(evaluation), max(evaluation)
+    for scale in set(scales) - evaluation.keys():
+        last = _last_with({scale, coarsest}, history, view) or _last_with({scale, coarsest}, history)
+        if last:
+            factor = ratio(evaluation[coarsest].total, last[coarsest].total) or 0.0
+            result[scale] = LossTerms(**{name: value * factor for name, value in last[scale].items()})
+    return dict(sorted(result.items()))
+
+
+def _last_with(scales: set[int], history: Sequence[StepRecord], view: int | None = None) -> Evaluation | None:
+    """Return the loss of the last step that evaluated some scales, on one view or on any."""
+    steps = (record for record in reversed(history) if view in (None, record.view))
+    return next((record.terms for record in steps if scales <= set(record.evaluated)), None)
+
+
 def round_loss(history: Sequence[StepRecord], round_length: int) -> float:
     """Return the loss of the last round of views: the geometric mean over the last steps of the current phase.
 

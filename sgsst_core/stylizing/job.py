@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -169,13 +169,14 @@ class StylizationJob:
         sh_dc: Tensor,
         style: StyleTargets,
         target: ViewTarget,
-        scales: Sequence[int],
+        scales: Sequence[int] | Mapping[int, float],
         background: Color | None = None,
     ) -> tuple[Tensor, SosResult]:
         """Return dE/dsh_dc [n, 3] of one view for colors [n, 3], and the loss.
 
         Args:
             sh_dc: Colors of the rendered Gaussians.
+            scales: Scales to evaluate; a mapping gives their weights (`SosLoss.evaluate`).
             background: Background color; None for that of the settings.
         """
         with self.timer("render"), torch.no_grad():

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from sgsst_core.budget import measuring_memory, memory_for, peak_memory
 from sgsst_core.decision import Decision
+from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.number_format import duration
 from sgsst_core.planning import choices
 from sgsst_core.planning.context import Facts, NetworkPixels, Saving
@@ -21,6 +22,7 @@ from sgsst_core.planning.measurement_choice import (
     novel_view_seconds,
 )
 from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.trial import Trial
 
@@ -78,13 +80,13 @@ def completed_plan(
     coarse = plan.steps_coarse
     sos = settings.steps_sos or int(not coarse)  # phase 1 may have been the only one and be skipped
     seconds = {
-        ranks: (coarse * trial.coarse.seconds + sos * trial.sos.seconds) / (coarse + sos)
+        ranks: (coarse * trial.coarse.seconds + sos * _sos_seconds(trial, facts, settings)) / (coarse + sos)
         for ranks, trial in trials.items()
     }
     ranks = choices.choose_ranks(seconds)
     trial = trials[ranks]
     plan = replace(plan, ranks=ranks, graphs=choices.uses_graphs(plan, facts, settings, cost))
-    one_rank = trials[1].sos.seconds if facts.machine.ranks > 1 and 1 in trials else None
+    one_rank = _sos_seconds(trials[1], facts, settings) if facts.machine.ranks > 1 and 1 in trials else None
     prediction = replace(_predicted_steps(plan, facts, settings, trial, cost), seconds_one_rank=one_rank)
     if plan.measured:
         plan, prediction = _with_measurements(plan, prediction, facts, settings, trial)
@@ -96,14 +98,24 @@ def completed_plan(
     return replace(plan, decisions=(*lines, *([_about_measuring(plan, settings)] if plan.measured else [])))
 
 
+def _sos_seconds(trial: Trial, facts: Facts, settings: Settings) -> float:
+    """Return the seconds of a step of phase 2 on average, because steps may leave out scales."""
+    count = max(scale_count(*size, settings.coarsest_side) for size in facts.sizes)
+    left_out = 1 - ScaleWeights(settings.scales).sampled_cost(count, settings.scale_sampling)
+    return trial.sos.seconds - left_out * (trial.sos.seconds - trial.coarse.seconds)
+
+
 def _predicted_steps(plan: Plan, facts: Facts, settings: Settings, trial: Trial, cost: Saving | None) -> Prediction:
     """Return the prediction for the steps, with first visits and style; those of the trial have been made already."""
     views = len(plan.covered)
     saved = settings.views_per_step * cost.saved if cost and plan.graphs else 0.0
     unvisited = max(1 - trial.views / views, 0.0)
     phases = [
-        (steps, max(own.seconds - saved, 0.0), own.first * unvisited)
-        for steps, own in ((settings.steps_sos, trial.sos), (plan.steps_coarse, trial.coarse))
+        (steps, max(seconds - saved, 0.0), first * unvisited)
+        for steps, seconds, first in (
+            (settings.steps_sos, _sos_seconds(trial, facts, settings), trial.sos.first),
+            (plan.steps_coarse, trial.coarse.seconds, trial.coarse.first),
+        )
     ]
     style = trial.style * max(len({facts.sizes[index] for index in plan.covered}) - 1, 0)
     job = style + sum(

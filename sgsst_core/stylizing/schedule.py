@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -82,6 +83,28 @@ def drawn_views(covered: Sequence[int], seed: int) -> Iterator[int]:
         yield from reversed(drawn_round(covered, generator))
 
 
+def drawn_scales(chosen: Sequence[int], period: int, seed: int, view: int, visit: int) -> list[int]:
+    """Return the scales of a view that a visit of phase 2 evaluates, finest first (`Settings.scale_sampling`).
+
+    The coarsest is always among them. Of each `period` visits that evaluate a scale, one evaluates the next finer one
+    too. The draw depends only on the arguments: there is no random state, and all ranks agree.
+
+    Args:
+        chosen: Scales of the view with a positive weight, finest first.
+        period: Number of visits; 1 for all scales in every visit.
+        seed: Seed of the job.
+        visit: Number of earlier visits of the view.
+    """
+    count = 1
+    while count < len(chosen):
+        visit, position = divmod(visit, period)
+        digest = hashlib.blake2b(f"{seed},{view},{count},{visit}".encode(), digest_size=8).digest()
+        if position != int.from_bytes(digest, "big") % period:
+            break
+        count += 1
+    return list(chosen[-count:])
+
+
 @dataclass(frozen=True)
 class StepRecord:
     """Record of one iteration.
@@ -90,11 +113,13 @@ class StepRecord:
         step: Step number, counted from 1 over both phases.
         view: Index of the camera; of the first one if the step has several views.
         seconds: Wall-clock seconds of all iterations so far, in all sessions of a resumed job.
-        loss: Loss before the step, mean over the step's views.
+        loss: Loss before the step, mean over the step's views and over the scales in `terms`.
+        terms: Loss by scale and term; of scales that the step has not evaluated, an estimate (`completed`).
         parts: Time in seconds of this step by activity.
         memory: Physical memory of the process after the step, in bytes.
         sent: Bytes sent by this rank to others, by purpose (`collectives.Traffic`); empty for a single rank.
         device_memory: Peak GPU memory of tensors so far, in bytes; None on a CPU.
+        evaluated: Scales that the step has evaluated.
     """
 
     step: int
@@ -107,6 +132,7 @@ class StepRecord:
     memory: int
     sent: dict[str, int] = field(default_factory=dict)
     device_memory: int | None = None
+    evaluated: tuple[int, ...] = ()
 
 
 @dataclass

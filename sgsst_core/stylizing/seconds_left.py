@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from statistics import median
+from statistics import fmean
 
 #: Number of latest steps of each phase that are used, separately with and without first visits.
 _LATEST = 101
@@ -41,10 +41,10 @@ class Pace:
         Args:
             ratio: Ratio of measured to predicted seconds of steps of any phase.
         """
-        step = median(self.later) if self.later else min([self.expected * ratio, *(own for own, _ in self.first)])
+        step = fmean(self.later) if self.later else min([self.expected * ratio, *(own for own, _ in self.first)])
         if not self.first:
             return step, self.expected_first * ratio
-        return step, max(median((seconds - step) / views for seconds, views in self.first), 0.0)
+        return step, max(fmean((seconds - step) / views for seconds, views in self.first), 0.0)
 
 
 class SecondsLeft:
@@ -86,7 +86,7 @@ class SecondsLeft:
             limit: Upper bound on the remaining seconds of steps; None for no bound.
         """
         phases, seconds, start = list(self._phases.values()), 0.0, 0
-        ratios = [median(phase.later) / phase.expected for phase in phases if phase.later and phase.expected]
+        ratios = [fmean(phase.later) / phase.expected for phase in phases if phase.later and phase.expected]
         for phase in phases:
             steps = phase.steps - min(max(step - start, 0), phase.steps)
             later, first = phase.prices(ratios[-1] if ratios else 1.0)

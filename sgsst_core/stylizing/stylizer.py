@@ -6,7 +6,7 @@ Each call of `Stylizer.run_step` makes one step; `loop.run` makes all steps.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Self, TypeVar
@@ -31,6 +31,7 @@ from sgsst_core.style import Style, image_of
 from sgsst_core.stylizing.evaluation import (
     Evaluation,
     ShowViews,
+    completed,
     evaluate,
     mean_evaluation,
     mean_loss,
@@ -48,6 +49,7 @@ from sgsst_core.stylizing.schedule import (
     StepRecord,
     StylizerState,
     ViewOrder,
+    drawn_scales,
     drawn_views,
     phase_at,
 )
@@ -199,7 +201,8 @@ class Stylizer:
             largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(done))
         with self.job.timer("communication"):
             self.job.team.check_drift(self.step + 1, self.sh_dc)
-        terms = self._read(largest, results)
+        evaluated = self._read(largest, results)
+        terms = completed(evaluated, phase.scales(self.job.scales(views[0])), views[0], self.history)
         self.step += 1
         self.job.timer.read()
         speeds = self.job.team.compare_speeds(cost, self.job.timer.seconds) if phase.scale is None else None
@@ -220,6 +223,7 @@ class Stylizer:
             memory=psutil.Process().memory_info().rss,
             sent={kind: total - sent[kind] for kind, total in self.job.collectives.sent.items() if total > sent[kind]},
             device_memory=device_peak(self.job.network.device),
+            evaluated=tuple(evaluated),
         )
         self.history.append(record)
         return record
@@ -234,11 +238,11 @@ class Stylizer:
         cost = 0
         own_views = views[self.job.team.own_group :: self.job.team.groups]
         for position, index in enumerate(own_views):
-            scales = phase.scales(self.job.scales(index))
+            scales = self._scales(index, phase, self.step, views[0])
             background = self.drawn_background(index)
             with self.job.timer("prepare", whole=True):
                 self.job.views.cache_weights(index)
-                target = self.job.view_targets.target(index, scales, background)
+                target = self.job.view_targets.target(index, list(scales), background)
                 self._prefetch(own_views[position + 1 :], phase)
                 style = self.job.style_targets(self.job.views.cameras[index])
             assert target.division is not None
@@ -302,7 +306,24 @@ class Stylizer:
             index, phase = self._order.left[-1 - self.job.team.own_group], phase_at(self.job.schedule, self.step + 1)
         else:
             return
-        self.job.view_targets.prefetch(index, phase.scales(self.job.scales(index)))
+        step, first = (self.step, self.latest[0]) if left else (self.step + 1, self._order.left[-1])
+        self.job.view_targets.prefetch(index, list(self._scales(index, phase, step, first)))
+
+    def _scales(self, index: int, phase: Phase, step: int, first: int) -> Sequence[int] | Mapping[int, float]:
+        """Return the scales of a view that a step evaluates, finest first; with their weights if they are drawn.
+
+        Args:
+            index: Index of the view.
+            step: Number of steps before this one.
+            first: First view of the step, whose draw applies to all of them, so that no group of ranks waits.
+        """
+        chosen, settings = phase.scales(self.job.scales(index)), self.job.settings
+        period = settings.scale_sampling
+        if period == 1 or len(chosen) == 1:
+            return chosen
+        visit = step * settings.views_per_step // len(self.job.views.covered)
+        drawn = drawn_scales(chosen, period, settings.seed, first, visit)
+        return self.job.loss.weights.sampled(chosen, drawn, period)
 
     def evaluate(
         self, indices: Sequence[int], sh_dc: Tensor | None = None, show: ShowViews = show_nothing

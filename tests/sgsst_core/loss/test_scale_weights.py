@@ -17,6 +17,7 @@ from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.schedule import drawn_scales
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import cameras
 
@@ -64,6 +65,36 @@ def test_float64_agrees_with_the_definition(
     assert actual.loss == pytest.approx(expected, rel=1e-9)
     assert actual.image_gradient is not None
     assert relative_error(actual.image_gradient, gradient) < 1e-9
+
+
+@pytest.mark.parametrize(("values", "period"), [((), 2), ((1.0, 0.5, 2.0), 2), ((1.0, 0.0, 2.0), 3)])
+def test_mean_gradient_of_all_draws_is_that_of_the_whole_loss(
+    tiny_weights: BackboneWeights, values: tuple[float, ...], period: int
+) -> None:
+    """Each view sees every draw equally often, so the mean over as many visits as there are draws is the mean."""
+    image, content, painting = (synthetic_image(*SIZE, seed=seed) for seed in (1, 2, 3))
+    expected = sos_reference(
+        tiny_weights, image, resize_area(painting, style_size(SIZE, SIZE)), content, coarsest=COARSEST, scales=values
+    )[1]
+    weights = ScaleWeights(values)
+    loss = SosLoss(FeatureNetwork(tiny_weights, dtype=torch.float64), coarsest=COARSEST, scales=weights)
+    style, view = loss.targets.of_style(Style.of(painting), SIZE), loss.targets.of_view(content)
+    chosen = weights.chosen(3)
+    draws = period ** (len(chosen) - 1)
+    mean = torch.zeros_like(image)
+    for visit in range(draws):
+        drawn = drawn_scales(chosen, period, 7, 2, visit)
+        gradient = loss.evaluate(image, style, view, weights.sampled(chosen, drawn, period)).image_gradient
+        assert gradient is not None
+        mean += gradient / draws
+    assert relative_error(mean, expected) < 1e-9
+
+
+def test_cost_of_drawn_scales_is_the_mean_over_draws() -> None:
+    assert EVEN.sampled_cost(3, 1) == EVEN.sampled_cost(1, 5) == 1
+    assert EVEN.sampled_cost(2, 4) == pytest.approx(1 / 4)
+    assert EVEN.sampled_cost(3, 2) == pytest.approx((16 / 4 + 4 / 2) / 20)
+    assert ScaleWeights((1.0, 0.0, 2.0)).sampled_cost(3, 3) == pytest.approx(1 / 3)
 
 
 def test_scales_without_weight_are_not_computed(tiny_weights: BackboneWeights) -> None:

@@ -136,6 +136,7 @@ def test_storage_format_of_losses_is_stable(full_checkpoint: Checkpoint, tmp_pat
     assert history[1] == {
         **{"step": 2, "stage": "sos", "view": 3, "seconds": 0.3, "loss": 4.0},
         **{"parts": {"render": 0.2, "loss": 1 / 3}, "memory": 10**9, "sent": {"image": 7}, "device_memory": None},
+        **{"evaluated": []},
     }
 
 

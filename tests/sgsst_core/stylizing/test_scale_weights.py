@@ -80,6 +80,39 @@ def test_missing_scales_are_refused_before_the_survey(tiny_weights: BackboneWeig
         make(tiny_weights, scales=(1.0, 0.0, 0.0, 1.0))
 
 
+def test_drawn_scales_are_the_same_after_a_resume_and_losses_cover_all(tiny_weights: BackboneWeights) -> None:
+    """Each of three views shows the finer scales once in two and four visits."""
+    values = {"steps_coarse": 0, "steps_sos": 12, "scale_sampling": 2, "early_stop": False}
+    whole, first, second = (make(tiny_weights, **values) for _ in range(3))
+    run(whole)
+    for _ in range(7):
+        first.run_step()
+    second.load_state(first.state())
+    run(second)
+    assert torch.equal(second.stylized(), whole.stylized())
+    assert [record.terms for record in second.history] == [record.terms for record in whole.history]
+    for view in range(3):
+        visits = [len(record.evaluated) for record in whole.history if record.view == view]
+        assert sorted(visits) == [1, 1, 2, 3]
+    known: set[int] = set()
+    for record in whole.history:
+        known |= set(record.evaluated)
+        assert set(record.terms) == known
+        assert record.loss == pytest.approx(sum(terms.total for terms in record.terms.values()) / len(known))
+
+
+def test_losses_of_scales_that_were_not_drawn_follow_the_coarsest(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, steps_coarse=0, steps_sos=9, scale_sampling=3, scales=(1.0, 1.0))
+    run(stylizer)
+    ratios: dict[int, float] = {}
+    for record in stylizer.history:
+        ratio = record.terms[0].total / record.terms[1].total if 0 in record.terms else None
+        if record.evaluated == (0, 1):
+            ratios[record.view] = ratio
+        elif record.view in ratios:
+            assert ratio == pytest.approx(ratios[record.view])
+
+
 @pytest.mark.slow
 def test_runs_are_bit_identical_and_reduce_the_loss(tiny_weights: BackboneWeights) -> None:
     first, second = (make(tiny_weights, steps_sos=30, scales=(0.0, 1.0, 2.0), early_stop=False) for _ in range(2))

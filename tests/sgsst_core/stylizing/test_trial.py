@@ -196,6 +196,17 @@ def test_job_time_adds_steps_first_visits_style_and_measuring() -> None:
     assert limited.job - limited.measuring == pytest.approx(5.0)
 
 
+def test_steps_that_leave_out_scales_count_as_their_mean() -> None:
+    """Views have two scales."""
+    sampled = plan_of(facts(), scale_sampling=4)
+    assert expected(sampled).seconds == pytest.approx(0.4 + (2.0 - 0.4) / 4)
+    assert expected(sampled).first_visit == expected(plan_of(facts(), scale_sampling=1)).first_visit
+    assert "finer scales cost 75% less" in text_of(sampled, "scale sampling")
+    one_scale = plan_of(facts(), scale_sampling=4, coarsest_side=600)
+    assert expected(one_scale).seconds == 2.0
+    assert line(one_scale, "scale sampling") is None
+
+
 def test_planned_measuring_stays_within_the_allowed_time() -> None:
     for steps in (16, 200, 2000):
         plan = plan_of(facts(), steps_sos=steps)
