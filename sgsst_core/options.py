@@ -175,6 +175,18 @@ def parse_bytes(text: str) -> int:
     return size
 
 
+#: Seconds per unit of a time.
+_SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+
+
+def parse_seconds(text: str) -> float:
+    """Return seconds from "90s", "5m", "1.5h" or a plain number."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?|\.\d+)\s*([a-z]*)", text.strip().lower())
+    if not match or match[2] not in _SECONDS:
+        raise ValueError(f"{text!r} is not a time. Give one such as 90s, 5m or 1h.")
+    return float(match[1]) * _SECONDS[match[2]]
+
+
 def parse_strength(text: str) -> float:
     """Return a content weight from "light", "balanced", "strong" or a number."""
     if text.lower() in STRENGTHS:

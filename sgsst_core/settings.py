@@ -30,6 +30,7 @@ from sgsst_core.options import (
     parse_bytes,
     parse_color,
     parse_growth,
+    parse_seconds,
     parse_strength,
     parse_weights,
     reason,
@@ -49,6 +50,8 @@ TrainingBackground = Literal["auto", "background", "random", "palette"]
 #: Prefix of the description of a default that depends on the preset.
 BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
+#: Settings that a time budget chooses if they are not given.
+_BUDGETED = ("max_resolution", "steps_coarse", "steps_sos", "learning_rate_end")
 
 
 #: Upper limit of a view's longer side in pixels: well beyond the paper's 5187, and low enough that a typo does not
@@ -248,12 +251,24 @@ class Settings(BaseModel):
         "(1 = off); auto: only those too large for the strokes of the finest scale, up to twice as many in total.",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Seed for the order of views and for random training backgrounds.")
-    max_seconds: Annotated[float | None, Option(unit="seconds", metavar="S", default="no limit")] = Field(
+    within: Annotated[
+        float | None,
+        Option(
+            unit="seconds",
+            metavar="TIME",
+            default="no limit",
+            parse=parse_seconds,
+            syntax=", such as 90s, 5m or 1h.",
+        ),
+    ] = Field(
         None,
         gt=0,
         allow_inf_nan=False,
-        description="Stop after S seconds of steps and write the result. Not counted: reading, the survey of the "
-        "views, and measurements of speed and quality.",
+        description="Time budget of the whole job, from its start to its last file; chooses the resolution, the number "
+        "of views and the steps that fit, unless they are given.",
+    )
+    fixed: Annotated[tuple[str, ...], Option(instead="within")] = Field(
+        (), description="What a time budget leaves as it is: given settings, and `views`."
     )
     memory_limit: Annotated[
         int | None,
@@ -384,6 +399,8 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     chosen = {shown[name].field if name in shown else name: each for name, each in values.items() if each is not None}
     if "learning_rate" in chosen:  # an explicit learning rate is constant, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])
+    if "within" in chosen:
+        chosen.setdefault("fixed", tuple(name for name in _BUDGETED if name in chosen))
     whole = _PRESETS[preset]
     settings = checked(Settings, {"preset": preset, **whole, **chosen})
     fraction = (settings.steps_coarse + settings.steps_sos) / (whole["steps_coarse"] + whole["steps_sos"])

@@ -13,6 +13,7 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers, write_json
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.files.stylized_ply import write_colors, write_stylized
+from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.progress import Progress
 from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
@@ -43,6 +44,7 @@ def execute(
     saved: Callable[[int], None] = lambda step: None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     run_id: str | None = None,
+    left: SecondsLeft | None = None,
 ) -> Result:
     """Run a prepared job and write its outputs.
 
@@ -59,6 +61,7 @@ def execute(
         saved: Callback that receives the step of each checkpoint.
         checkpoint_seconds: Seconds between checkpoints. A job that ends early writes one more at its end.
         run_id: Identifier of this run, stored in checkpoints. None generates one.
+        left: Seconds left of the time budget; None without one.
 
     Raises:
         OutputError: If the PLY, or the checkpoint of an interrupted job, cannot be written.
@@ -78,7 +81,7 @@ def execute(
     if first:
         _write_views(job, warn)
     checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), saved, warn)
-    callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds)
+    callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds, left=left)
     if first:
         callbacks.progress, callbacks.stop, callbacks.finish = reported, stop, finish
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
@@ -86,15 +89,15 @@ def execute(
         if preview and not _has_rows_of_file(job):
             preview.live.share_scene(stylizer.job.scene)
     stopped = run(stylizer, callbacks)
-    if first and stopped in ("on-request", "max-seconds", "target-loss", "converged"):
+    if first and stopped in ("on-request", "within", "target-loss", "converged"):
         expected = stylizer.job.plan.prediction
-        left = measure.seconds_left(stylizer.step, ends=True) + (expected.ending if expected else 0.0)
-        reported.end_early(left)
+        remaining = measure.seconds_left(stylizer.step, ends=True) + (expected.ending if expected else 0.0)
+        reported.end_early(remaining)
     if stopped == "interrupted":
         if checkpoint.error is not None:
             raise checkpoint.error
         return Result(stopped=stopped, steps=stylizer.step, total=stylizer.job.total_steps)
-    result = _finish(job, stopped, measure)
+    result = _finish(job, stopped, measure, left)
     if first and preview:
         preview.finish(stylizer)
     return result
@@ -163,8 +166,11 @@ class _CheckpointWriter:
             self._warn(f"The checkpoint could not be written: {error}")
 
 
-def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
-    """Write the PLY, then all other outputs. Every rank must call this function."""
+def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft | None) -> Result:
+    """Write the PLY, then all other outputs. Novel views are left out if a time budget has no time for them.
+
+    Every rank must call this function.
+    """
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.job.collectives.rank == 0
     attenuation = stylizer.job.settings.sh_attenuation
@@ -172,9 +178,11 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements) -> Result:
         lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized(), sh_attenuation=attenuation)
     )
     compressed = stylizer.job.collectives.broadcast(lambda: _write_compressed(job))
-    if first and stopped != "max-seconds":
+    if first and stopped != "within":
         outputs.checkpoints.remove()
-    measure.at_the_end()
+    needed = measure.seconds_left(stylizer.step, ends=True)
+    if stylizer.job.collectives.broadcast(lambda: left is None or left() > needed):
+        measure.at_the_end()
     # The initial loss is evaluated here, because evaluating it before the first step would delay the job.
     before = measure.evaluate(unstylized=True)
     # A run that ends before its first step has no round of views.

@@ -31,9 +31,10 @@ from sgsst_core.orbit.choice import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.shown import nothing_seen
 from sgsst_core.planning.survey import sees_something
+from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.regions.definition import Regions
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
@@ -91,6 +92,11 @@ class Inputs:
     decisions: tuple[Decision, ...]
     regions: Regions | None
     reader: bool
+
+    def chosen(self, choice: TimeChoice, settings: Settings) -> Inputs:
+        """Return the inputs with the views of a time budget, given the settings that it has chosen."""
+        photos = self.photos and choice.of(self.photos)
+        return replace(self, cameras=fit_cameras(choice.of(self.cameras), settings), photos=photos)
 
     def photo_loader(self, background: Color) -> Callable[[int], Tensor] | None:
         """Return a function that loads the photo of a camera by its index; None if the job has no photos.

@@ -134,12 +134,16 @@ class StylizeOptions(_Chosen):
         Raises:
             SettingsError: If values contradict each other.
         """
-        return make_settings(self.preset, **self.given_settings())
+        settings = make_settings(self.preset, **self.given_settings())
+        views = self.views if self.orbit is None else self.orbit
+        if settings.within is None or views in (None, "auto"):
+            return settings
+        return settings.model_copy(update={"fixed": (*settings.fixed, "views")})
 
 
 #: Options by group, in the order of the page, the help texts and docs/options.md.
 GROUPS: dict[str, list[str]] = {
-    ESSENTIALS: ["preset", "content_weight", "resolution", "views", "max_seconds"],
+    ESSENTIALS: ["preset", "content_weight", "within", "resolution", "views"],
     VIEWS: ["orbit", "up", "elevation", "radius"],
     "Look": [
         "style_scale",

@@ -26,6 +26,7 @@ from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.context import common_device, rasterizer_problem
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
+from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice
 from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.refine.split import Refinement
 from sgsst_core.report.document import Sources
@@ -33,7 +34,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_plan, save_plan, versions
 from sgsst_core.stylizing.job import StylizationJob
-from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.planner import choose_within, plan_job
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.timing import Timer
@@ -75,6 +76,7 @@ def prepare(
     show_planning: ShowPlanning | None = None,
     preview: Previews | None = None,
     plan_file: Path | None = None,
+    left: SecondsLeft | None = None,
 ) -> Job:
     """Read and check all inputs of a job, and plan it. Every rank must call this function.
 
@@ -89,6 +91,7 @@ def prepare(
             is used.
         preview: Writer of previews, used on rank 0 of a new job; None to write none.
         plan_file: Plan that `dry_run` has handed over; None or a missing file for none.
+        left: Seconds left of the time budget, which chooses what the checkpoint or the plan has not; None without one.
 
     Raises:
         InvalidInputError: If an input cannot be used. Every rank raises the same error.
@@ -102,7 +105,7 @@ def prepare(
         inputs = read_inputs(request, collectives)
         fingerprint = fingerprint_of(inputs, settings, weights.sha256, collectives)
     resume = resume or Resume(request.resume)
-    resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, fingerprint, settings, resume, warn))
+    resumed = collectives.broadcast(lambda: _find_checkpoint(outputs, fingerprint, resume, warn))
     if resumed and not settings.memory_limit:
         settings = settings.model_copy(update={"memory_limit": resumed.state.memory})
     if preview and not resumed and collectives.rank == 0:
@@ -110,6 +113,12 @@ def prepare(
     known: Checkpoint | _HandedOver | None = resumed
     if plan_file and not resumed:
         known = collectives.broadcast(lambda: _handed_over(plan_file, fingerprint, inputs, settings))
+    chosen = known.plan.time_choice if known else None
+    if not known:
+        with timer("planning"):
+            chosen = _choose(inputs, settings, left, weights, collectives, show_planning)
+    asked, settings = settings, chosen.applied(settings) if chosen else settings
+    inputs = inputs.chosen(chosen, settings) if chosen else inputs
     refinement, scene_file = known.plan.refinement if known else None, inputs.scene_file
     if settings.growth > 1:
         with timer("refining"):
@@ -117,13 +126,14 @@ def prepare(
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     plan = _usable_plan(known, collectives)
     planned_ranks = known.ranks if known and plan else collectives.size
-    stylization = _planner(inputs, settings, weights, scene_file.scene, refinement)(
+    stylization = _planner(inputs, asked, weights, scene_file.scene, refinement, chosen)(
         plan=plan,
         photos=inputs.photo_loader(settings.background),
         collectives=collectives,
         survey=known.plan.survey if known else None,
         show=show_planning,
         timer=timer,
+        left=None if known else left,
     )
     with timer("preparing"):
         stylizer = Stylizer(stylization)
@@ -135,7 +145,13 @@ def prepare(
     return Job(request, outputs, scene_file, sources, stylizer, fingerprint, resumed, planned_ranks, workers)
 
 
-def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None, hand_over: Path | None = None) -> Plan:
+def dry_run(
+    request: JobSpec,
+    inputs: Inputs,
+    show: ShowPlanning | None = None,
+    hand_over: Path | None = None,
+    left: SecondsLeft | None = None,
+) -> Plan:
     """Plan a job as `prepare` would on one rank.
 
     Args:
@@ -143,16 +159,20 @@ def dry_run(request: JobSpec, inputs: Inputs, show: ShowPlanning | None = None, 
         inputs: Inputs of the job, from `read_inputs`.
         show: Callback for the progress of planning.
         hand_over: Existing file to write the plan to, for `prepare`; None writes nothing.
+        left: Seconds left of the time budget if the job had been started instead; None without one.
 
     Raises:
         InvalidInputError: If the job cannot be planned.
     """
     settings, weights = request.settings, load_network_weights(request.backbone)
-    refinement = _refine(inputs, settings, weights, ALONE, show)
+    chosen, of_job = _choose(inputs, settings, left, weights, ALONE, show), inputs
+    applied = chosen.applied(settings) if chosen else settings
+    inputs = inputs.chosen(chosen, applied) if chosen else inputs
+    refinement = _refine(inputs, applied, weights, ALONE, show)
     scene = refined(inputs.scene_file.scene, refinement)
-    plan = _planner(inputs, settings, weights, scene, refinement)(show=show).plan
+    plan = _planner(inputs, settings, weights, scene, refinement, chosen)(show=show, left=left).plan
     if hand_over:
-        job = fingerprint_of(inputs, settings, weights.sha256, ALONE)
+        job = fingerprint_of(of_job, settings, weights.sha256, ALONE)
         with contextlib.suppress(OSError):  # a job without this file plans again
             save_plan(hand_over, plan, job, _conditions(settings))
     return plan
@@ -193,10 +213,37 @@ def _conditions(settings: Settings) -> str:
     return json.dumps([settings.model_dump(mode="json"), versions(), machine])
 
 
+def _choose(
+    inputs: Inputs,
+    settings: Settings,
+    left: SecondsLeft | None,
+    weights: BackboneWeights,
+    collectives: Collectives,
+    show: ShowPlanning | None,
+) -> TimeChoice | None:
+    """Return the choice of the time budget; None without one."""
+    return left and choose_within(
+        inputs.scene_file.scene,
+        inputs.cameras,
+        inputs.style,
+        settings,
+        left,
+        weights=weights,
+        collectives=collectives,
+        regions=inputs.regions,
+        show=show,
+    )
+
+
 def _planner(
-    inputs: Inputs, settings: Settings, weights: BackboneWeights, scene: Scene, refinement: Refinement | None
+    inputs: Inputs,
+    settings: Settings,
+    weights: BackboneWeights,
+    scene: Scene,
+    refinement: Refinement | None,
+    chosen: TimeChoice | None,
 ) -> partial[StylizationJob]:
-    """Return `plan_job` for the job of some inputs, given their refined scene."""
+    """Return `plan_job` for the job of some inputs, given their refined scene and the choice of a time budget."""
     return partial(
         plan_job,
         scene,
@@ -209,6 +256,7 @@ def _planner(
         about_inputs=inputs.decisions,
         regions=inputs.regions and inputs.regions.refined(refinement),
         refinement=refinement,
+        chosen=chosen,
     )
 
 
@@ -254,9 +302,7 @@ def _workers_used(stylizer: Stylizer) -> dict[str, Any]:
     return {"used": len(ranks), "ranks": ranks}
 
 
-def _find_checkpoint(
-    outputs: Outputs, job_id: str, settings: Settings, resume: Resume, warn: Warn
-) -> Checkpoint | None:
+def _find_checkpoint(outputs: Outputs, job_id: str, resume: Resume, warn: Warn) -> Checkpoint | None:
     """Return the checkpoint to resume from; None to start from the beginning."""
     if not resume.wanted:
         return None
@@ -272,11 +318,6 @@ def _find_checkpoint(
         if resume.required:
             raise
         return None
-    if resume.required and settings.max_seconds and checkpoint.state.seconds >= settings.max_seconds:
-        raise CheckpointError(
-            f"{outputs.checkpoint}: the job has run for {checkpoint.state.seconds:.0f} s already, and --max-seconds "
-            f"counts these too. Give more than {checkpoint.state.seconds:.0f}, or omit --max-seconds."
-        )
     if checkpoint.written_by["torch"] != torch.__version__:
         warn(f"The checkpoint was written with PyTorch {checkpoint.written_by['torch']}: last digits may differ.")
     return checkpoint

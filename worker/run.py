@@ -141,11 +141,13 @@ def run_rank(
         RankLeftOut: If the plan does not use this rank.
     """
     from sgsst_core.parallel.collectives import ALONE
+    from sgsst_core.planning.time_budget import seconds_left
     from worker.execute import execute
     from worker.prepare import describe, prepare
     from worker.previews import Previews
 
     preview, collectives = None, collectives or ALONE
+    left = seconds_left(request.settings.within, options.started)
     if options.preview_folder:
         preview = Previews(options.preview_folder, options.preview_seconds, listener.warn)
     job = prepare(
@@ -156,6 +158,7 @@ def run_rank(
         show_planning=listener.progress,
         preview=preview,
         plan_file=options.plan_file,
+        left=left,
     )
     job.workers |= about_ranks or {}
     if collectives.rank == 0:
@@ -170,4 +173,5 @@ def run_rank(
         saved=listener.saved,
         checkpoint_seconds=options.checkpoint_seconds,
         run_id=run_id,
+        left=left,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
@@ -19,7 +20,7 @@ BAD_INPUT, FAILURE = 2, 1
 NOT_FOUND, CONFLICT, JOB_FAILED = 3, 4, 5
 #: Reasons why a job stopped before its last step.
 EARLY_ENDS = {
-    "max-seconds": "it reached --max-seconds (submit it again with more seconds to make more steps)",
+    "within": "its time budget was used up (submit it again with a larger `within` to make more steps)",
     "on-request": "it was asked to finish (submit it again to make all steps)",
     "target-loss": "the loss has reached --target-loss",
     "converged": "the loss no longer falls (use --no-early-stop to run all steps)",
@@ -29,6 +30,19 @@ INTERRUPTED = 130
 
 #: Characters that are not printed: control characters, which terminals obey, and marks that reorder a line.
 _CONTROLS = dict.fromkeys({*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A)} - {9, 10})
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """Invocation of the program.
+
+    Attributes:
+        arguments: Arguments of the command line.
+        started: Start of the process, or of the call of `main` in another program, in seconds since the epoch.
+    """
+
+    arguments: list[str]
+    started: float
 
 
 class PlainConsole(Console):

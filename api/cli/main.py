@@ -6,16 +6,27 @@ import io
 import json
 import re
 import sys
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, requires
 from typing import Annotated, Any
 
+import psutil
 import typer
 
 from api.cli import client_commands, operator_commands
 from api.cli.bench_commands import bench_app
-from api.cli.console import BAD_INPUT, CONFLICT, FAILURE, INTERRUPTED, NOT_FOUND, error_console, out_console
+from api.cli.console import (
+    BAD_INPUT,
+    CONFLICT,
+    FAILURE,
+    INTERRUPTED,
+    NOT_FOUND,
+    Invocation,
+    error_console,
+    out_console,
+)
 from api.cli.machine_commands import doctor, weights_app
 from api.cli.scene_commands import blend, check, convert, plan, render, view
 from api.cli.study_commands import study_app
@@ -101,12 +112,13 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Expected errors become one message on stderr and an exit code, without a traceback."""
+    started = psutil.Process().create_time() if arguments is None else time.time()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     warnings.formatwarning = _format_warning
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":  # file names hold any characters
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        code = app(args=arguments, prog_name="sgsst", obj=arguments, standalone_mode=False)
+        code = app(args=arguments, prog_name="sgsst", obj=Invocation(arguments, started), standalone_mode=False)
         return code if isinstance(code, int) else 0
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)

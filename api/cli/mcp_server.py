@@ -48,7 +48,7 @@ Options = Annotated[
     Field(
         description="Options by name, such as `preset` (preview, standard or paper), `orbit` (number of views around "
         "an object, in place of cameras), `content_weight` (light, balanced or strong), `style_weights`, "
-        "`preserve_colors`, `max_seconds` (time limit). /docs of the service lists all."
+        "`preserve_colors`, `within` (time budget in seconds). /docs of the service lists all."
     ),
 ]
 JobId = Annotated[str, Field(description="ID of a job, from `submit`.")]

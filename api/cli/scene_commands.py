@@ -41,6 +41,7 @@ _TIMED_FRAMES = 6
 @with_options(StylizeOptions, without=("workers",))
 @with_arguments(JobInputs)
 def plan(
+    context: typer.Context,
     inputs: JobInputs,
     out: Annotated[
         Path, typer.Option(help="JSON file to write the plan to.", callback=file_to_write, rich_help_panel=ESSENTIALS)
@@ -56,7 +57,7 @@ def plan(
 
     request = inputs.request(options, out)
     with job_bar(error_console) as bar:
-        plan = make_plan(request, bar.show, sheet)
+        plan = make_plan(request, bar.show, sheet, context.obj.started)
     out_console.print(_decisions_table(plan))
     if plan.prediction:
         seconds, peak = plan.prediction.seconds, plan.prediction.peak_bytes / 1e9

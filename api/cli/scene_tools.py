@@ -18,6 +18,7 @@ from sgsst_core.files.blending import normalized
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
+from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
@@ -38,18 +39,22 @@ _COMPARED_VIEWS = 3
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 
-def make_plan(request: JobSpec, show_planning: ShowPlanning | None = None, sheet: Path | None = None) -> Plan:
+def make_plan(
+    request: JobSpec, show_planning: ShowPlanning | None = None, sheet: Path | None = None, started: float | None = None
+) -> Plan:
     """Plan a job as `sgsst stylize` would, without making a step, and write the plan as JSON.
 
     Args:
         request: Request whose `out` is the file of the plan.
         show_planning: Callback that shows the progress of the survey of the views.
         sheet: JPEG file for images of the views, written before the plan is made; None writes no file.
+        started: Start of the time budget, in seconds since the epoch; None for now.
 
     Raises:
         InvalidInputError: If an input cannot be used; the first one is reported.
     """
     source, settings, out = request.source, request.settings, request.out
+    left = seconds_left(settings.within, started)
     check_choice(source, request.images)
     if out.suffix.lower() != ".json":  # a mistyped path must not overwrite a scene or its cameras
         raise OutputError(f"{out}: not the name of a JSON file. Give one, such as plan.json.")
@@ -65,7 +70,7 @@ def make_plan(request: JobSpec, show_planning: ShowPlanning | None = None, sheet
         sheet.parent.mkdir(parents=True, exist_ok=True)
         scene = inputs.scene_file.scene
         write_views(sheet, scene, inputs.cameras, background=settings.background, near=settings.near)
-    plan = dry_run(request, inputs, show_planning)
+    plan = dry_run(request, inputs, show_planning, left=left)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, plan_json(plan))
     return plan

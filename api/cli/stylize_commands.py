@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from api.cli.arguments import JobInputs, file_to_write, folder_to_write
-from api.cli.console import EARLY_ENDS, FAILURE, error_console, loss_text, out_console, print_field, spinner
+from api.cli.console import EARLY_ENDS, FAILURE, Invocation, error_console, loss_text, out_console, print_field, spinner
 from api.cli.machine_commands import fetch
 from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import WeightsError
@@ -31,9 +31,9 @@ if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command i
     from worker.ranks.rank import WorkerOptions
     from worker.run import Ended
 
-#: Resolution and number of steps of the demo, and seconds after which it stops on a slow machine. The whole demo takes
-#: less than five minutes.
-DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 180
+#: Resolution and number of steps of the demo, and its time budget, which ends the steps on a slow machine. The whole
+#: demo takes less than five minutes.
+DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 240
 
 
 @with_options(StylizeOptions)
@@ -59,7 +59,9 @@ def stylize(
     request = inputs.request(options, out, resume=run.resume)
     from worker.ranks.rank import WorkerOptions
 
-    _stylize(request, context.obj, options.workers, WorkerOptions(run.rank_timeout, run.checkpoint_seconds))
+    invocation: Invocation = context.obj
+    run_options = WorkerOptions(run.rank_timeout, run.checkpoint_seconds, started=invocation.started)
+    _stylize(request, invocation.arguments, options.workers, run_options)
 
 
 def demo(
@@ -80,11 +82,11 @@ def demo(
     with spinner("Building the scene"):
         files = build_demo(out)
     source = SceneRequest(scene=files.ply, cameras=files.cameras, resolution=DEMO_RESOLUTION)
-    settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, max_seconds=DEMO_SECONDS)
+    settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, within=DEMO_SECONDS)
     request = JobSpec(source=source, styles=(StyleFile(files.style),), out=out / "stylized.ply", settings=settings)
     options: dict[str, object] = {"--style": files.style, "--cameras": files.cameras, "--out": request.out}
     options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
-    options |= {"--steps-sos": DEMO_STEPS, "--max-seconds": DEMO_SECONDS}
+    options |= {"--steps-sos": DEMO_STEPS, "--within": DEMO_SECONDS}
     arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
     print_field("command", shlex.join(["sgsst", *arguments]))
     _stylize(request, arguments)
@@ -163,10 +165,10 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
         paths += [("report as JSON", outputs.report)]
     for heading, path in paths:
         print_field(heading, path)
-    if result.stopped == "max-seconds":
+    if result.stopped == "within":
         out_console.print(
-            f"Reached --max-seconds at step {result.steps} of {result.total}. The checkpoint is kept. To continue, "
-            f"raise --max-seconds, which counts from the first step:\n{command}"
+            f"The time of --within was used up at step {result.steps} of {result.total}. The checkpoint is kept. To "
+            f"continue, with as much time again, run:\n{command}"
         )
     elif result.stopped in EARLY_ENDS:
         out_console.print(f"Stopped at step {result.steps} of {result.total}: {EARLY_ENDS[result.stopped]}.")

@@ -133,7 +133,7 @@ export const words = {
   /** Titles, help, units and defaults of options for artists. Others are shown as the service describes them. */
   options: {
     titles: /** @type {Record<string, string>} */ ({
-      content_weight: "Content weight", resolution: "Resolution", views: "Views to use", max_seconds: "Time limit for painting",
+      content_weight: "Content weight", resolution: "Resolution", views: "Views to use", within: "Time",
       style_scale: "Stroke size", style_rotation: "Rotate the painting", preserve_colors: "Keep the scene's colors", background: "Background", style_background: "Behind transparent paintings",
       refine: "Finer strokes", sh_attenuation: "Soften reflections", stroke_depth: "Strokes by depth", unseen: "Parts that no view shows",
       up: "Up direction", elevation: "Height of the orbit", radius: "Distance of the orbit",
@@ -146,13 +146,13 @@ export const words = {
     help: /** @type {Record<string, string>} */ ({
       content_weight: "The strength as a number: lower values give more style, higher ones keep more of the original.",
       resolution: "Longer side of the views in pixels. Larger is finer, and slower.", views: "Uses this many of the cameras, evenly spread. Fewer is faster.",
-      max_seconds: "Counts painting steps only; reading, analyzing views and checking quality take extra time. What is painted by then is kept.", style_scale: "1 is the painting's own; 2 paints strokes twice as large.", style_rotation: "Turns the strokes, counterclockwise.",
+      within: "As good as it gets in this time, from its start to its last file. Chooses resolution, views and steps unless they are set.", style_scale: "1 is the painting's own; 2 paints strokes twice as large.", style_rotation: "Turns the strokes, counterclockwise.",
       preserve_colors: "match: the painting takes on the scene's colors. luminance: only brightness changes.", background: "black, white, or R,G,B from 0 to 255, such as 40,40,48.",
       style_background: "black, white, or R,G,B from 0 to 255.", refine: "Splits large Gaussians, up to this many times as many in total. 1 is off; auto splits those too large for strokes.",
       orbit: "auto: as many as the scene needs.", up: "auto: estimated from the scene.", elevation: "One ring at this height. Otherwise, as many rings as the scene needs.", radius: "From the scene's center.",
       sh_attenuation: "0 keeps highlights that move with the view, 1 removes them.", stroke_depth: "Strokes of the same size in the scene: larger ones nearby.", unseen: "neighbors: painted like what is around them. freeze: left as they are.",
     }),
-    units: /** @type {Record<string, string>} */ ({ content_weight: "", resolution: "", views: "", max_seconds: "seconds", style_scale: "×", refine: "×", sh_attenuation: "" }),
+    units: /** @type {Record<string, string>} */ ({ content_weight: "", resolution: "", views: "", within: "seconds", style_scale: "×", refine: "×", sh_attenuation: "" }),
     defaults: /** @type {Record<string, string>} */ ({ content_weight: "strong", orbit: "auto", radius: "automatic" }),
   },
   uploads: {
@@ -176,8 +176,8 @@ export const words = {
     made: (/** @type {string} */ at) => `Created ${at}`, took: (/** @type {number} */ s) => `took ${seconds(s)}`, attempt: (/** @type {number} */ n) => `attempt ${n}`, expires: (/** @type {string} */ at) => `kept until ${at}`,
     steps: (/** @type {number} */ n, /** @type {number} */ all) => (n < all ? `${count(n)} of ${several(all, "step")}` : several(n, "step")),
     lossLeft: (/** @type {number} */ left) => (left > 1 ? `the loss is ${percent(left - 1)} above that of the original` : `${percent(left)} of the loss is left`),
-    early: /** @type {Record<string, string>} */ ({ "max-seconds": "The time limit ended this job early", "on-request": "This job was stopped early", converged: "The loss no longer fell", "target-loss": "The target loss was reached" }),
-    onward: /** @type {Record<string, string>} */ ({ "max-seconds": "For more, choose “Same with changes” and raise the time limit.", "on-request": "For all steps, choose “Same with changes” and start again." }),
+    early: /** @type {Record<string, string>} */ ({ within: "Its time was used up", "on-request": "This job was stopped early", converged: "The loss no longer fell", "target-loss": "The target loss was reached" }),
+    onward: /** @type {Record<string, string>} */ ({ within: "For more, choose “Same with changes” and give it more time.", "on-request": "For all steps, choose “Same with changes” and start again." }),
     risen: "The loss has risen: choose “Same with changes” and give it more steps.",
     threeD: "3D", sheet: "Before and after", result: "Result", download: "Download", format: "Format", converting: "Converted on the first download, which takes about 10 seconds for a million Gaussians.", files: "Files", settings: "Settings", inputs: "Inputs", openReport: "Open the report", noFiles: "Nothing yet.", noScene: "This scene can't be shown here.", view3d: "Result", compare: "Compare with", compareWith: "Another job of this scene",
     sheetOf: (/** @type {string} */ name) => `Views of ${name} before and after`, failed: "The job failed", anotherPainting: "Try another painting", changed: "Same with changes",

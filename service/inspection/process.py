@@ -46,6 +46,7 @@ from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.images import image_size
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.paintings import STARRY_NIGHT
+from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.progress import Progress
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_confine`
@@ -158,10 +159,14 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
     inputs, settings = _read(request), request.parameters.settings()
     findings, spec = _findings(inputs), job_spec(request.staged, request.parameters)
     send({"checked": findings})
-    job_plan = dry_run(spec, inputs, lambda now: _show(now, send), request.output and request.output_file)
+    to_write = request.output and request.output_file
+    left = seconds_left(settings.within, time.time() - _seconds_to_start() - (time.perf_counter() - started))
+    job_plan = dry_run(spec, inputs, lambda now: _show(now, send), to_write, left)
+    if job_plan.time_choice:
+        settings = job_plan.time_choice.applied(settings)
     seconds = total = memory = on_device = None
     if expected := job_plan.prediction:
-        steps = min(expected.job - expected.measuring, settings.max_seconds or math.inf)
+        steps = expected.job - expected.measuring
         # The job starts a process with the same modules as this one, then reads and plans as was done here.
         total = _seconds_to_start() + time.perf_counter() - started + steps + expected.measuring + expected.ending
         memory, on_device = expected.peak_bytes, expected.device_bytes

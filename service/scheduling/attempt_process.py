@@ -17,6 +17,7 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import psutil
 from pydantic import BaseModel
 
 from service.files.staging import PLAN
@@ -105,6 +106,7 @@ class AttemptProcess:
             resume_required=False,
             workplace=task.workplace,
             plan_file=Path(PLAN),
+            started=psutil.Process().create_time(),
         )
         workers = task.workers if task.workers > 1 or task.cluster else None
         return stylize(task.spec, workers, listener, options).result

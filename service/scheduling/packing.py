@@ -160,7 +160,8 @@ def _seconds_of_steps(job: JobRow) -> float:
     side = min(_requested(job, "resolution") or _LONGER_SIDE, settings.max_resolution or math.inf)
     network = _PIXEL_SECONDS[settings.precision] * _ASPECT * side**2
     step = _FIXED_SECONDS + _GAUSSIAN_SECONDS * _scene_bytes(job) / GAUSSIAN_BYTES + network
-    return settings.views_per_step * (settings.steps_sos + _COARSE_FRACTION * settings.steps_coarse) * step
+    steps = settings.steps_sos + _COARSE_FRACTION * settings.steps_coarse
+    return min(settings.views_per_step * steps * step, settings.within or math.inf)
 
 
 def _settings(job: JobRow) -> Settings:

@@ -1,7 +1,7 @@
 """Error against run time: variants of one job with the same time budget, evaluated by the same exact loss.
 
 Every variant runs its own schedule for the same number of seconds. Each point is the result of a job with
-`max_seconds`, without early stop. At fixed times, its colors are evaluated on some views by the float32 loss of all
+`within`, without early stop. At fixed times, its colors are evaluated on some views by the float32 loss of all
 scales (`exact.Float32Reference`). This is the paper's loss, regardless of the loss that the variant optimizes. At the
 same times, they are judged on novel views by a network that no variant optimizes (`Judge`). Run time excludes
 evaluations and judgments. It also excludes the one-time preparation of each view, which would dominate a short budget

@@ -12,9 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sgsst_core.planning.plan import Prediction
+from sgsst_core.settings import Settings
 
-#: Seconds that are always allowed, so that short jobs are measured too. If the steps take less than five minutes, this
-#: is more than a tenth of their time.
+#: Seconds that are allowed without a time budget, so that short jobs are measured too. If the steps take less than
+#: five minutes, this is more than a tenth of their time.
 LEAST_ALLOWED = 30.0
 #: Planned measurements may use this fraction of the time allowed, because predictions are accurate to about a fifth.
 _PLANNED = 0.8
@@ -84,31 +85,31 @@ class Prices:
         return level.views * (self.setup + self.view) + moments * self.again(level)
 
 
-def allowed_seconds(fraction: float, steps: float) -> float:
-    """Return the seconds that all measurements may take: `fraction` of the steps' time, or a minimum."""
-    return max(LEAST_ALLOWED, fraction * steps)
+def allowed_seconds(settings: Settings, steps: float) -> float:
+    """Return the seconds that all measurements may take: `measure` of the steps' time, or a minimum."""
+    return max(0.0 if settings.within else LEAST_ALLOWED, settings.measure * steps)
 
 
-def novel_view_seconds(fraction: float, expected: Prediction) -> float:
+def novel_view_seconds(settings: Settings, expected: Prediction) -> float:
     """Return the time in seconds that novel views may take.
 
-    This is the time allowed minus the time for the initial loss; 0 if `fraction` is 0.
+    This is the time allowed minus the time for the initial loss; 0 if `measure` is 0.
     """
-    if not fraction:
+    if not settings.measure:
         return 0.0
-    return max(_PLANNED * allowed_seconds(fraction, expected.job - expected.measuring) - expected.losses, 0.0)
+    return max(_PLANNED * allowed_seconds(settings, expected.job - expected.measuring) - expected.losses, 0.0)
 
 
-def choose_loss_views(fraction: float, steps: float, price: float, views: int) -> int:
+def choose_loss_views(settings: Settings, steps: float, price: float, views: int) -> int:
     """Choose the number of views on which the loss is evaluated before and after.
 
     Args:
-        fraction: Fraction of the steps' time allowed for measurements.
+        settings: Settings of the job.
         steps: Time in seconds of all steps.
         price: Time in seconds to evaluate the loss of one view before and after.
         views: Number of views of the job.
     """
-    half = _PLANNED * allowed_seconds(fraction, steps) / 2
+    half = _PLANNED * allowed_seconds(settings, steps) / 2
     return min(next((count for count in LOSS_VIEWS if min(count, views) * price <= half), LOSS_VIEWS[-1]), views)
 
 

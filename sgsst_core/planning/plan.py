@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sgsst_core.decision import Decision
 from sgsst_core.planning.survey import Survey
+from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.refine.split import Refinement
 from sgsst_core.settings import CachedWeights, PlannedBackground, Precision
 
@@ -80,6 +81,7 @@ class Plan:
         ranks: Number of ranks that take part.
         refinement: Refinement that produced the scene of the plan from the input scene; None if the input scene is not
             refined.
+        time_choice: What a time budget has chosen; None without one, or if everything was given.
         decisions: Decisions for display.
         prediction: Predicted values, for comparison with the measured ones.
     """
@@ -105,6 +107,7 @@ class Plan:
     loss_views: int = 4
     ranks: int = 1
     refinement: Refinement | None = None
+    time_choice: TimeChoice | None = None
     decisions: tuple[Decision, ...] = ()
     prediction: Prediction | None = None
 

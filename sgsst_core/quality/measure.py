@@ -227,7 +227,7 @@ class Measurements:
         stylizer, expected = self._stylizer, self._stylizer.job.plan.prediction
         if expected is None:
             return index
-        allowed = novel_view_seconds(stylizer.job.settings.measure, expected)
+        allowed = novel_view_seconds(stylizer.job.settings, expected)
         # One view is already prepared, so measuring it at the end is always affordable.
         return min(choose_level(prices, allowed, stylizer.job.total_steps, index), NOTHING - 1)
 

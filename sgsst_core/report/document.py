@@ -265,7 +265,7 @@ def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
     fraction = stylizer.job.settings.measure
     return {
         "fraction": fraction,
-        "allowed": allowed_seconds(fraction, expected.job - expected.measuring) if expected else None,
+        "allowed": allowed_seconds(stylizer.job.settings, expected.job - expected.measuring) if expected else None,
         "seconds": round(seconds, 3),
         "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
         "loss_views": len(stylizer.job.evaluation_views),

@@ -26,7 +26,7 @@ _LIST = 40
 _SECTIONS = ("history", "novel_views", "approximations", "loss_over_time", "findings", "plan", "seconds_by_part")
 _STOPPED = {
     "finished": "all planned steps are done",
-    "max-seconds": "stopped at the time limit",
+    "within": "stopped when its time budget was used up",
     "target-loss": "stopped when the target loss was reached",
     "converged": "stopped when the loss had converged",
     "on-request": "stopped on request, with the colors of that step",

@@ -29,6 +29,7 @@ from sgsst_core.loss.feature_scale import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EV
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
+from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera
@@ -43,7 +44,7 @@ from sgsst_core.stylizing.schedule import StepRecord, StylizerState
 FORMAT_VERSION = "8"
 #: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
 #: measurements; the memory limit, which determines the partition, changes only rounding.
-_FREE_SETTINGS = {"max_seconds", "target_loss", "early_stop", "memory_limit", "measure"}
+_FREE_SETTINGS = {"within", "fixed", "target_loss", "early_stop", "memory_limit", "measure"}
 
 
 @dataclass(frozen=True)
@@ -234,6 +235,7 @@ def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> 
     except (KeyError, TypeError, ValueError) as error:
         raise _unreadable(path, error) from error
     count, refinement, fits = len(scene), plan.refinement, True
+    views = len(plan.time_choice.views) if plan.time_choice else len(cameras)
     if refinement is not None:
         count = int(refinement.pieces.long().prod(dim=1).sum())
         fits = refinement.pieces.shape == (len(scene), 3) and int(refinement.pieces.min()) >= 1
@@ -242,8 +244,9 @@ def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> 
         fits
         and all(each.shape == (count,) and each.dtype == torch.bool for each in (plan.seen, plan.optimized))
         and plan.survey.total_blend_weights.shape == (count,)
-        and all(0 <= index < len(cameras) for index in (*plan.covered, *plan.survey.covered))
-        and len(plan.survey.regions) == len(cameras)
+        and all(0 <= index < views for index in (*plan.covered, *plan.survey.covered))
+        and len(plan.survey.regions) == views
+        and all(0 <= index < len(cameras) for index in (plan.time_choice.views if plan.time_choice else ()))
     )
     if not fits:
         raise CheckpointError(f"{path}: is not a plan of this scene.")
@@ -355,6 +358,8 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
     decisions = tuple(Decision(**decision) for decision in values.pop("decisions"))
     covered = tuple(values.pop("covered"))
     expected = values.pop("prediction")
+    if chosen := values.pop("time_choice", None):
+        chosen = TimeChoice(**{**chosen, "views": tuple(chosen["views"])})
     refined, refinement = values.pop("refinement", None), None
     if refined:
         refinement = Refinement(tensors["plan.pieces"], sh_dc=tensors.get("plan.refined_sh_dc"), **refined)
@@ -366,5 +371,6 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
         decisions=decisions,
         prediction=Prediction(**expected) if expected else None,
         refinement=refinement,
+        time_choice=chosen,
         **values,
     )

@@ -293,13 +293,13 @@ def prepare_job(
     )
 
 
-def continued(job: StylizationJob, plan: Plan) -> StylizationJob:
-    """Return the job of a trial under its completed plan. What the trial has cached stays, as far as it fits."""
+def continued(job: StylizationJob, plan: Plan, settings: Settings) -> StylizationJob:
+    """Return the job of a trial under its completed plan and settings. What the trial has cached stays if it fits."""
     job.team.expect(plan)
     memory = view_memory(plan, job.memory)
     job.views.limit(memory)
     job.view_targets.limit(memory)
-    return replace(job, plan=plan, graphs=LossGraphs(job.loss) if plan.graphs else None)
+    return replace(job, plan=plan, settings=settings, graphs=LossGraphs(job.loss) if plan.graphs else None)
 
 
 def _job_styles(

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, Protocol
 
 from sgsst_core.loss.convergence import has_converged, has_reached, window_length
 from sgsst_core.planning.plan import Prediction
+from sgsst_core.planning.time_budget import SecondsLeft as BudgetLeft
+from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.progress import Progress
 from sgsst_core.stylizing.evaluation import RunningRound, mean_loss
 from sgsst_core.stylizing.seconds_left import Pace, SecondsLeft
 from sgsst_core.stylizing.stylizer import Stylizer
 
-Stopped = Literal["finished", "max-seconds", "target-loss", "converged", "on-request", "interrupted"]
+Stopped = Literal["finished", "within", "target-loss", "converged", "on-request", "interrupted"]
 
 
 class Measuring(Protocol):
@@ -31,8 +33,8 @@ class Measuring(Protocol):
     def due(self, step: int) -> bool:
         """Return whether the job is to be measured after this many steps."""
 
-    def seconds_left(self, step: int) -> float:
-        """Return the expected seconds of the remaining measurements after this many steps."""
+    def seconds_left(self, step: int, *, ends: bool = False) -> float:
+        """Return the expected seconds of the remaining measurements after this many steps, with `ends` the last."""
 
 
 @dataclass
@@ -51,6 +53,7 @@ class Callbacks:
         preview_seconds: Seconds between previews.
         measure: Called with the stylizer after each step for which it is due; its time does not count toward
             `Stylizer.seconds`.
+        left: Seconds left of the time budget (`Settings.within`); None to count it from the start of the loop.
 
     Example:
         >>> steps = []
@@ -70,6 +73,7 @@ class Callbacks:
     preview: Callable[[Stylizer], None] | None = None
     preview_seconds: float = 60.0
     measure: Measuring | None = None
+    left: BudgetLeft | None = None
 
 
 def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
@@ -82,7 +86,8 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
         >>> run(stylizer)
         'finished'
     """
-    callbacks = callbacks or Callbacks()
+    callbacks = replace(callbacks or Callbacks())
+    callbacks.left = callbacks.left or seconds_left(stylizer.job.settings.within)
     try:
         last_checkpoint = last_preview = time.perf_counter()
         pace, ended = _pace(stylizer), partial(_end_requested, stylizer, callbacks)
@@ -120,8 +125,15 @@ def _end_requested(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
         return "interrupted"
     if callbacks.finish and stylizer.step and callbacks.finish():
         return "on-request"
-    seconds = stylizer.job.settings.max_seconds
-    return "max-seconds" if seconds and stylizer.seconds >= seconds else None
+    return "within" if callbacks.left and callbacks.left() <= _reserved(stylizer, callbacks) else None
+
+
+def _reserved(stylizer: Stylizer, callbacks: Callbacks) -> float:
+    """Return the seconds of a time budget that the next step and the end of the job need."""
+    expected = stylizer.job.plan.prediction or Prediction(0.0, 0.0, 0)
+    step = stylizer.seconds / stylizer.step if stylizer.step else expected.seconds
+    measuring = callbacks.measure.seconds_left(stylizer.step, ends=True) if callbacks.measure else 0.0
+    return step + measuring + expected.ending
 
 
 def _enough(stylizer: Stylizer) -> Stopped | None:
@@ -173,9 +185,9 @@ def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
 
 
 def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft, running: RunningRound) -> Progress:
-    record, most, measure = stylizer.history[-1], stylizer.job.settings.max_seconds, callbacks.measure
-    expected = stylizer.job.plan.prediction
-    left = pace.left(stylizer.step, limit=most - stylizer.seconds if most else None)
+    record, measure, expected = stylizer.history[-1], callbacks.measure, stylizer.job.plan.prediction
+    limit = callbacks.left() - _reserved(stylizer, callbacks) if callbacks.left else None
+    left = pace.left(stylizer.step, limit=limit)
     left += measure.seconds_left(stylizer.step) if measure else 0.0
     stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
     if expected:

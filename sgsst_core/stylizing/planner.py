@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 from sgsst_core.budget import memory_for
 from sgsst_core.decision import ANOTHER_LOSS, Decision
@@ -16,14 +17,23 @@ from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.orbit.choice import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut
 from sgsst_core.planning import choices
-from sgsst_core.planning.context import Facts, NetworkPixels, PlanningContext, equip, gradient_error, weight_cost
-from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.context import (
+    Facts,
+    NetworkPixels,
+    PlanningContext,
+    common_device,
+    equip,
+    gradient_error,
+    weight_cost,
+)
+from sgsst_core.planning.plan import Device, Plan
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
+from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice, ViewCost, choosable, choose, pixels_of
 from sgsst_core.progress import Progress
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions, region_decisions
-from sgsst_core.scene.camera import Camera, fit_cameras
+from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.colors import color_subspace_of
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import harmonics_energy
@@ -31,9 +41,14 @@ from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import StylizationJob, continued, prepare_job
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.prediction import completed_plan, with_spare_memory
+from sgsst_core.stylizing.prediction import completed_plan, ending_seconds, with_spare_memory
 from sgsst_core.stylizing.trial import Trial, launch_cost, run_trial
 from sgsst_core.timing import Timer
+
+#: Longer side in pixels of the first views that a time budget is chosen from, their number for each rank, and the
+#: factor from which on larger ones are tried too. Small views hide how much a GPU can do at once.
+_TRIED_SIDE: dict[Device, int] = {"cpu": 160, "cuda": 640}
+_TRIED_VIEWS, _MUCH_LARGER = 4, 1.25
 
 
 def plan_job(
@@ -55,6 +70,8 @@ def plan_job(
     about_inputs: Sequence[Decision] = (),
     regions: Regions | None = None,
     refinement: Refinement | None = None,
+    chosen: TimeChoice | None = None,
+    left: SecondsLeft | None = None,
 ) -> StylizationJob:
     """Plan and prepare a job. Every rank must call this with the same arguments, and gets the same plan.
 
@@ -79,6 +96,8 @@ def plan_job(
         about_inputs: Decisions about cameras and photos that start the plan.
         regions: Regions of the scene; None if there are none.
         refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
+        chosen: Choice of the time budget, to which `cameras` and `photos` belong (`choose_within`); None without one.
+        left: Seconds left of the time budget, for which the trial corrects the number of steps; None to leave it.
 
     Raises:
         CameraError: If there are no cameras, or none sees a Gaussian.
@@ -90,6 +109,7 @@ def plan_job(
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
     timer, weights = timer or Timer(), weights or load_network_weights("auto")
+    asked, settings = settings, chosen.applied(settings) if chosen else settings
 
     def prepared(plan: Plan, context: PlanningContext | None = None) -> StylizationJob:
         return prepare_job(
@@ -126,14 +146,86 @@ def plan_job(
         lines += _about_styles(style, regions, settings)
         counts = _rank_counts(facts.machine.ranks, settings)
         job, trials = _try(lambda ranks: prepared(replace(draft, ranks=ranks), context), counts, collectives, show)
+        if chosen and left:
+            correct = partial(_corrected, chosen, draft, asked, trials.values(), facts, left)
+            chosen = collectives.broadcast(correct)
+            settings = chosen.applied(asked)
+            draft = replace(draft, steps_coarse=settings.steps_coarse if draft.steps_coarse else 0)
         cost = launch_cost(job) if job is not None and choices.considers_graphs(draft, facts, settings) else None
         plan = collectives.broadcast(lambda: completed_plan(draft, facts, settings, pixels, trials, cost))
         plan = with_spare_memory(plan, facts, of_a_view)  # graphs, which the draft lacks, leave less
-        plan = replace(plan, refinement=refinement, decisions=(*lines, *plan.decisions))
+        lines += [chosen.decision(asked.within)] if chosen else []
+        plan = replace(plan, refinement=refinement, time_choice=chosen, decisions=(*lines, *plan.decisions))
         if job is not None and plan.ranks == job.collectives.size:
-            return continued(job, plan)
+            return continued(job, plan, settings)
         job = None  # frees its memory
         return prepared(plan, context)
+
+
+def choose_within(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    style: Style,
+    settings: Settings,
+    left: SecondsLeft,
+    *,
+    weights: BackboneWeights | None = None,
+    rasterizer: str | None = None,
+    collectives: Collectives = ALONE,
+    regions: Regions | None = None,
+    show: ShowPlanning | None = None,
+) -> TimeChoice | None:
+    """Choose what fits a time budget, from trials of a few small views. Every rank must call this function.
+
+    The first trial is small enough to be cheap. If it leads to a much larger resolution, half of that is tried too.
+
+    Args:
+        left: Seconds left of the budget.
+
+    Returns:
+        The choice; None if the settings give everything.
+    """
+    if not choosable(settings):
+        return None
+    if not cameras:
+        raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
+    weights, fitted = weights or load_network_weights("auto"), fit_cameras(cameras, settings)
+    views, costs = spread(fitted, _TRIED_VIEWS * collectives.size), list[ViewCost]()
+    side = min(_TRIED_SIDE[common_device(collectives)], max(camera.side for camera in fitted))
+    ending = ending_seconds(len(scene))
+    while True:
+        small, timer = [resized(camera, min(side, camera.side)) for camera in views], Timer()
+        own = {"max_resolution": side, "rebalance": False, "scales": (), "stroke_depth": False, "refine": 1.0}
+        tried = plan_job(
+            scene, small, style, settings.model_copy(update=own), weights=weights, rasterizer=rasterizer,
+            collectives=collectives, regions=regions, timer=timer, show=show,
+        ).plan.prediction  # fmt: skip
+        assert tried is not None
+        # The trial visits up to half of the views, so the prediction has half of the first visits.
+        first, survey = 2 * tried.first_visit, timer.seconds.get("survey", 0.0) / len(small)
+        costs.append(ViewCost(pixels_of(small, side, settings)[0], tried.seconds, first, survey))
+        chosen = collectives.broadcast(lambda: choose(fitted, settings, costs, left(), ending))
+        before, side = side, chosen.resolution // 2
+        if len(costs) > 1 or side < _MUCH_LARGER * before:
+            return chosen
+
+
+def _corrected(
+    chosen: TimeChoice, draft: Plan, settings: Settings, trials: Collection[Trial], facts: Facts, left: SecondsLeft
+) -> TimeChoice:
+    """Return the choice of a time budget with the steps that fit after the trial.
+
+    Args:
+        draft: Plan of the chosen views.
+        settings: Settings without the choice.
+        left: Seconds left of the budget.
+    """
+    coarse = settings.steps_coarse if draft.steps_coarse else 0
+    best = min(trials, key=lambda trial: coarse * trial.coarse.seconds + settings.steps_sos * trial.sos.seconds)
+    seconds = coarse * best.coarse.seconds + settings.steps_sos * best.sos.seconds
+    first = best.sos.first + (best.coarse.first if coarse else 0.0)
+    once = min(chosen.steps_sos * settings.views_per_step, len(draft.covered)) * first
+    return chosen.corrected(settings, seconds, once + ending_seconds(facts.gaussians), left())
 
 
 def _try(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -40,6 +41,13 @@ _MEASURING_BYTES = 100 << 20
 _NOVEL_GAUSSIAN_BYTES, _NOVEL_PIXEL_BYTES = 12, 84
 #: Time of a render without gradient, relative to one with gradient, and renders for the depth of a novel view.
 _RENDER, _DEPTH_RENDERS = 0.5, 2
+#: Seconds of a job from which on the plan offers a time budget.
+_LONG_SECONDS = 3600.0
+
+
+def ending_seconds(gaussians: int) -> float:
+    """Return the seconds from the last step of a job to its last file, except for measurements."""
+    return _ENDING_SECONDS + _ENDING_SECONDS_PER_GAUSSIAN * gaussians
 
 
 def with_spare_memory(plan: Plan, facts: Facts, activations: int) -> Plan:
@@ -94,8 +102,10 @@ def completed_plan(
     plan = replace(plan, prediction=replace(prediction, peak_bytes=process, device_bytes=device))
     saved = max(trial.render - trial.sos.of("render", "raster_backward"), 0.0)
     parts = {**trial.sos.parts, "cached weights": saved}
-    lines = choices.decisions(plan, facts, settings, pixels, parts, cost, seconds)
-    return replace(plan, decisions=(*lines, *([_about_measuring(plan, settings)] if plan.measured else [])))
+    lines = [*choices.decisions(plan, facts, settings, pixels, parts, cost, seconds)]
+    lines += [_about_measuring(plan, settings)] if plan.measured else []
+    lines += _about_time(plan, facts, settings)
+    return replace(plan, decisions=tuple(lines))
 
 
 def _sos_seconds(trial: Trial, facts: Facts, settings: Settings) -> float:
@@ -130,7 +140,7 @@ def _predicted_steps(plan: Plan, facts: Facts, settings: Settings, trial: Trial,
         first_visit=first,
         first_visit_coarse=first_coarse,
         style=style,
-        job=min(job, settings.max_seconds or job),
+        job=min(job, settings.within or job),
     )
 
 
@@ -149,8 +159,8 @@ def _with_measurements(
     # would determine the step at which the job ends.
     loss_views = plan.loss_views
     if not settings.target_loss:
-        loss_views = choose_loss_views(settings.measure, expected.job, before_and_after, count)
-    ending = _ENDING_SECONDS + _ENDING_SECONDS_PER_GAUSSIAN * facts.gaussians
+        loss_views = choose_loss_views(settings, expected.job, before_and_after, count)
+    ending = ending_seconds(facts.gaussians)
     losses = loss_views * before_and_after
     expected = replace(expected, evaluation=loss_views * evaluation, losses=losses, ending=ending)
     neighbors = _NEIGHBORS_SECONDS_PER_GAUSSIAN * facts.gaussians if _searches_neighbors(plan, settings) else 0.0
@@ -159,7 +169,7 @@ def _with_measurements(
         view=RENDERED * _RENDER * trial.render + sos.of("vgg_forward", "statistics"),
         moment=neighbors + (2 * expected.seconds if plan.is_approximated else 0.0),
     )
-    level = choose_level(prices, novel_view_seconds(settings.measure, expected), total)
+    level = choose_level(prices, novel_view_seconds(settings, expected), total)
     measuring = losses + prices.of(LEVELS[level], len(LEVELS[level].moments(total)))
     expected = replace(expected, measuring=measuring, job=expected.job + measuring)
     return replace(plan, measuring=level, loss_views=loss_views), expected
@@ -207,13 +217,24 @@ def _about_measuring(plan: Plan, settings: Settings) -> Decision:
     moments = level.moments(plan.steps_coarse + settings.steps_sos)
     when = f"at {len(moments)} moments" if len(moments) > 1 else "at the end"
     novel = f", and {when} up to {_count(level.views, 'novel view')}" if moments else " only"
-    allowed = duration(allowed_seconds(settings.measure, steps), " ")
+    least = "" if settings.within else f" or {LEAST_ALLOWED:.0f} s"
+    allowed = duration(allowed_seconds(settings, steps), " ")
     return Decision(
         "measuring",
         f"{losses}{novel}",
-        f"{cost}; {allowed} is allowed, {settings.measure:.0%} of the steps' time or {LEAST_ALLOWED:.0f} s, and less "
-        "is measured if the first novel view takes longer",
+        f"{cost}; {allowed} is allowed, {settings.measure:.0%} of the steps' time{least}, and less is measured if the "
+        "first novel view takes longer",
     )
+
+
+def _about_time(plan: Plan, facts: Facts, settings: Settings) -> list[Decision]:
+    """Return the warning that a job takes long, with what is possible in an hour; empty if it takes less than that."""
+    seconds = plan.prediction.job if plan.prediction else 0.0
+    if settings.within or seconds <= _LONG_SECONDS:
+        return []
+    side = int(max(max(size) for size in facts.sizes) * math.sqrt(_LONG_SECONDS / seconds)) // 32 * 32
+    faster = f"--within 1h (`within` 3600 in a request) paints it in an hour, at about {max(side, 96)} px"
+    return [Decision("time", f"warning: the steps take about {duration(seconds, ' ')}", faster)]
 
 
 def _count(number: int, what: str) -> str:

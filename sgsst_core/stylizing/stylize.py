@@ -15,6 +15,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import F, as_scene, stylized
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.stylized_ply import check_sh_attenuation
+from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.progress import Progress
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import RenderMode
@@ -71,17 +72,19 @@ def stylize(
         True
     """
     chosen = make_settings(preset, **settings)
+    left = seconds_left(chosen.within)
     if isinstance(scene, SceneFile):
         check_sh_attenuation(scene, chosen.sh_attenuation)
     with job_bar(Console(highlight=False, markup=False, emoji=False)) if progress else nullcontext() as bar:
         show = bar.show if bar else None
         given = as_scene(scene)
         given = replace(given, rendering=given.rendering.requested(render_mode, eps2d))
-        stylizer = Stylizer.planned(given, cameras, style, chosen, weights=weights, photos=photos, show=show)
+        stylizer = Stylizer.planned(given, cameras, style, chosen, weights=weights, photos=photos, show=show, left=left)
         job = stylizer.job
         if isinstance(scene, SceneFile):
             scene.refined(job.plan.refinement)  # raises before the steps if the file cannot hold the result
-        run(stylizer, _shown(bar, callbacks or Callbacks()))
+        callbacks = callbacks or Callbacks()
+        run(stylizer, _shown(bar, replace(callbacks, left=callbacks.left or left)))
     result = replace(job.scene, sh_dc=stylizer.stylized())
     return cast(F, stylized(scene, result, job.plan.refinement, chosen.sh_attenuation))
 

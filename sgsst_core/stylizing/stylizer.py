@@ -23,6 +23,7 @@ from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import ShowPlanning
+from sgsst_core.planning.time_budget import SecondsLeft, seconds_left
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, checked_cameras
 from sgsst_core.scene.gaussians import Scene, checked_scene
@@ -40,7 +41,7 @@ from sgsst_core.stylizing.evaluation import (
 from sgsst_core.stylizing.job import StylizationJob, with_second_attempt
 from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.planner import choose_within, plan_job
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.result_colors import result_colors, transferred_colors
 from sgsst_core.stylizing.schedule import (
@@ -117,10 +118,12 @@ class Stylizer:
         collectives: Collectives = ALONE,
         regions: Regions | None = None,
         show: ShowPlanning | None = None,
+        left: SecondsLeft | None = None,
     ) -> Self:
         """Check the inputs, refine the scene if the settings request it, plan the job, and create its stylizer.
 
-        The arguments are those of `plan_job`. The job contains the refined scene.
+        The arguments are those of `plan_job`. The job contains the refined scene. A time budget of the settings counts
+        from this call unless `left` is given.
 
         Example:
             >>> scene, cameras = load_scene("scene.ply").scene, load_cameras("cameras.json")
@@ -132,11 +135,26 @@ class Stylizer:
         style, regions = Style.given(style), regions and regions.with_checked_styles()
         scene, cameras = checked_scene(scene), checked_cameras(cameras)
         weights = weights or load_network_weights("auto")
-        refinement = refine(
+        left = left or seconds_left(settings.within)
+        chosen = left and choose_within(
             scene,
             cameras,
             style,
             settings,
+            left,
+            weights=weights,
+            rasterizer=rasterizer,
+            collectives=collectives,
+            regions=regions,
+            show=show,
+        )
+        views = chosen.views if chosen else range(len(cameras))
+        cameras = [cameras[index] for index in views]
+        refinement = refine(
+            scene,
+            cameras,
+            style,
+            chosen.applied(settings) if chosen else settings,
             weights=weights,
             rasterizer=rasterizer,
             collectives=collectives,
@@ -148,13 +166,15 @@ class Stylizer:
             cameras,
             style,
             settings,
-            photos=photos and (lambda index: image_of(photos(index), f"photo of view {index}")),
+            photos=photos and (lambda index: image_of(photos(views[index]), f"photo of view {views[index]}")),
             regions=regions and regions.refined(refinement),
             refinement=refinement,
             weights=weights,
             rasterizer=rasterizer,
             collectives=collectives,
             show=show,
+            chosen=chosen,
+            left=left,
         )
         return cls(job)
 

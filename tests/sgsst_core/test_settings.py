@@ -59,7 +59,7 @@ def test_learning_rate_is_exponential_in_the_fraction_of_steps() -> None:
         ({"content_weight": -1}, "content_weight"),
         ({"content_weight": "weak"}, "content_weight"),
         ({"precision": "float16"}, "precision"),
-        ({"max_seconds": 0}, "max_seconds"),
+        ({"within": 0}, "within"),
         ({"unheard_of": 1}, "unheard_of"),
     ],
 )

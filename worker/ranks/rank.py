@@ -13,7 +13,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -99,6 +99,7 @@ class WorkerOptions:
         resume_required: Whether resuming a job fails if no checkpoint can be used.
         workplace: Workplace for ranks on machines without a shared folder; None for this process's working folder.
         plan_file: Plan of a dry run, to use if it was made for the same job; None for none.
+        started: Start of the job's time budget, in seconds since the epoch; the default is now.
     """
 
     rank_timeout: float = RunOptions().rank_timeout
@@ -109,6 +110,7 @@ class WorkerOptions:
     resume_required: bool = True
     workplace: Workplace | None = None
     plan_file: Path | None = None
+    started: float = field(default_factory=time.time)
 
 
 @dataclass(frozen=True)

@@ -94,13 +94,13 @@ def test_job_that_ended_early_says_how_little_was_done(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:
     job_id = submit(files, capsys)
-    finish(service, job_id, b"result", tmp_path, stopped="max-seconds", steps=2, total=60, loss_after=1.94)
+    finish(service, job_id, b"result", tmp_path, stopped="within", steps=2, total=60, loss_after=1.94)
     assert main(["status", job_id]) == 0
     shown = capsys.readouterr().out
-    assert "2 of 60: it reached --max-seconds (submit it again with more seconds" in shown
+    assert "2 of 60: its time budget was used up (submit it again with a larger `within`" in shown
     assert "(97.0%)" in shown
     assert main(["watch", job_id]) == 0
-    assert "2 of 60: it reached --max-seconds" in capsys.readouterr().out
+    assert "2 of 60: its time budget was used up" in capsys.readouterr().out
 
 
 def test_service_that_is_not_there_is_reported_at_once(

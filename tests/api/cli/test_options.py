@@ -17,7 +17,7 @@ from api.cli.options import flags, help_text
 from api.cli.options_table import reference
 from service.parameters import JobParameters
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Declared, declared, parse_strength
+from sgsst_core.options import Declared, declared, parse_seconds, parse_strength
 from sgsst_core.settings import Settings, checked, make_settings
 from worker.job import SceneRequest
 from worker.options import GROUPS, RunOptions, StylizeOptions, ViewOptions
@@ -40,7 +40,7 @@ def test_every_setting_has_an_option() -> None:
     standing = {
         info.metadata[-1].instead for name, info in Settings.model_fields.items() if name not in fields(options)
     }
-    assert standing == {"learning_rate"}
+    assert standing == {"learning_rate", "within"}
     assert options.keys() | standing <= OPTIONS.keys()
 
 
@@ -125,7 +125,7 @@ def test_orbit_that_is_no_number_is_refused_with_the_word(capsys: pytest.Capture
 
 @pytest.mark.parametrize("value", ["nan", "inf", "many", ""])
 def test_non_finite_numbers_are_rejected(value: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for flag in ("--near", "--max-seconds", "--workers"):
+    for flag in ("--near", "--within", "--workers"):
         assert main(["stylize", "scene.ply", "--style", "x.png", "--out", "x.ply", flag, value]) == 2
         assert flag in capsys.readouterr().err
 
@@ -151,3 +151,16 @@ def test_options_become_settings() -> None:
 @pytest.mark.parametrize(("text", "weight"), [("light", 3e4), ("Balanced", 1e4), ("strong", 1.0), ("2.5", 2.5)])
 def test_content_weight_accepts_numbers_and_strengths(text: str, weight: float) -> None:
     assert parse_strength(text) == weight
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90s", 90), ("90", 90), ("5m", 300), ("1.5 h", 5400), ("2min", 120), (".5H", 1800)]
+)
+def test_times_have_units(text: str, seconds: float) -> None:
+    assert parse_seconds(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "5 days", "-5m", "m", "1e3s", "5m30"])
+def test_what_is_no_time_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(ValueError, match="Give one such as 90s, 5m or 1h"):
+        parse_seconds(text)

@@ -63,9 +63,13 @@ def test_estimate_covers_the_whole_job(service: Service, files: dict[str, bytes]
         assert plan["warnings"] == []
         expected = plan["plan"]["prediction"]
         assert plan["total_seconds"] > expected["job"] + expected["ending"] > plan["estimated_seconds"] > 0
-        steps = expected["job"] - expected["measuring"]
-        limited = client.post("/v1/jobs", **request(files, max_seconds=steps / 1000)).json()
-        assert limited["total_seconds"] > limited["plan"]["prediction"]["ending"]
+        limited = client.post("/v1/jobs", **request(files, within=0.001)).json()
+        (chosen,) = (each for each in limited["plan"]["decisions"] if each["item"] == "time budget")
+        assert "0 and 1 steps" in chosen["decision"]
+        assert (
+            "steps" in chosen["reason"].partition("in 4 ms: ")[2]
+            or limited["estimated_seconds"] < plan["estimated_seconds"]
+        )
 
 
 def test_views_and_regions_without_gaussians_are_warned_about(service: Service, files: dict[str, bytes]) -> None:

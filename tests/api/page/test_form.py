@@ -102,7 +102,7 @@ def test_invalid_numbers_stop_the_start(visit: Visit, files: dict[str, Path]) ->
     page.on("request", lambda request: sent.append(request.url) if "/v1/" in request.url else None)
     wrong = {
         "resolution": ("99999", "Must be at most 16,384."),
-        "max_seconds": ("1e400", "Must be a number."),
+        "within": ("1e400", "Must be a number."),
         "content_weight": ("1e400", "Must be a number."),
         "views": ("2.5", "Must be a whole number."),
         "refine": ("0", "Must be at least 1."),

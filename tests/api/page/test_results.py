@@ -132,9 +132,9 @@ def test_stages_beside_steps_count_their_own_views(
     ("result", "text"),
     [
         (
-            {"stopped": "max-seconds", "steps": 2, "total": 60, "loss_after": 97.0},
-            "The time limit ended this job early: 2 of 60 steps, 97% of the loss is left. For more, choose “Same with "
-            "changes” and raise the time limit.",
+            {"stopped": "within", "steps": 2, "total": 60, "loss_after": 97.0},
+            "Its time was used up: 2 of 60 steps, 97% of the loss is left. For more, choose “Same with "
+            "changes” and give it more time.",
         ),
         (
             {"stopped": "on-request", "steps": 5, "total": 60, "loss_after": 130.0},

@@ -17,6 +17,7 @@ from sgsst_core.planning.measurement_choice import (
     novel_view_seconds,
 )
 from sgsst_core.planning.plan import Prediction
+from sgsst_core.settings import make_settings
 
 
 @pytest.mark.parametrize("total", [1, 2, 3, 24, 300, 20_000])
@@ -45,15 +46,15 @@ def test_first_allowed_level_is_chosen() -> None:
 
 def test_measuring_may_take_half_a_minute_or_its_fraction_of_the_steps() -> None:
     steps = Prediction(1.0, 1.0, 0, losses=3.0, measuring=50.0, job=1050.0)
-    assert novel_view_seconds(0.1, steps) == 80.0 - 3.0
-    assert novel_view_seconds(0.001, steps) == 0.8 * LEAST_ALLOWED - 3.0
-    assert novel_view_seconds(0.001, replace(steps, losses=32.0)) == 0.0
-    assert novel_view_seconds(0.0, steps) == 0.0
+    assert novel_view_seconds(make_settings(measure=0.1), steps) == 80.0 - 3.0
+    assert novel_view_seconds(make_settings(measure=0.001), steps) == 0.8 * LEAST_ALLOWED - 3.0
+    assert novel_view_seconds(make_settings(measure=0.001), replace(steps, losses=32.0)) == 0.0
+    assert novel_view_seconds(make_settings(measure=0.0), steps) == 0.0
 
 
 def test_loss_gets_half_of_the_allowed_time_and_at_least_one_view() -> None:
     for steps, price, views in ((0.0, 3.0, 4), (0.0, 3.01, 2), (0.0, 6.0, 2), (0.0, 6.01, 1), (0.0, 1e9, 1)):
-        assert choose_loss_views(0.1, steps, price, 97) == views
-    assert choose_loss_views(0.1, 3000.0, 6.01, 97) == 4
-    assert choose_loss_views(0.1, 0.0, 4.0, 3) == 3  # there are only three views
-    assert choose_loss_views(0.0, 3000.0, 3.0, 97) == 4
+        assert choose_loss_views(make_settings(measure=0.1), steps, price, 97) == views
+    assert choose_loss_views(make_settings(measure=0.1), 3000.0, 6.01, 97) == 4
+    assert choose_loss_views(make_settings(measure=0.1), 0.0, 4.0, 3) == 3  # there are only three views
+    assert choose_loss_views(make_settings(measure=0.0), 3000.0, 3.0, 97) == 4

@@ -132,8 +132,8 @@ def test_report_has_the_losses_of_the_steps(
     finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources
 ) -> None:
     stylizer, before, after = finished
-    report = build_report(stylizer, sources, "max-seconds", before, after)
-    assert report["stopped"] == "max-seconds"
+    report = build_report(stylizer, sources, "within", before, after)
+    assert report["stopped"] == "within"
     assert [entry["step"] for entry in report["history"]] == list(range(1, 8))
     for entry, record in zip(report["history"], stylizer.history, strict=True):
         terms = entry["scales"]["0"]

@@ -303,7 +303,7 @@ def test_fingerprint_depends_on_the_feature_scale_factors(
 
 def test_fingerprint_ignores_budgets() -> None:
     scene, views, image = wall(), cameras(), style()
-    free = make_settings(max_seconds=3, memory_limit=10**9, measure=0.0)
+    free = make_settings(within=3, memory_limit=10**9, measure=0.0)
     assert fingerprint(scene, views, Style.of(image), free, "w") == fingerprint(
         scene, views, Style.of(image), make_settings(), "w"
     )

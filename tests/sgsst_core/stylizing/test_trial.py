@@ -192,7 +192,7 @@ def test_job_time_adds_steps_first_visits_style_and_measuring() -> None:
     assert (prediction.first_visit, prediction.first_visit_coarse, prediction.style) == (0.75, 1.5, 0.0)
     steps = 40 * 0.4 + 40 * 2.0 + 4 * (0.75 + 1.5)
     assert prediction.job == pytest.approx(steps + prediction.measuring)
-    limited = expected(plan_of(facts(), max_seconds=5.0))
+    limited = expected(plan_of(facts(), within=5.0))
     assert limited.job - limited.measuring == pytest.approx(5.0)
 
 

@@ -1,0 +1,233 @@
+"""Time budget of a job: the resolution, the views and the steps that fit, given what small views cost.
+
+Resolution is lowered first, because strokes need their steps more than their pixels, then steps are left out, and only
+then the resolution is lowered further (benchmarks/results/README.md has the experiment).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from sgsst_core.decision import Decision
+from sgsst_core.number_format import duration
+from sgsst_core.scene.camera import Camera, resized, spread
+from sgsst_core.scene.pyramid import scale_count
+from sgsst_core.settings import Settings
+
+#: Function that returns the seconds that are left of a time budget.
+SecondsLeft = Callable[[], float]
+T = TypeVar("T")
+
+#: Longer sides in pixels are multiples of `_STEP`, and at least `_LEAST_SIDE`.
+_STEP, _LEAST_SIDE = 32, 96
+#: Longer side below which steps are left out before the resolution is lowered further, and the least fraction of them
+#: that remains before it is.
+_ENOUGH_SIDE, _LEAST_STEPS = 256, 0.5
+#: Steps that a trial takes, and portion of the time that is left for what no measurement predicts.
+_TRIAL_STEPS, _MARGIN = 6, 0.1
+#: Time of a step of phase 1 relative to one on all scales, if there are several.
+_COARSE = 0.5
+#: Factor of the longer budget whose choice is shown.
+_MORE = 4
+
+
+def seconds_left(within: float | None, started: float | None = None) -> SecondsLeft | None:
+    """Return a function that returns the seconds left of a time budget; None without a budget.
+
+    Args:
+        within: Time budget in seconds.
+        started: Start of the budget, in seconds since the epoch; None for now.
+    """
+    if within is None:
+        return None
+    # The system's clock may be set while the job runs.
+    end = time.monotonic() + within - (0.0 if started is None else time.time() - started)
+    return lambda: end - time.monotonic()
+
+
+@dataclass(frozen=True)
+class ViewCost:
+    """Measured cost of views of one resolution.
+
+    Attributes:
+        pixels: Pixels of a view on all scales, mean over the views.
+        seconds: Seconds of a step on all scales.
+        first: Additional seconds of a view's first visit.
+        survey: Seconds of the survey of a view.
+        scales: Largest number of scales of a view.
+    """
+
+    pixels: float
+    seconds: float
+    first: float
+    survey: float
+    scales: int = 1
+
+    def at(self, pixels: float, smaller: ViewCost | None) -> ViewCost:
+        """Return the cost of views with more pixels: in proportion to them, or on a line with that of smaller views."""
+
+        def scaled(name: str) -> float:
+            own, other = getattr(self, name), getattr(smaller, name) if smaller else 0.0
+            distance = self.pixels - (smaller.pixels if smaller else 0.0)
+            slope = min(max(own - other, 0.0) / distance, own / self.pixels) if distance > 0 else own / self.pixels
+            return float(max(own + slope * (pixels - self.pixels), 0.0))
+
+        return ViewCost(pixels, scaled("seconds"), scaled("first"), scaled("survey"))
+
+
+@dataclass(frozen=True)
+class TimeChoice:
+    """Choice of a time budget.
+
+    Attributes:
+        resolution: Longer side of the views in pixels.
+        views: Indices of the chosen views.
+        steps_coarse, steps_sos: Steps of both phases.
+        seconds: Predicted seconds of the steps and everything after the choice.
+        more: Text about what more time would bring; empty if it would bring nothing.
+    """
+
+    resolution: int
+    views: tuple[int, ...]
+    steps_coarse: int
+    steps_sos: int
+    seconds: float
+    more: str = ""
+
+    def of(self, views: Sequence[T]) -> list[T]:
+        """Return what belongs to the chosen views."""
+        return [views[index] for index in self.views]
+
+    def applied(self, settings: Settings) -> Settings:
+        """Return the settings with the choice in place of what they ask for without a budget."""
+        steps = settings.steps_coarse + settings.steps_sos
+        fraction = (self.steps_coarse + self.steps_sos) / max(steps, 1)
+        chosen: dict[str, object] = {
+            "max_resolution": self.resolution,
+            "steps_coarse": self.steps_coarse,
+            "steps_sos": self.steps_sos,
+        }
+        if fraction < 1 and "learning_rate_end" not in settings.fixed:
+            chosen["learning_rate_end"] = settings.learning_rate_at(fraction)
+        return settings.model_copy(update=chosen)
+
+    def decision(self, within: float | None) -> Decision:
+        """Return the choice as a decision of a plan, given the seconds of the budget."""
+        views = f"{len(self.views)} view{'s' if len(self.views) != 1 else ''}"
+        reason = f"about {duration(self.seconds, ' ')} from here on"
+        reason += f" of {duration(within, ' ')}" if within else ", as chosen before"
+        more = f"; {self.more}" if self.more else ""
+        phases = f"{self.steps_coarse} and {self.steps_sos} steps"
+        return Decision("time budget", f"{self.resolution} px, {views}, {phases}", reason + more)
+
+    def corrected(self, settings: Settings, seconds: float, once: float, left: float) -> TimeChoice:
+        """Return the choice with the steps that fit, now that a step of the chosen views has been measured.
+
+        Args:
+            settings: Settings without the choice.
+            seconds: Seconds of all steps that the settings ask for.
+            once: Seconds of everything else that remains.
+            left: Seconds that are left.
+        """
+        usable = left / (1 + _MARGIN) - once
+        fraction = min(max(usable / (seconds * (1 + settings.measure)), 0.0), 1.0) if seconds else 1.0
+        coarse, sos = _steps(settings, fraction)
+        return replace(self, steps_coarse=coarse, steps_sos=sos, seconds=fraction * seconds + once)
+
+
+def choosable(settings: Settings) -> bool:
+    """Return whether a time budget has anything to choose: the resolution or the steps."""
+    return settings.within is not None and not {"max_resolution", "steps_sos"} <= {*settings.fixed}
+
+
+def choose(
+    cameras: Sequence[Camera], settings: Settings, costs: Sequence[ViewCost], left: float, ending: float
+) -> TimeChoice:
+    """Choose what fits a time budget, and tell what more time would bring.
+
+    Args:
+        cameras: All cameras at the resolution of the settings.
+        settings: Settings of the job with all steps.
+        costs: Costs of one or two resolutions, the smaller one first.
+        left: Seconds that are left.
+        ending: Seconds from the last step to the last file.
+    """
+    estimate = _Estimate(cameras, settings, costs, ending)
+    chosen, longer = estimate.best(left), estimate.best(left + (_MORE - 1) * (settings.within or 0.0))
+    gains = [f"{longer.resolution} px"] if longer.resolution > chosen.resolution else []
+    more = longer.steps_coarse + longer.steps_sos
+    gains += [f"{more} steps"] if more > chosen.steps_coarse + chosen.steps_sos else []
+    text = f"in {duration(_MORE * (settings.within or 0.0), ' ')}: {', '.join(gains)}" if gains else ""
+    return replace(chosen, more=text)
+
+
+class _Estimate:
+    """Estimator of the seconds of a job by resolution and steps."""
+
+    def __init__(self, cameras: Sequence[Camera], settings: Settings, costs: Sequence[ViewCost], ending: float) -> None:
+        self._cameras, self._settings, self._costs, self._ending = spread(cameras, 16), settings, costs, ending
+        self._count, self._known = len(cameras), dict[int, ViewCost]()
+        self._side = max(camera.side for camera in cameras)
+
+    def best(self, left: float) -> TimeChoice:
+        """Return the best choice that fits into the seconds that are left, or the smallest one."""
+        sides = [self._side]
+        if "max_resolution" not in self._settings.fixed:
+            sides += reversed(range(min(_LEAST_SIDE, self._side), self._side, _STEP))
+        sides = [side for side in sides if self._cost(side).scales >= len(self._settings.scales)] or sides[:1]
+        smaller = [side for side in sides if side <= _ENOUGH_SIDE] or sides[-1:]
+        for side in sides[: len(sides) - len(smaller)] + smaller[:1]:
+            if (choice := self._choice(side, 1.0)).seconds <= left:
+                return choice
+        for side in smaller:
+            fraction = self._fraction(side, left)
+            if fraction >= _LEAST_STEPS:
+                return self._choice(side, fraction)
+        return self._choice(smaller[-1], fraction)
+
+    def _fraction(self, side: int, left: float) -> float:
+        """Return the largest fraction of all steps that fits, in hundredths; 0 if none fits."""
+        hundredths = range(100, 0, -1)
+        return next((each / 100 for each in hundredths if self._choice(side, each / 100).seconds <= left), 0.0)
+
+    def _choice(self, side: int, fraction: float) -> TimeChoice:
+        settings, cost = self._settings, self._cost(side)
+        coarse, sos = _steps(settings, fraction)
+        visits = max(sos, int(not sos) * coarse) * settings.views_per_step
+        count = self._count if "views" in settings.fixed else min(self._count, max(visits, 1))
+        coarse_seconds = _COARSE * cost.seconds if cost.scales > 1 else 0.0
+        steps = coarse * coarse_seconds + sos * cost.seconds + min(visits, count) * cost.first
+        steps *= 1 + settings.measure
+        seconds = (steps + count * cost.survey + _TRIAL_STEPS * cost.seconds + self._ending) * (1 + _MARGIN)
+        return TimeChoice(side, tuple(spread(range(self._count), count)), coarse, sos, seconds)
+
+    def _cost(self, side: int) -> ViewCost:
+        """Return the expected cost of views of a resolution."""
+        if side not in self._known:
+            *others, largest = self._costs
+            pixels, scales = pixels_of(self._cameras, side, self._settings)
+            self._known[side] = replace(largest.at(pixels, others[0] if others else None), scales=scales)
+        return self._known[side]
+
+
+def pixels_of(cameras: Sequence[Camera], side: int, settings: Settings) -> tuple[float, int]:
+    """Return the pixels of a view on all scales with a longer side, mean over the cameras, and the most scales."""
+    pixels, most = 0.0, 1
+    for camera in (resized(each, min(side, each.side)) for each in cameras):
+        scales = scale_count(camera.height, camera.width, settings.coarsest_side)
+        pixels += camera.width * camera.height * sum(0.25**scale for scale in range(scales))
+        most = max(most, scales)
+    return pixels / len(cameras), most
+
+
+def _steps(settings: Settings, fraction: float) -> tuple[int, int]:
+    """Return a fraction of the steps of both phases, at least one in all, except for given numbers."""
+    coarse, sos = (
+        asked if name in settings.fixed else math.floor(fraction * asked + 1e-6)
+        for name, asked in (("steps_coarse", settings.steps_coarse), ("steps_sos", settings.steps_sos))
+    )
+    return coarse, max(sos, int(not coarse and bool(settings.steps_sos)))
