@@ -30,7 +30,6 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.statistics import TILE, span_positions
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.content import ContentDifference
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Size
@@ -232,7 +231,7 @@ class Passes:
             with Counted() as there, _fused_pooling(there):
                 activations = self.loss.network.forward(meta(outer.bottom - outer.top, outer.right - outer.left, 3))
             with Counted() as back, _fused_pooling(back):
-                self.loss.network.backward(activations, lambda *_: None)
+                self.loss.network.backward(activations, lambda *_: True)  # the style gradient masks it
             forward += there.works
             backward += back.works if is_cached else there.works + back.works
         return forward, backward
@@ -251,18 +250,16 @@ class Passes:
         )
 
     def content(self) -> list[Work]:
-        """Return the work of the content loss and gradient, given the features."""
-        channels, dtype = self.loss.network.channels(CONTENT_LAYER), self.loss.network.dtype
-        works: list[Work] = []
-        for tile, scaled in self.tiles:
-            features = meta(1, _cells(CONTENT_LAYER, tile, scaled), channels, dtype=dtype)
-            factor = meta(dtype=torch.float64)
-            with Counted() as counted:
-                ContentDifference.of(features, features, factor).loss()
-                gradient = ContentDifference.of(features, features, factor).gradient()
-                features += gradient
-            works += counted.works
-        return works
+        """Return the work of the kernels of the content term.
+
+        One reads features and their target; the other also reads and writes the gradient.
+        """
+        cell = self.loss.network.channels(CONTENT_LAYER) * self.loss.network.dtype.itemsize
+        return [
+            Work(0, tensors * cell * _cells(CONTENT_LAYER, tile, scaled))
+            for tile, scaled in self.tiles
+            for tensors in (2, 4)
+        ]
 
     def scaled(self) -> list[Work]:
         """Return the work of downscaling an image to all scales."""

@@ -37,8 +37,9 @@ from sgsst_core.features.statistics import (
     block_of_channels,
     block_of_entries,
 )
-from sgsst_core.loss import statistics_terms
+from sgsst_core.loss import content_kernels, statistics_terms
 from sgsst_core.loss import statistics_terms_kernels as loss_kernels
+from sgsst_core.loss.content import POSITIONS as CONTENT_POSITIONS
 from sgsst_core.loss.statistics_terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
 from sgsst_core.rasterizer import triton_cached_kernels as cached_kernels
 from sgsst_core.rasterizer import triton_kernels as kernels
@@ -66,7 +67,16 @@ _TYPES = {
     **dict.fromkeys(("high", "low"), "*bf16"),
     "constant": "*fp32",
     **dict.fromkeys(
-        ("positions", "row_cells", "out_row_cells", "weight_row_step", "weight_column_step", "span"), "i32"
+        (
+            "positions",
+            "row_cells",
+            "content_row_cells",
+            "out_row_cells",
+            "weight_row_step",
+            "weight_column_step",
+            "span",
+        ),
+        "i32",
     ),
     **dict.fromkeys(("total", "visible", "width", "height", "across"), "i32"),
 }
@@ -102,7 +112,7 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
     dtype = _DTYPES[form]
     block, step = POSITIONS[dtype.itemsize], statistics_terms.STEPS[dtype.itemsize]
     moments = {**matrix, "P": block, "PARTS": FLUSH[dtype.itemsize] // block}
-    gradient = {**matrix, "K": block_of_channels(channels, step), "P": statistics_terms.POSITIONS}
+    gradient = {**matrix, "K": block_of_channels(channels, step), "P": statistics_terms.POSITIONS, "RELU": True}
     types = {"features": features, "gradient": features}
     if dtype == torch.bfloat16:
         moments, gradient, types = {**moments, "shift": None}, {**gradient, "mean": None}, {**types, "matrix": features}
@@ -181,6 +191,16 @@ KERNELS: dict[str, Target] = {
     **_of_features("float32", _PIXELS, "pixels"),
     **_of_statistics(_WIDEST),
     **_of_statistics(_PIXELS, "_pixels"),
+    **{
+        f"{kernel.__name__}_{form}": Target(
+            kernel,
+            {"CHANNELS": _WIDEST, "BLOCK": _WIDEST, "P": CONTENT_POSITIONS, "WEIGHTED": True, **more},
+            4,
+            dict.fromkeys(("features", "content", "gradient"), types) | {"sums": "*fp32", "factor": "*fp64"},
+        )
+        for kernel, more in ((content_kernels.content_sums, {}), (content_kernels.add_content_gradient, {"RELU": True}))
+        for form, types in (("float32", "*fp32"), ("bfloat16", "*bf16"))
+    },
     "rest_colors": Target(
         harmonics_kernels.rest_colors,
         {"DEGREE": 3, "COEFFICIENTS": 15, "BLOCK": harmonics_kernels.BLOCK.value},

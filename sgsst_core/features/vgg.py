@@ -55,7 +55,7 @@ def layer_stride(layer: str) -> int:
 
 
 #: Callback of `FeatureNetwork.backward` with layer, features and gradient.
-FeatureGradient = Callable[[str, Tensor, Tensor], None]
+FeatureGradient = Callable[[str, Tensor, Tensor], bool | None]
 
 
 @dataclass
@@ -344,7 +344,7 @@ class FeatureNetwork:
             activations: Result of a forward pass with cache=True; its tensors are released along the way.
             feature_gradient: Callback for each reported layer, deepest first. It receives the layer's name, its
                 features [h, w, c] and the accumulated gradient [h, w, c], and adds dL/dfeatures to the gradient in
-                place.
+                place. It returns whether it has also set the gradient to 0 wherever the ReLU's output is 0.
 
         Returns:
             dL/drgb, [h, w, 3], float32 (float64 for a float64 network).
@@ -376,8 +376,7 @@ class FeatureNetwork:
             features = activations.features.pop(step.layer, None)
             if features is not None and features.numel():
                 gradient = torch.zeros_like(output) if gradient is None else gradient
-                feature_gradient(step.layer, features, gradient[0].permute(1, 2, 0))
-                masked = False
+                masked = bool(feature_gradient(step.layer, features, gradient[0].permute(1, 2, 0)))
             if gradient is not None:
                 gradient = gradient if masked else relu_backward(gradient, output)
                 gradient, masked = self._convolve_back(gradient, step), False

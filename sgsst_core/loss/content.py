@@ -16,10 +16,15 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from sgsst_core.devices import on_device
 from sgsst_core.features.partition import PartitionTile
+from sgsst_core.features.statistics import block_of_channels, can_be_fused, row_cells
 from sgsst_core.features.vgg import CONTENT_LAYER
 from sgsst_core.loss.position_term import Objective, PositionTerm, ScaledView, TermInputs
 from sgsst_core.loss.targets import ContentFeatures, PositionWeights
+
+#: Positions per program of the GPU kernels: 4,096 values of the content layer's 512 channels.
+POSITIONS = 8
 
 
 def content_factor(count: Tensor, channels: int, weight: float) -> Tensor:
@@ -101,15 +106,82 @@ class ContentTerm(PositionTerm):
 
     def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
         """Return the contribution of the cells that a tile owns, float64 scalar."""
-        return self._difference(tile, features[CONTENT_LAYER]).loss()
+        owned = self._owned(tile, features[CONTENT_LAYER])
+        if _can_be_fused(*owned[:2]):
+            return self.factor * fused_content_sum(*owned)
+        return self._difference(*owned).loss()
 
-    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> None:
+    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool | None:
         """Add the derivative of `value` with respect to a layer's features to a gradient in place."""
-        if layer == CONTENT_LAYER:
-            cells = tile.owned_cells(CONTENT_LAYER, self.view.size)[1]
-            gradient[cells.slices] += self._difference(tile, features).gradient()
+        if layer != CONTENT_LAYER:
+            return None
+        owned = self._owned(tile, features)
+        added = gradient[tile.owned_cells(CONTENT_LAYER, self.view.size)[1].slices]
+        if _can_be_fused(*owned[:2], added):
+            relu = added.shape == gradient.shape
+            fused_add_content_gradient(added, *owned, self.factor, relu=relu)
+            return relu
+        added += self._difference(*owned).gradient()
+        return False
 
-    def _difference(self, tile: PartitionTile, features: Tensor) -> ContentDifference:
+    def _owned(self, tile: PartitionTile, features: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return features, content and position weights of the cells that a tile owns."""
         in_view, in_tile = tile.owned_cells(CONTENT_LAYER, self.view.size)
         weights = self.view.weights(CONTENT_LAYER, in_view, self.position_weights)
-        return ContentDifference.of(features[in_tile.slices], self.content[tile], self.factor, weights)
+        return features[in_tile.slices], self.content[tile], weights
+
+    def _difference(self, features: Tensor, content: Tensor, weights: Tensor | None) -> ContentDifference:
+        return ContentDifference.of(features, content, self.factor, weights)
+
+
+# --- on a GPU: one kernel launch each ---
+
+
+def fused_content_sum(features: Tensor, content: Tensor, position_weights: Tensor | None = None) -> Tensor:
+    """Return the sum of a_p |F_p - content_p|^2 as `ContentDifference.loss` computes it, float64 scalar."""
+    from sgsst_core.loss import content_kernels as kernels
+
+    launch, constants = _launch(features, content, position_weights)
+    programs = -(-launch[0] // POSITIONS)
+    sums = torch.empty(programs, device=features.device)
+    weights = features if position_weights is None else position_weights
+    if programs:
+        with on_device(features.device):
+            kernels.content_sums[(programs,)](features, content, weights, sums, *launch, **constants)
+    return sums.sum(dtype=torch.float64)
+
+
+def fused_add_content_gradient(
+    gradient: Tensor,
+    features: Tensor,
+    content: Tensor,
+    position_weights: Tensor | None,
+    factor: Tensor,
+    *,
+    relu: bool = False,
+) -> None:
+    """Add `ContentDifference.gradient` to a gradient [h, w, c], and pass it through the features' ReLU if `relu`."""
+    from sgsst_core.loss import content_kernels as kernels
+
+    launch, constants = _launch(features, content, position_weights)
+    weights = features if position_weights is None else position_weights
+    if programs := -(-launch[0] // POSITIONS):
+        with on_device(features.device):
+            kernels.add_content_gradient[(programs,)](
+                features, content, weights, gradient, factor, *launch, row_cells(gradient), RELU=relu, **constants
+            )
+
+
+def _launch(
+    features: Tensor, content: Tensor, position_weights: Tensor | None
+) -> tuple[tuple[int, ...], dict[str, int | bool]]:
+    """Return the numbers and constants that both kernels take."""
+    height, width, channels = features.shape
+    steps = (0, 0) if position_weights is None else position_weights.stride()[:2]
+    numbers = (height * width, width, row_cells(features), row_cells(content), *steps)
+    block = block_of_channels(channels)
+    return numbers, {"CHANNELS": channels, "BLOCK": block, "P": POSITIONS, "WEIGHTED": position_weights is not None}
+
+
+def _can_be_fused(*tensors: Tensor) -> bool:
+    return all(can_be_fused(each) and each.dtype == tensors[0].dtype for each in tensors)

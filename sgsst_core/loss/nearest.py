@@ -242,11 +242,14 @@ class NearestTerm(PositionTerm):
             self.matches[tile].append(matches)
         return reduce(operator.add, sums)
 
-    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> None:
+    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool | None:
         """Add the derivative of `value` with respect to a layer's features to a gradient in place."""
+        added = None
         for (vectors, factor, pyramid), matches in zip(self.regions, self.matches[tile], strict=True):
             if layer in vectors.parts:
                 in_view, in_tile = tile.owned_cells(layer, self.view.size)
                 weights = self.view.weights(layer, in_view, pyramid)
                 owned = gradient[in_tile.slices], features[in_tile.slices]
                 matches.add_gradient(*owned, layer, vectors, factor, weights)
+                added = False
+        return added

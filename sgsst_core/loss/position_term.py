@@ -126,10 +126,13 @@ class PositionTerm(ABC):
         """
 
     @abstractmethod
-    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> None:
+    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool | None:
         """Add the derivative of `value` with respect to a layer's features to a gradient in place.
 
         It is called for every layer that the network reports.
+
+        Returns:
+            Whether the gradient was also passed through the layer's ReLU; None if nothing was added.
 
         Args:
             tile: Partition tile; `value` has been called for it.

@@ -261,11 +261,13 @@ class SosLoss:
     def _backward_tile(self, pass_: _ScalePass, tile: PartitionTile, activations: Activations, result: Tensor) -> None:
         """Add the pixel gradient of a tile to that of its scale, starting from the features that the tile owns."""
 
-        def add(layer: str, features: Tensor, gradient: Tensor) -> None:
+        def add(layer: str, features: Tensor, gradient: Tensor) -> bool:
             with self.timer("statistics"):
-                pass_.statistics.add_gradient(tile, layer, features, gradient)
+                passed = pass_.statistics.add_gradient(tile, layer, features, gradient)
                 for term in pass_.terms:
-                    term.add_gradient(tile, layer, features, gradient)
+                    added = term.add_gradient(tile, layer, features, gradient)
+                    passed = passed if added is None else added
+            return passed
 
         with self.timer("vgg_backward"):
             result[tile.outer.within(pass_.view.area).slices] += self.network.backward(activations, add)

@@ -139,14 +139,22 @@ class StyleGradient:
         self.add_to(result, features, position_weights)
         return result
 
-    def add_to(self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None) -> None:
+    def add_to(
+        self, gradient: Tensor, features: Tensor, position_weights: Tensor | None = None, *, relu: bool = False
+    ) -> bool:
         """Add the result of `apply` to a gradient [h, w, c] in place.
 
         The computation runs in blocks, so no tensor as large as the features is allocated.
+
+        Args:
+            relu: Whether the gradient may be passed through the ReLU whose outputs the features are.
+
+        Returns:
+            Whether it was: GPU kernels do this at no cost, because they read the features anyway.
         """
         if can_be_fused(features) and can_be_fused(gradient) and self.matrix.dtype == torch.float32:
-            fused_add_style_gradient(gradient, features, self, position_weights)
-            return
+            fused_add_style_gradient(gradient, features, self, position_weights, relu=relu)
+            return relu
         precision = torch.promote_types(features.dtype, torch.float32)
         matrix, mean, offset = (t.to(features.device, precision) for t in (self.matrix, self.mean, self.offset))
         for rows, block in blocks_of(features):
@@ -159,6 +167,7 @@ class StyleGradient:
                 target.view(centered.shape).addmm_(centered, matrix).addr_(weights, offset)
             else:
                 target += torch.addr(centered @ matrix, weights, offset).view(target.shape)
+        return False
 
 
 def style_loss(
@@ -263,13 +272,20 @@ class StatisticsTerms:
             self._gradients.setdefault(layer, []).append((gradient, region))
         return dict(zip(STATISTICS_TERMS, total.unbind(), strict=True))
 
-    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> None:
-        """Add the gradient with respect to a layer's features of a tile, on the cells that the tile owns, in place."""
+    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool:
+        """Add the gradient with respect to a layer's features of a tile, on the cells that the tile owns, in place.
+
+        Returns:
+            Whether the gradient was also passed through the layer's ReLU.
+        """
         in_view, in_tile = tile.owned_cells(layer, self._view.size)
+        added, owned = gradient[in_tile.slices], features[in_tile.slices]
+        relu, passed = layer != PIXELS and added.shape == gradient.shape, False
         for own, region in self._gradients.get(layer, ()):
             weights = self._view.weights(layer, in_view, region.positions)
             if not self._is_nowhere(weights):
-                own.add_to(gradient[in_tile.slices], features[in_tile.slices], weights)
+                passed = own.add_to(added, owned, weights, relu=relu)
+        return passed
 
     def _is_nowhere(self, weights: Tensor | None) -> bool:
         """Return whether the weights of a region in some cells are known to be all 0.
@@ -313,7 +329,12 @@ def fused_style_loss(
 
 
 def fused_add_style_gradient(
-    gradient: Tensor, features: Tensor, style: StyleGradient, position_weights: Tensor | None = None
+    gradient: Tensor,
+    features: Tensor,
+    style: StyleGradient,
+    position_weights: Tensor | None = None,
+    *,
+    relu: bool = False,
 ) -> None:
     """Compute `StyleGradient.add_to` on a GPU, for a gradient and features [h, w, c] of the same dtype."""
     from sgsst_core.loss import statistics_terms_kernels as kernels
@@ -331,5 +352,5 @@ def fused_add_style_gradient(
             features, weights, gradient, matrix, low, mean, offset,
             positions, width, row_cells(features), *weights.stride()[:2], row_cells(gradient),
             CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEPS[features.element_size()]), P=block,
-            WEIGHTED=position_weights is not None,
+            WEIGHTED=position_weights is not None, RELU=relu,
         )  # fmt: skip

@@ -78,8 +78,9 @@ def add_style_gradient(
     features, weights, gradient, matrix, low, mean, offset,
     positions, width, row_cells, weight_row_step, weight_column_step, out_row_cells,
     CHANNELS: tl.constexpr, TILE: tl.constexpr, K: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
+    RELU: tl.constexpr,
 ):  # fmt: skip
-    """Compute gradient_p += a_p (matrix (F_p - mean) + offset).
+    """Compute gradient_p += a_p (matrix (F_p - mean) + offset); if RELU, zero it where the features are not positive.
 
     Each program handles P positions and TILE output channels; it sums over the input channels in steps of K. In
     bfloat16, features are multiplied as they are: products of 8-bit factors are exact.
@@ -93,6 +94,7 @@ def add_style_gradient(
         low: Output of `compare` for bfloat16 features; otherwise None.
         positions: Number of positions, h * width.
         row_cells, out_row_cells: Distances of two rows of features and gradient in cells of CHANNELS values.
+        RELU: Whether the features are the outputs of a ReLU, through which the gradient is passed on.
     """
     tiles: tl.constexpr = (CHANNELS + TILE - 1) // TILE
     stages: tl.constexpr = 3 if low is not None and CHANNELS > K else 1
@@ -121,4 +123,8 @@ def add_style_gradient(
     target = gradient + cells_of(position, width, out_row_cells)[:, None] * CHANNELS + own[None, :]
     mask = mask_of(there, own, CHANNELS)
     before = tl.load(target, mask=mask, other=0.0)
-    tl.store(target, (before.to(tl.float32) + sums).to(before.dtype), mask=mask)
+    sums += before.to(tl.float32)
+    if RELU:
+        output = load_features(features, cell, own, there, CHANNELS, TILE)
+        sums = tl.where(output.to(tl.float32) <= 0, 0.0, sums)
+    tl.store(target, sums.to(before.dtype), mask=mask)

@@ -23,6 +23,7 @@ from tests.ptx.operations import (
     comparison,
     conversion,
     dtype_of,
+    from_bfloat16,
     select,
     to_bfloat16,
 )
@@ -142,6 +143,8 @@ def compile_instruction(instruction: Instruction) -> Execute:
     type_ = opcode[-1]
     if name == "cvt" and opcode[-2] in ("f16x2", "bf16x2"):
         return _convert_pair(instruction)
+    if name == "setp" and type_ == "bf16x2":
+        return _compare_pairs(instruction)
     if name == "cvt":
         function, types = conversion(opcode), [type_]
     elif name == "setp":
@@ -198,6 +201,20 @@ def _pack(instruction: Instruction) -> Execute:
         write(state, target, joined.view(UNSIGNED[bits]).reshape(-1), mask)
 
     return join
+
+
+def _compare_pairs(instruction: Instruction) -> Execute:
+    targets, *operands = instruction.operands
+    compare = comparison((*instruction.opcode[:-1], "f32"))
+    reads = [reader(operand, "u32") for operand in operands]
+
+    def execute(state: State, mask: np.ndarray | None) -> None:
+        pairs = [read(state) for read in reads]
+        for target, shift in zip(targets.split("|"), (0, 16), strict=True):
+            halves = (from_bfloat16((pair >> np.uint32(shift)).astype(np.uint16)) for pair in pairs)
+            write(state, target, compare(*halves), mask)
+
+    return execute
 
 
 def _convert_pair(instruction: Instruction) -> Execute:

@@ -14,6 +14,7 @@ from torch import Tensor
 from sgsst_core.constants import ALPHA_MIN
 from sgsst_core.features.pooling import fused_max_pool, fused_max_pool_backward, max_pool_backward_reference
 from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
+from sgsst_core.loss.content import fused_add_content_gradient, fused_content_sum
 from sgsst_core.loss.statistics_terms import StyleGradient, fused_add_style_gradient
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
@@ -223,6 +224,64 @@ def test_shifted_masks_are_reported() -> None:
         fused_statistics(features, weights)
         kernel = driver.kernels["shifted_moments"]
         assert sum(reports(kernel, shifted, lambda: fused_statistics(features, weights).centered)) >= 5
+
+
+def strict(instruction: Instruction) -> Instruction | None:
+    """Let a comparison of features with 0 take 0 for a positive number."""
+    changed = {"le": "lt", "gtu": "geu"}.get((*instruction.opcode, "")[1])
+    if instruction.opcode[0] != "setp" or changed is None or instruction.opcode[-1] not in ("f32", "bf16x2"):
+        return None
+    return replace(instruction, opcode=("setp", changed, *instruction.opcode[2:]))
+
+
+def styled(gradient: Tensor, features: Tensor) -> None:
+    style = StyleGradient(torch.ones((64, 64)), torch.zeros(64), torch.ones(64))
+    fused_add_style_gradient(gradient, features, style, relu=True)
+
+
+def compared(gradient: Tensor, features: Tensor) -> None:
+    factor = torch.ones((), dtype=torch.float64)
+    fused_add_content_gradient(gradient, features, features + 1, None, factor, relu=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "add", "capability"),
+    [("add_style_gradient", styled, 80), ("add_content_gradient", compared, 90)],  # sm_90 multiplies by `wgmma`
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_every_changed_relu_is_reported(
+    name: str, add: Callable[[Tensor, Tensor], None], capability: int, dtype: torch.dtype
+) -> None:
+    features = torch.randn((5, 29, 64), generator=torch.Generator().manual_seed(0)).relu().to(dtype)
+
+    def gradient() -> Tensor:
+        result = torch.zeros_like(features)
+        add(result, features)
+        return result
+
+    with compiled_kernels(capability) as driver:
+        assert torch.equal(gradient() != 0, features != 0)
+        reported = reports(driver.kernels[name], strict, gradient)
+    assert reported
+    assert all(reported)
+
+
+def test_shifted_masks_of_the_content_term_are_reported() -> None:
+    """Without its mask, a program would compare or change positions beyond the last one."""
+    features, content = torch.rand((2, 3, 5, 16), generator=torch.Generator().manual_seed(0))
+
+    def gradient() -> Tensor:
+        result = torch.zeros_like(features)
+        fused_add_content_gradient(result, features, content, None, torch.ones((), dtype=torch.float64))
+        return result
+
+    with compiled_kernels(80) as driver:
+        for name, run in (
+            ("content_sums", lambda: fused_content_sum(features, content)),
+            ("add_content_gradient", gradient),
+        ):
+            run()
+            assert sum(reports(driver.kernels[name], shifted, run)) >= 1
 
 
 def test_shifted_masks_of_pooling_are_reported() -> None:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sgsst_core.features.statistics import LayerStatistics, fused_statistics, layer_statistics_reference
 from sgsst_core.loss import statistics_terms as terms
+from sgsst_core.loss.content import ContentDifference, fused_add_content_gradient, fused_content_sum
 from sgsst_core.loss.statistics_terms import (
     StyleGradient,
     fused_add_style_gradient,
@@ -186,6 +187,47 @@ def test_bfloat16_features_may_differ_in_their_last_bit_only(weighted: bool) -> 
     fused_add_style_gradient(gradient, x, on_device, a)
     expected = (x.cpu().double() - exact.mean) / 3 * (1 if a is None else a.cpu().double()[..., None])
     assert relative_error(gradient.cpu().double(), expected) < 8e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(("channels", "weighted"), [(8, True), (128, False)])
+def test_gradient_passes_the_relu_of_the_features(dtype: torch.dtype, channels: int, weighted: bool) -> None:
+    x, a = features(20, 33, channels, seed=3).to(dtype), position_weights(20, 33) if weighted else None
+    x[0, 0, 0], x[0, 1, 0] = torch.nan, -0.0
+    assert 0.3 < float((x == 0).float().mean()) < 0.7
+    generator = torch.Generator().manual_seed(0)
+    matrix, mean, offset = (
+        torch.randn(shape, generator=generator) for shape in ((channels, channels), channels, channels)
+    )
+    style = StyleGradient(*(part.to(DEVICE) for part in (matrix + matrix.T, mean, offset)))
+    before = torch.randn(x.shape, generator=generator).to(DEVICE, dtype)
+    gradient, expected = before.clone(), before.clone()
+    fused_add_style_gradient(gradient, x, style, a, relu=True)
+    fused_add_style_gradient(expected, x, style, a)
+    expected = torch.ops.aten.threshold_backward(expected, x, 0)
+    assert torch.equal(gradient.cpu().nan_to_num(), expected.cpu().nan_to_num())
+    assert gradient[0, 0].isnan().any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(("channels", "weighted"), [(8, True), (512, False)])
+def test_content_term_agrees_with_float64(dtype: torch.dtype, channels: int, weighted: bool) -> None:
+    x, content = (features(9, 13, channels, seed=seed).to(dtype) for seed in (1, 2))
+    a, factor = position_weights(9, 13) if weighted else None, torch.tensor(0.7, dtype=torch.float64, device=DEVICE)
+    exact = ContentDifference.of(x.double(), content.double(), factor, a)
+    assert float(factor * fused_content_sum(x, content, a)) == pytest.approx(float(exact.loss()), rel=1e-6)
+    before = torch.randn(x.shape, generator=torch.Generator().manual_seed(0)).to(DEVICE, dtype)
+    for relu in (False, True):
+        gradient, expected = before.clone(), before.double() + exact.gradient()
+        fused_add_content_gradient(gradient, x, content, a, factor, relu=relu)
+        expected = expected * (x > 0) if relu else expected
+        assert relative_error(gradient.cpu().double(), expected.cpu()) < (1e-6 if dtype == torch.float32 else 4e-3)
+
+
+def test_content_term_of_no_positions_is_0() -> None:
+    x, factor = torch.zeros((0, 7, 16), device=DEVICE), torch.ones((), dtype=torch.float64, device=DEVICE)
+    assert not float(fused_content_sum(x, x))
+    fused_add_content_gradient(x.clone(), x, x, None, factor)
 
 
 def test_kernel_splits_the_gradient() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.pooling import relu_backward
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, graphs_problem
 from sgsst_core.loss.sos import SosLoss, SosResult
@@ -23,7 +25,7 @@ from sgsst_core.style import Style
 from sgsst_core.timing import Timer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
-from tests.sgsst_core.synthetic_images import synthetic_image
+from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -89,6 +91,32 @@ def test_graph_is_bit_identical_to_eager_mode_for_every_view(
         assert values.cpu().equal(expected_values.cpu())
     assert graphs.problem is None
     assert loss.timer.read()["network"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tile_size", [None, 32])
+def test_kernels_agree_with_tensor_functions_and_pass_relus(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch, tile_size: int | None
+) -> None:
+    """Kernels of the style gradient and the content term pass ReLUs, but not in tiles with cells that others own."""
+    loss = make_loss(tiny_weights, tile_size=tile_size)
+    style, view, pixels = style_of(loss), view_of(loss, 2, weighted=True), image(1)
+    results, relus = [], []
+    for leave_out in (False, True):
+        if leave_out:
+            leave_out_kernels(monkeypatch)
+        counts.clear()
+        results.append(loss.evaluate(pixels, style, view, SCALES))
+        lines = inspect.getsourcelines(relu_backward)
+        places = {f"sgsst_core/features/pooling.py:{lines[1] + number}" for number in range(len(lines[0]))}
+        relus.append(sum(counts.launches[line] for line in places))
+    fast, plain = (result.image_gradient for result in results)
+    assert fast is not None
+    assert plain is not None
+    assert relative_error(fast.cpu(), plain.cpu().double()) < 1e-5
+    assert relative_error(results[0].values.cpu(), results[1].values.cpu()) < 1e-5
+    if tile_size is None:  # of eleven convolutions, relu3_2 alone is neither pooled nor part of the loss
+        assert relus == [len(SCALES), 11 * len(SCALES)]
 
 
 @pytest.mark.usefixtures("without_triton")
