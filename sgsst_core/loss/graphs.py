@@ -28,15 +28,15 @@ FIRST_VISITS = 2
 FIRST_TORCH = 2, 13
 
 
-def graphs_problem(device: torch.device | str) -> str | None:
-    """Return the reason why CUDA graphs are not used on a device; None if they are.
+def failure_is_fatal() -> bool:
+    """Return whether this process cannot use the GPU after a failed capture: the allocator stays in capture mode."""
+    return tuple(map(int, torch.__version__.split(".")[:2])) < FIRST_TORCH
 
-    Before PyTorch 2.13, the allocator stays in capture mode after a capture has failed, which breaks the process.
-    """
+
+def graphs_problem(device: torch.device | str) -> str | None:
+    """Return the reason why CUDA graphs are not used on a device; None if they are."""
     if torch.device(device).type != "cuda" or torch.version.hip is not None:
         return "only NVIDIA GPUs are known to replay them"
-    if tuple(map(int, torch.__version__.split(".")[:2])) < FIRST_TORCH:
-        return f"PyTorch {'.'.join(map(str, FIRST_TORCH))} or later is needed, but this is {torch.__version__}"
     return None
 
 
@@ -124,6 +124,11 @@ class LossGraphs:
     def captured(self) -> int:
         """Number of captured graphs."""
         return len(self._graphs)
+
+    @property
+    def visited(self) -> int:
+        """Number of keys whose next evaluation is captured or replayed."""
+        return len(self._visited)
 
     def clear(self) -> None:
         """Delete all graphs, for example because the partition is about to change."""

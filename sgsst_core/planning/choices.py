@@ -9,7 +9,7 @@ from dataclasses import replace
 from sgsst_core.budget import memory_for
 from sgsst_core.decision import ANOTHER_LOSS, VIEWS, Decision
 from sgsst_core.loss.convergence import MIN_FALL, window_length
-from sgsst_core.loss.graphs import FIRST_VISITS
+from sgsst_core.loss.graphs import FIRST_VISITS, failure_is_fatal
 from sgsst_core.loss.nearest import MAX_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.statistics_terms import has_statistics
@@ -36,6 +36,8 @@ _SCAN_BACKGROUND: PlannedBackground = "palette"
 _MUCH_FASTER = 1.5
 #: Minimum visits per view size for which a CUDA graph of the loss is considered at all.
 LEAST_GRAPH_VISITS = 20
+#: The same if the capture is first tried in a child process, whose start takes as long as so many visits save: 6 s.
+LEAST_TRIED_VISITS = 1000
 #: Minimum fraction of a step's time that additional ranks must save.
 LEAST_GAIN = 0.03
 #: Bytes per optimized Gaussian: color, gradient and two moments, float32.
@@ -99,7 +101,8 @@ def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
 
 def considers_graphs(plan: Plan, facts: Facts, settings: Settings) -> bool:
     """Return whether CUDA graphs of the loss are possible, and may pay off."""
-    often = _visits_of_a_size(plan, facts, settings) >= LEAST_GRAPH_VISITS
+    least = LEAST_TRIED_VISITS if failure_is_fatal() else LEAST_GRAPH_VISITS
+    often = _visits_of_a_size(plan, facts, settings) >= least
     return plan.device == "cuda" and often and not _divides_views(facts, settings)
 
 

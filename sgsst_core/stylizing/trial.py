@@ -17,9 +17,10 @@ import psutil
 import torch
 
 from sgsst_core.budget import device_peak, memory_for
-from sgsst_core.loss.graphs import LossGraphs, graphs_problem
+from sgsst_core.loss.graphs import LossGraphs, failure_is_fatal, graphs_problem
 from sgsst_core.planning.context import NetworkPixels, Saving
 from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.stylizing.capture_trial import CaptureTrial
 from sgsst_core.stylizing.job import StylizationJob, with_second_attempt
 from sgsst_core.stylizing.optimizer import ColorOptimizer
 from sgsst_core.stylizing.schedule import Phase, drawn_views
@@ -290,12 +291,14 @@ def launch_cost(job: StylizationJob) -> Saving:
 
     try:
         seconds(graphs.evaluate)  # eager first run: warms up the kernels
+        if not graphs.visited:
+            return Saving(problem="a view's activations do not fit the memory twice")
         eager = min(seconds(job.loss.evaluate) for _ in range(_REPETITIONS))
+        if failure_is_fatal() and (problem := CaptureTrial.of(job, (image.shape[0], image.shape[1])).run_in_child()):
+            return Saving(problem=problem)
         first = seconds(graphs.evaluate)
         if graphs.problem is not None:
             return Saving(problem=graphs.problem)
-        if not graphs.captured:
-            return Saving(problem="a view's activations do not fit the memory twice")
         replayed = min(seconds(graphs.evaluate) for _ in range(_REPETITIONS))
     except torch.OutOfMemoryError:
         return Saving(problem="the GPU's memory was not enough to evaluate the first view")

@@ -15,7 +15,7 @@ if torch.cuda.is_available():
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.pooling import relu_backward
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, graphs_problem
+from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, failure_is_fatal, graphs_problem
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.loss.terms import layers_of
@@ -220,10 +220,10 @@ def test_failed_capture_falls_back_to_eager_mode(
     assert not torch.cuda.is_current_stream_capturing()
 
 
-def test_graphs_require_pytorch_2_13(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
-    for version, used in (("2.11.0+cu128", False), ("2.12.1", False), ("2.13.0+cu130", True), ("3.0", True)):
+def test_failed_captures_are_fatal_before_pytorch_2_13(monkeypatch: pytest.MonkeyPatch) -> None:
+    for version, fatal in (("2.11.0+cu128", True), ("2.12.1", True), ("2.13.0+cu130", False), ("3.0", False)):
         monkeypatch.setattr(torch, "__version__", version)
-        assert (graphs_problem("cuda") is None) is used
+        assert failure_is_fatal() is fatal
 
 
 @pytest.mark.usefixtures("without_triton")

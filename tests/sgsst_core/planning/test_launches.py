@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +17,7 @@ if torch.cuda.is_available():
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.planning.choices import LEAST_GRAPH_VISITS
+from sgsst_core.planning.choices import LEAST_GRAPH_VISITS, LEAST_TRIED_VISITS
 from sgsst_core.planning.context import Saving
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
@@ -72,7 +74,35 @@ def test_launch_cost_without_graph_states_the_problem(
         patch.setattr(torch.cuda, "graph", broken)
         assert launch_cost(planned).problem == "RuntimeError: not here"
     monkeypatch.setattr(torch, "__version__", TorchVersion("2.12.1"))
-    assert "PyTorch 2.13 or later is needed" in str(launch_cost(planned).problem)
+    assert "a trial in a child process ended with status 1: " in str(launch_cost(planned).problem)  # no GPU there
+
+
+@pytest.mark.slow
+def test_capture_is_tried_in_a_child_process_if_a_failure_is_fatal(
+    counts: Counts, tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The child process has the simulated GPU too, on which capturing works, or fails where the host waits for it."""
+    planned = job(tiny_weights)
+    monkeypatch.setattr(torch, "__version__", TorchVersion("2.12.1"))
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path(__file__).parents[3]}")
+    start = (
+        "import os; os.environ['TRITON_INTERPRET'] = '1'\n"
+        "import pytest; from tests.pretend_cuda.interpreter import leave_out_kernels\n"
+        "from tests.pretend_cuda.runtime import pretend_cuda\n"
+        "device = pretend_cuda(); device.__enter__(); leave_out_kernels(pytest.MonkeyPatch())\n"
+    )
+    wait = (
+        "from sgsst_core.features.vgg import FeatureNetwork\n"
+        "convolve = FeatureNetwork._convolve\n"
+        "FeatureNetwork._convolve = lambda self, x, step: float(x.amax()) and convolve(self, x, step)\n"
+    )
+    (tmp_path / "sitecustomize.py").write_text(start)
+    cost = launch_cost(planned)
+    assert cost.problem is None
+    assert cost.seconds > 0
+    (tmp_path / "sitecustomize.py").write_text(start + wait)
+    assert "operation not permitted when stream is capturing" in str(launch_cost(planned).problem)
+    assert planned.loss.timer.read() is not None  # this process still uses the device
 
 
 @pytest.mark.slow
@@ -95,15 +125,23 @@ def test_bfloat16_is_not_used_if_it_is_emulated(
 
 
 @pytest.mark.slow
-def test_launches_are_measured_if_views_are_visited_often(counts: Counts, tiny_weights: BackboneWeights) -> None:
-    for steps in (LEAST_GRAPH_VISITS, LEAST_GRAPH_VISITS - 1):
+def test_launches_are_measured_if_views_are_visited_often(
+    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Visits must also save the time of a child process if one tries the capture."""
+    for version, steps, considered in (
+        ("2.13.0", LEAST_GRAPH_VISITS, True),
+        ("2.13.0", LEAST_GRAPH_VISITS - 1, False),
+        ("2.12.1", LEAST_TRIED_VISITS - 1, False),
+    ):
+        monkeypatch.setattr(torch, "__version__", TorchVersion(version))
         settings = make_settings(steps_coarse=0, steps_sos=steps, coarsest_side=16, position_weights="off")
         stylizer = Stylizer.planned(
             wall(10, 8), cameras(2, 48, 32), style(), settings, weights=tiny_weights, rasterizer="cpu"
         )
         decision = next(line for line in stylizer.job.plan.decisions if line.item == "launches")
         measured = "measured per view" in decision.reason
-        assert measured is (steps == LEAST_GRAPH_VISITS)
+        assert measured is considered
         assert (stylizer.job.graphs is not None) is stylizer.job.plan.graphs
 
 
