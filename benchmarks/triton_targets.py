@@ -28,8 +28,8 @@ from triton.compiler import ASTSource
 
 from benchmarks.machine import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, TRANSMITTANCE_MIN
+from sgsst_core.features import first_layer_kernels, statistics_kernels
 from sgsst_core.features import pooling_triton_kernels as pooling_kernels
-from sgsst_core.features import statistics_kernels
 from sgsst_core.features.statistics import (
     FLUSH,
     POSITIONS,
@@ -200,6 +200,20 @@ KERNELS: dict[str, Target] = {
         )
         for kernel, more in ((content_kernels.content_sums, {}), (content_kernels.add_content_gradient, {"RELU": True}))
         for form, types in (("float32", "*fp32"), ("bfloat16", "*bf16"))
+    },
+    **{
+        kernel.__name__: Target(
+            kernel,
+            {"CHANNELS": 64, "BLOCK": 64, "P": first_layer_kernels.P.value},
+            4,
+            dict.fromkeys(("weight", "bias", "gradient"), "*bf16")
+            | dict.fromkeys(("pixels", "scale", "shift"), "*fp32")
+            | {"height": "i32", "out": out},
+        )
+        for kernel, out in (
+            (first_layer_kernels.convolve_pixels, "*bf16"),
+            (first_layer_kernels.pixel_gradients, "*fp32"),
+        )
     },
     "rest_colors": Target(
         harmonics_kernels.rest_colors,

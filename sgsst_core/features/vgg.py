@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from sgsst_core.features import first_layer
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.pooling import max_pool, max_pool_backward, max_positions, relu_backward
@@ -291,18 +292,18 @@ class FeatureNetwork:
         activations = Activations({}, size=(height, width))
         if PIXELS in self.layers:
             activations.features[PIXELS] = pixels * PIXEL_UNIT
-        # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
-        x = (pixels * self._scale + self._shift).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         with convolutions(self.device, tf32=self.tf32):
-            self._forward_steps(x, activations, cache, until)
+            self._forward_steps(pixels, activations, cache, until)
         for layer in self.layers:
             stride = layer_stride(layer)
             if layer not in activations.features and min(height, width) < stride:
-                activations.features[layer] = x.new_empty((height // stride, width // stride, self.channels(layer)))
+                shape = (height // stride, width // stride, self.channels(layer))
+                activations.features[layer] = torch.empty(shape, dtype=self.dtype, device=self.device)
         return activations
 
-    def _forward_steps(self, x: Tensor, activations: Activations, cache: bool, until: str | None) -> None:
-        """Run the steps on the pixels [1, 3, h, w], up to the last layer that has cells, or `until`."""
+    def _forward_steps(self, pixels: Tensor, activations: Activations, cache: bool, until: str | None) -> None:
+        """Run the steps on the pixels [h, w, 3], up to the last layer that has cells, or `until`."""
+        x = pixels
         for step in self._steps:
             if isinstance(step, _Pool):
                 if min(x.shape[2:]) < 2:
@@ -311,13 +312,21 @@ class FeatureNetwork:
                 if cache:
                     activations.outputs.append(x.new_empty(0))
                 continue
-            x = self._convolve(x, step)
+            x = self._convolve_pixels(x, step) if x is pixels else self._convolve(x, step)
             if cache:
                 activations.outputs.append(x)
             if step.layer in self.layers:
                 activations.features[step.layer] = x[0].permute(1, 2, 0)
             if step.layer == until:
                 break
+
+    def _convolve_pixels(self, pixels: Tensor, step: _Convolution) -> Tensor:
+        """Normalize pixels [h, w, 3], and apply the first convolution, bias and ReLU."""
+        if first_layer.has_kernels(step.weight):
+            return first_layer.convolve_pixels(pixels, step.weight, step.bias, self._scale, self._shift)
+        # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
+        x = (pixels * self._scale + self._shift).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
+        return self._convolve(x, step)
 
     def _convolve(self, x: Tensor, step: _Convolution) -> Tensor:
         """Apply convolution, bias and ReLU to x [1, in, h, w]."""
@@ -352,10 +361,7 @@ class FeatureNetwork:
         with convolutions(self.device, tf32=self.tf32):
             gradient = self._backward_steps(activations, feature_gradient)
         shape = (*activations.size, 3)
-        if gradient is None:
-            pixels = torch.zeros(shape, dtype=self._scale.dtype, device=self.device)
-        else:
-            pixels = gradient[0].permute(1, 2, 0).to(self._scale.dtype) * self._scale
+        pixels = torch.zeros(shape, dtype=self._scale.dtype, device=self.device) if gradient is None else gradient
         if (features := activations.features.pop(PIXELS, None)) is not None:
             own = torch.zeros(shape, dtype=self._scale.dtype, device=self.device)
             feature_gradient(PIXELS, features, own)
@@ -363,7 +369,7 @@ class FeatureNetwork:
         return gray_gradient(pixels) if self._gray else pixels
 
     def _backward_steps(self, activations: Activations, feature_gradient: FeatureGradient) -> Tensor | None:
-        """Return the gradient [1, 3, h, w] of the first step's input; None if no layer has a gradient."""
+        """Return the gradient of the pixels [h, w, 3]; None if no layer has a gradient."""
         gradient: Tensor | None = None  # [1, c, h, w]
         masked = False  # whether the gradient is already 0 wherever the ReLU's output is 0
         steps = self._steps[: len(activations.outputs)]
@@ -379,8 +385,10 @@ class FeatureNetwork:
                 masked = bool(feature_gradient(step.layer, features, gradient[0].permute(1, 2, 0)))
             if gradient is not None:
                 gradient = gradient if masked else relu_backward(gradient, output)
+                if step is self._steps[0] and first_layer.has_kernels(step.weight):
+                    return first_layer.pixel_gradient(gradient, step.backward_weight, self._scale)
                 gradient, masked = self._convolve_back(gradient, step), False
-        return gradient
+        return None if gradient is None else gradient[0].permute(1, 2, 0).to(self._scale.dtype) * self._scale
 
     def held_bytes_per_pixel(self) -> float:
         """Return the bytes per pixel that a forward pass stores until `backward` has used them.

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MIN
+from sgsst_core.features.first_layer import convolve_pixels, pixel_gradient
 from sgsst_core.features.pooling import fused_max_pool, fused_max_pool_backward, max_pool_backward_reference
 from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
 from sgsst_core.loss.content import fused_add_content_gradient, fused_content_sum
@@ -264,6 +265,23 @@ def test_every_changed_relu_is_reported(
         reported = reports(driver.kernels[name], strict, gradient)
     assert reported
     assert all(reported)
+
+
+@pytest.mark.parametrize("name", ["convolve_pixels", "pixel_gradients"])
+def test_shifted_borders_of_the_first_layer_are_reported(name: str) -> None:
+    """Every comparison of a row or column with the border keeps zeros around the image."""
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.randn((16, 3, 3, 3), generator=generator).bfloat16().contiguous(memory_format=torch.channels_last)
+    pixels, gradient = torch.rand((3, 5, 3), generator=generator), torch.ones((1, 3, 5, 16), dtype=torch.bfloat16)
+    one, back = torch.ones(16), weight.transpose(0, 1).contiguous(memory_format=torch.channels_last)
+    runs = {
+        "convolve_pixels": lambda: convolve_pixels(pixels, weight, one.bfloat16(), one[:3], one[:3]).float(),
+        "pixel_gradients": lambda: pixel_gradient(gradient.permute(0, 3, 1, 2), back, one[:3]),
+    }
+    with compiled_kernels(80) as driver:
+        runs[name]()
+        reported = reports(driver.kernels[name], shifted, runs[name])
+    assert sum(reported) >= 3, reported
 
 
 def test_shifted_masks_of_the_content_term_are_reported() -> None:
