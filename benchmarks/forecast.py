@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass
 from typing import Any
 from unittest import mock
@@ -24,7 +24,7 @@ from benchmarks.machine import write_result
 from benchmarks.work import Counted, Work, meta
 from sgsst_core.budget import GPU_SHARE, content_fraction, measuring_memory, memory_for
 from sgsst_core.constants import RASTER_TILE
-from sgsst_core.features import vgg
+from sgsst_core.features import first_layer, vgg
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
@@ -228,9 +228,9 @@ class Passes:
         forward, backward = [], []
         for (tile, _), is_cached in zip(self.tiles, self.cached, strict=True):
             outer = tile.outer
-            with Counted() as there, _fused_pooling(there):
+            with Counted() as there, _as_kernels(there):
                 activations = self.loss.network.forward(meta(outer.bottom - outer.top, outer.right - outer.left, 3))
-            with Counted() as back, _fused_pooling(back):
+            with Counted() as back, _as_kernels(back):
                 self.loss.network.backward(activations, lambda *_: True)  # the style gradient masks it
             forward += there.works
             backward += back.works if is_cached else there.works + back.works
@@ -276,8 +276,8 @@ class Passes:
         return counted.works
 
 
-def _fused_pooling(counted: Counted) -> AbstractContextManager[Any]:
-    """Count pooling, and its backward pass with ReLU's, as the Triton kernels that a GPU runs; they need values."""
+def _as_kernels(counted: Counted) -> AbstractContextManager[Any]:
+    """Count pooling, its backward pass with ReLU's, and the first layer as the kernels of a GPU; they need values."""
 
     def pool(source: Tensor) -> Tensor:
         _, channels, height, width = source.shape
@@ -288,7 +288,22 @@ def _fused_pooling(counted: Counted) -> AbstractContextManager[Any]:
         counted.works.append(Work(0, gradient.nbytes + 2 * source.nbytes))
         return torch.empty_like(source)
 
-    return mock.patch.multiple(vgg, max_pool=pool, max_pool_backward=pool_backward)
+    def convolve(pixels: Tensor, weight: Tensor, bias: Tensor, *_: Tensor) -> Tensor:
+        out = meta(1, len(bias), *pixels.shape[:2], dtype=weight.dtype)
+        counted.works.append(Work(2.0 * weight.numel() * out[0, 0].numel(), pixels.nbytes + out.nbytes))
+        return out
+
+    def gradient(gradient: Tensor, weight: Tensor, scale: Tensor) -> Tensor:
+        out = meta(*gradient.shape[2:], 3)
+        counted.works.append(Work(2.0 * weight.numel() * gradient[0, 0].numel(), gradient.nbytes + 3 * out.nbytes))
+        counted.works.append(Work(0, 4 * out.nbytes))
+        return out
+
+    stack = ExitStack()
+    stack.enter_context(mock.patch.multiple(vgg, max_pool=pool, max_pool_backward=pool_backward))
+    kernels = {"has_kernels": lambda weight: weight.element_size() == 2, "convolve_pixels": convolve}
+    stack.enter_context(mock.patch.multiple(first_layer, pixel_gradient=gradient, **kernels))
+    return stack
 
 
 def _cells(layer: str, tile: PartitionTile, size: Size) -> int:

@@ -22,7 +22,8 @@ from benchmarks.gpu.part import QUICK, Findings, Sizes, device
 from sgsst_core.bench.synthetic import surface_scene, texture, views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
-from sgsst_core.settings import make_settings
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Precision, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Steps that are recorded after the first.
@@ -87,13 +88,32 @@ class Launches:
 
 
 def run(sizes: Sizes, findings: Findings) -> None:
-    """Record the kernels of steps, then those of cached blend weights."""
-    quick, launches = sizes == QUICK, Launches()
-    width, height = sizes.view
+    """Record the kernels of steps, on a GPU in bfloat16 too, then those of cached blend weights."""
+    launches, (width, height) = Launches(), sizes.view
     scene = surface_scene(sizes.gaussians[0], degree=3)
+    precisions: tuple[Precision, ...] = ("bfloat16", "float32") if device().type == "cuda" else ("float32",)
+    for precision in precisions:
+        stylizer = _record_steps(sizes, scene, precision, launches)
+        place = "step" if precision == "float32" else f"step_{precision}"
+        report(launches, place, findings, _STEPS)
+        if device().type == "cuda":
+            findings.add(f"{place}/all_launches", _all_launches(stylizer))
+        launches.forget()
+    rasterizer = CachedRasterizer(scene, uncached=make_rasterizer("triton", scene))
+    colors, camera = torch.full((len(scene), 3), 0.5, device=device()), views(1, width, height)[0]
+    with launches.recorded():
+        for _ in range(2):
+            rasterizer.color_gradient(rasterizer.render(colors, camera), camera)
+    report(launches, "cached_weights", findings, 1)
+    findings.add("first_launch_seconds", {name: kernel.first for name, kernel in sorted(launches.kernels.items())})
+
+
+def _record_steps(sizes: Sizes, scene: Scene, precision: Precision, launches: Launches) -> Stylizer:
+    """Record the kernels of some steps after the first, and return their stylizer."""
+    quick, (width, height) = sizes == QUICK, sizes.view
     settings = make_settings(
         "standard", steps_coarse=0, steps_sos=10, early_stop=False, cached_weights="none",
-        coarsest_side=24 if quick else None, position_weights="on",
+        coarsest_side=24 if quick else None, position_weights="on", precision=precision,
     )  # fmt: skip
     with launches.recorded():
         stylizer = Stylizer.planned(
@@ -104,17 +124,7 @@ def run(sizes: Sizes, findings: Findings) -> None:
         launches.forget()
         for _ in range(_STEPS):
             stylizer.run_step()
-    report(launches, "step", findings, _STEPS)
-    if device().type == "cuda":
-        findings.add("step/all_launches", _all_launches(stylizer))
-    launches.forget()
-    rasterizer = CachedRasterizer(scene, uncached=make_rasterizer("triton", scene))
-    colors, camera = torch.full((len(scene), 3), 0.5, device=device()), stylizer.job.views.cameras[0]
-    with launches.recorded():
-        for _ in range(2):
-            rasterizer.color_gradient(rasterizer.render(colors, camera), camera)
-    report(launches, "cached_weights", findings, 1)
-    findings.add("first_launch_seconds", {name: kernel.first for name, kernel in sorted(launches.kernels.items())})
+    return stylizer
 
 
 def report(launches: Launches, prefix: str, findings: Findings, rounds: int) -> None:

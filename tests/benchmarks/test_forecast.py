@@ -29,10 +29,10 @@ FLOP = 2 * 9 * (
 
 
 def test_vgg19_takes_0_72_million_operations_per_pixel_and_pass() -> None:
-    forward, backward = Passes(make_loss(H200, "float32"), SMALL.size, [0]).network()
     assert FLOP == 722_304
-    for works in (forward, backward):
-        assert sum(work.operations for work in works) / (96 * 128) == FLOP
+    for precision in ("float32", "bfloat16"):
+        for works in Passes(make_loss(H200, precision), SMALL.size, [0]).network():
+            assert sum(work.operations for work in works) / (96 * 128) == FLOP
 
 
 def test_launches_are_counted_with_their_bytes() -> None:
