@@ -157,8 +157,10 @@ def test_products_of_bfloat16_features_are_not_rounded(channels: int) -> None:
     matrix = matrix + matrix.T
     expected = ((features.double() - mean.double()) @ matrix.double() + offset.double()) * weights[..., None]
     gradient = torch.zeros_like(features)
-    with compiled_kernels(80):
+    with compiled_kernels(80) as driver:
         assert relative_error(fused_statistics(features, weights).centered, exact.centered) < 1e-6
+        instructions = driver.kernels["shifted_moments"].program.instructions
+        assert any(one.opcode[:2] == ("cp", "async") for one in instructions), "loads do not overlap with products"
         fused_add_style_gradient(gradient, features, StyleGradient(matrix, mean, offset), weights)
     assert relative_error(gradient.double(), expected) < 4e-3
 
