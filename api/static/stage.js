@@ -4,6 +4,7 @@ import { announce, h, icon, newId, put } from "./dom.js";
 import { cameraLines, frameSize, upOf } from "./cameras.js";
 import { fileName } from "./names.js";
 import { Controls } from "./viewer/controls.js";
+import { canShow, Headset } from "./viewer/headset.js";
 import { Viewer } from "./viewer/viewer.js";
 import { words } from "./words.js";
 
@@ -75,6 +76,33 @@ export class Stage {
     help.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && (help.open = false));
     put(this.tools, this.wipe, this.cameraTools, h("fieldset.segments", h("legend.away", say.movement), mode(say.orbit, true), mode(say.fly, false)),
       h("div.buttons", this.framesButton, button("home", say.home, () => this.home()), button("picture", say.screenshot, () => this.save()), button("full", say.full, () => this.full()), help));
+    this.offerHeadsets();
+  }
+
+  /** Add a button for each way in which a headset can show the scene. */
+  async offerHeadsets() {
+    for (const [mode, name] of /** @type {const} */ ([["immersive-vr", say.vr], ["immersive-ar", say.ar]])) {
+      if (!(await canShow(mode))) continue;
+      const button = h("button.tool.wide", { type: "button", title: say.headset, "aria-pressed": "false", onclick: () => this.enter(mode, button) }, name);
+      this.tools.append(button);
+    }
+  }
+
+  /**
+   * Show the scene in the headset, or end that.
+   *
+   * @param {import("./viewer/headset.js").Mode} mode
+   * @param {HTMLElement} button
+   */
+  async enter(mode, button) {
+    const { viewer } = this;
+    if (!viewer || viewer.headset) return viewer?.headset?.end();
+    try {
+      await new Headset(viewer, mode, () => button.setAttribute("aria-pressed", "false")).start();
+      button.setAttribute("aria-pressed", "true");
+    } catch (error) {
+      this.message(error instanceof Error ? error.message : String(error));
+    }
   }
 
   /** @param {boolean} orbit whether to rotate about the scene; otherwise about the eye */

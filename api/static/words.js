@@ -72,6 +72,8 @@ export const words = {
     original: "Original", stylized: "Stylized", now: "So far", left: "Left", right: "Right",
     toggle: "Swap before and after", orbit: "Orbit", fly: "Fly", movement: "Movement", home: "Show everything", screenshot: "Save image", full: "Full screen", keys: "Keyboard and gestures",
     camera: "Camera", frames: "Show cameras", free: "Free view", cameraOf: (/** @type {number} */ n, /** @type {number} */ all, /** @type {string} */ name) => `${n} of ${all}${name ? ` · ${name}` : ""}`,
+    vr: "VR", ar: "AR", headset: "Show in the headset. Sticks move, turn and blend; the trigger teleports; grip with one hand to move the scene, with both to turn and scale it; hold A or X for the original.",
+    notLoadedYet: "Wait until the scene has loaded.",
     previous: "Previous camera", next: "Next camera",
     orbitHelp: [["Drag, or arrow keys", "orbit"], ["Wheel, pinch, or + −", "zoom"]],
     flyHelp: [["Drag, or arrow keys", "look around"], ["Wheel, pinch, or + −", "forward, back"]],

@@ -87,6 +87,16 @@ export class ViewCamera {
   }
 
   /**
+   * Return the principal point in pixels from the middle of a canvas: it is there.
+   *
+   * @param {number} _width
+   * @param {number} _height
+   */
+  shift(_width, _height) {
+    return [0, 0];
+  }
+
+  /**
    * @param {number} aside radians to the right, as if dragging the scene
    * @param {number} over radians; positive looks further down
    * @param {boolean} about whether to rotate about the target; otherwise about the eye

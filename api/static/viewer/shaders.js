@@ -49,7 +49,7 @@ uniform sampler2D leftColors, left1, left2, rightColors, right1, right2;
 uniform vec3 leftWeights, rightWeights;   // of three color sets each
 uniform mat3 axes;          // columns: right, down, forward
 uniform vec3 eye;
-uniform vec2 focal, size, fade;
+uniform vec2 focal, size, fade, shift;   // shift: principal point from the middle, pixels
 uniform float near, eps2d;
 uniform bool antialiased;
 uniform usampler2D marks;   // 1 for Gaussians to highlight
@@ -96,7 +96,7 @@ void main() {
   d = dot(d, d) > 1e-20 ? normalize(d) : vec2(1, 0);
   float reach = sqrt(2. * log(255. * opacity));   // to where alpha is 1/255
   vec2 offset = reach * (corner.x * sqrt(longer) * d + corner.y * sqrt(shorter) * vec2(-d.y, d.x));
-  vec2 pixel = focal * center.xy / center.z + offset;
+  vec2 pixel = focal * center.xy / center.z + shift + offset;
   gl_Position = vec4(2. * pixel.x / size.x, -2. * pixel.y / size.y, 0, 1);
   at = corner * reach;
   vec3 rest = directional(i, normalize(away));
@@ -127,11 +127,12 @@ precision highp float;
 uniform highp sampler2D picture;
 uniform vec3 background;
 uniform vec2 scale;         // texels of the picture for a pixel
+uniform float solid;        // 0 to keep transparency
 out vec4 color;
 void main() {
   vec4 found = scale.x == 1. ? texelFetch(picture, ivec2(gl_FragCoord.xy), 0)
     : texture(picture, gl_FragCoord.xy * scale / vec2(textureSize(picture, 0)));
-  color = vec4(found.rgb + (1. - found.a) * background, 1);
+  color = vec4(found.rgb + solid * (1. - found.a) * background, max(found.a, solid));
 }`;
 
 export const lineVertex = `#version 300 es
@@ -139,11 +140,12 @@ precision highp float;
 layout(location = 0) in vec3 point;
 uniform mat3 axes;
 uniform vec3 eye;
-uniform vec2 focal, size;
+uniform vec2 focal, size, shift;
 uniform float near;
 void main() {
   vec3 c = (point - eye) * axes;
-  gl_Position = vec4(2. * focal.x * c.x / size.x, -2. * focal.y * c.y / size.y, c.z - near, c.z);
+  vec2 pixel = focal * c.xy + shift * c.z;
+  gl_Position = vec4(2. * pixel.x / size.x, -2. * pixel.y / size.y, c.z - near, c.z);
 }`;
 
 export const lineFragment = `#version 300 es

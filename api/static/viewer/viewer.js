@@ -52,6 +52,8 @@ export class Viewer {
     this.milliseconds = [];
     this.lost = false;
     this.ended = false;
+    /** The headset that shows the scene instead of the canvas. @type {import("./headset.js").Headset | null} */
+    this.headset = null;
     this.scale = 1;
     this.movingScale = 1;
     this.movedAt = 0;
@@ -160,7 +162,7 @@ export class Viewer {
 
   step() {
     this.requested = 0;
-    if (this.lost || this.ended) return;
+    if (this.lost || this.ended || this.headset) return;
     if (this.fence && !this.finished()) {
       this.requested = requestAnimationFrame(() => this.step());
       return;
@@ -248,11 +250,45 @@ export class Viewer {
     gl.disable(gl.SCISSOR_TEST);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (this.sides) this.splats(w, h);
+    if (this.sides) this.splats(this.sides, this.cut, [0, 0, w, h]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
     this.composite(w / width);
-    if (this.lines.length) this.drawLines(width, height);
+    if (this.lines.length) this.drawLines(this.lines, width, height);
+  }
+
+  /**
+   * Draw what the eyes see side by side.
+   *
+   * @param {{framebuffer: WebGLFramebuffer, framebufferWidth: number, framebufferHeight: number}} layer
+   * @param {any[]} eyes cameras with their `viewport` [x, y, width, height]
+   * @param {{left: Side, right: Side}} sides
+   * @param {number} scale fraction of the layer's pixels in each direction
+   * @param {Float32Array} lines pairs of points
+   * @param {boolean} through whether the room is seen where the scene is transparent
+   */
+  renderEyes({ framebuffer, framebufferWidth, framebufferHeight }, eyes, sides, scale, lines, through) {
+    const { gl } = this, own = this.camera, w = Math.ceil(framebufferWidth * scale), h = Math.ceil(framebufferHeight * scale);
+    this.target(w, h);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.viewport(0, 0, w, h);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    for (const eye of eyes) {
+      this.camera = eye;
+      const part = eye.viewport.map((/** @type {number} */ value) => Math.floor(value * scale));
+      gl.viewport(part[0], part[1], part[2], part[3]);
+      this.splats(sides, 1, part);
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(0, 0, framebufferWidth, framebufferHeight);
+    this.composite(w / framebufferWidth, through);
+    for (const eye of lines.length ? eyes : []) {
+      this.camera = eye;
+      gl.viewport(eye.viewport[0], eye.viewport[1], eye.viewport[2], eye.viewport[3]);
+      this.drawLines(lines, eye.viewport[2], eye.viewport[3]);
+    }
+    this.camera = own;
   }
 
   /**
@@ -277,21 +313,21 @@ export class Viewer {
   }
 
   /**
-   * @param {number} width
-   * @param {number} height
+   * @param {{left: Side, right: Side}} sides
+   * @param {number} share fraction of the width that shows the left side
+   * @param {number[]} viewport x, y, width and height in pixels
    */
-  splats(width, height) {
-    const { gl } = this, { left, right } = /** @type {{left: Side, right: Side}} */ (this.sides);
-    const cut = Math.round(this.cut * width);
+  splats({ left, right }, share, [x, y, width, height]) {
+    const { gl } = this, cut = Math.round(share * width);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    if (left.scene === right.scene) this.drawScene(left, right, cut, width, height);
+    if (left.scene === right.scene) this.drawScene(left, right, x + cut, width, height);
     else {
       gl.enable(gl.SCISSOR_TEST);
-      gl.scissor(0, 0, cut, height);
-      if (cut > 0) this.drawScene(left, left, width, width, height);
-      gl.scissor(cut, 0, width - cut, height);
-      if (cut < width) this.drawScene(right, right, 0, width, height);
+      gl.scissor(x, y, cut, height);
+      if (cut > 0) this.drawScene(left, left, x + width, width, height);
+      gl.scissor(x + cut, y, width - cut, height);
+      if (cut < width) this.drawScene(right, right, x, width, height);
       gl.disable(gl.SCISSOR_TEST);
     }
     gl.disable(gl.BLEND);
@@ -369,7 +405,8 @@ export class Viewer {
    * @param {number} height
    */
   setView(at, width, height) {
-    const { gl, camera } = this, [fx, fy] = camera.pixels(width, height);
+    const { gl, camera } = this, [fx, fy] = camera.pixels(width, height), [sx, sy] = camera.shift(width, height);
+    gl.uniform2f(at("shift"), sx, sy);
     gl.uniformMatrix3fv(at("axes"), false, camera.axes.flat());
     gl.uniform3f(at("eye"), camera.eye[0], camera.eye[1], camera.eye[2]);
     gl.uniform2f(at("focal"), fx, fy);
@@ -377,8 +414,11 @@ export class Viewer {
     gl.uniform1f(at("near"), camera.near);
   }
 
-  /** @param {number} scale */
-  composite(scale) {
+  /**
+   * @param {number} scale
+   * @param {boolean} through whether to keep transparency
+   */
+  composite(scale, through = false) {
     const { gl } = this, { program, at } = /** @type {Program} */ (this.compose);
     gl.useProgram(program);
     gl.activeTexture(gl.TEXTURE0);
@@ -386,15 +426,17 @@ export class Viewer {
     gl.uniform1i(at("picture"), 0);
     gl.uniform3f(at("background"), this.background[0], this.background[1], this.background[2]);
     gl.uniform2f(at("scale"), scale, scale);
+    gl.uniform1f(at("solid"), Number(!through));
     gl.disableVertexAttribArray(0);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
   /**
+   * @param {Float32Array} lines pairs of points
    * @param {number} width
    * @param {number} height
    */
-  drawLines(width, height) {
+  drawLines(lines, width, height) {
     const { gl } = this, { program, at } = /** @type {Program} */ (this.line);
     gl.useProgram(program);
     this.setView(at, width, height);
@@ -402,11 +444,11 @@ export class Viewer {
     gl.bindBuffer(gl.ARRAY_BUFFER, this.lineBuffer ?? null);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
-    gl.bufferData(gl.ARRAY_BUFFER, this.lines, gl.STREAM_DRAW);
+    gl.bufferData(gl.ARRAY_BUFFER, lines, gl.STREAM_DRAW);
     gl.uniform4fv(at("ink"), INK);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
-    gl.drawArrays(gl.LINES, 0, this.lines.length / 3);
+    gl.drawArrays(gl.LINES, 0, lines.length / 3);
     gl.disable(gl.BLEND);
   }
 
