@@ -63,6 +63,13 @@ class Timer:
         if self._open:
             self._start()
 
+    def lap(self) -> Timer:
+        """Return a timer that has all measurements so far, to be read later, and continue with none."""
+        earlier = Timer(event=self._event)
+        earlier.seconds, earlier._marked = self.seconds, self._marked
+        self.seconds, self._marked = {}, []
+        return earlier
+
     def read(self) -> dict[str, float]:
         """Update and return `seconds`. On a GPU, waits for the end of the last block."""
         if self._marked and not self._marked[-1][2].query():

@@ -6,6 +6,7 @@ loop, and the first rank decides when it stops.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -44,7 +45,8 @@ class Callbacks:
     `measure` must be the same on every rank; give the other callbacks to the first rank only.
 
     Attributes:
-        progress: Called after every iteration.
+        progress: Called after the first and the last iteration, and between them about every `progress_seconds`.
+        progress_seconds: Seconds between calls of `progress`.
         stop: Called before every iteration; True ends the loop as "interrupted".
         finish: Called before every iteration but the first; True ends the loop as "on-request".
         checkpoint: Called with the stylizer about every `checkpoint_seconds`, and once if the loop ends early.
@@ -66,6 +68,7 @@ class Callbacks:
     """
 
     progress: Callable[[Progress], None] | None = None
+    progress_seconds: float = 0.25
     stop: Callable[[], bool] | None = None
     finish: Callable[[], bool] | None = None
     checkpoint: Callable[[Stylizer], None] | None = None
@@ -91,21 +94,25 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     try:
         last_checkpoint = last_preview = time.perf_counter()
         pace, ended = _pace(stylizer), partial(_end_requested, stylizer, callbacks)
-        running = RunningRound(stylizer.job.round_length, stylizer.job.loss.weights, stylizer.history)
+        report = _Reports(stylizer, callbacks, pace)
         if callbacks.preview and not stylizer.step:
             callbacks.preview(stylizer)
         _measure(stylizer, callbacks)  # a resumed job may have been stopped before this measurement
         while stylizer.step < stylizer.job.total_steps:
             reason = stylizer.job.collectives.broadcast(ended) or _enough(stylizer)
             if reason:
+                stylizer.read_step()
+                report(last=True)
                 if callbacks.checkpoint:
                     _checkpoint(stylizer, callbacks.checkpoint)
                 return reason
             _step(stylizer, pace)
             now = time.perf_counter()
-            if callbacks.progress:
-                running.add(stylizer.history[-1])
-                callbacks.progress(_progress(stylizer, callbacks, pace, running))
+            measures = callbacks.measure is not None and callbacks.measure.due(stylizer.step)
+            last = measures or stylizer.step == stylizer.job.total_steps
+            if last:
+                stylizer.read_step()
+            report(last=last)
             if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
                 _checkpoint(stylizer, callbacks.checkpoint)
                 last_checkpoint = time.perf_counter()
@@ -142,7 +149,9 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
     if not (settings.target_loss or settings.early_stop):
         return None
     windows = 2 * window_length(stylizer.job.round_length)  # what `has_converged` compares
-    losses = [record.loss for record in stylizer.history[-windows:] if record.stage == "sos"]
+    # A checkpoint reads the last step, but must not change when the job ends.
+    end = stylizer.step - stylizer.reads_late
+    losses = [record.loss for record in stylizer.history[max(end - windows, 0) : max(end, 0)] if record.stage == "sos"]
     if settings.target_loss and len(losses) >= stylizer.job.round_length:  # all views have been visited at this point
         target = settings.target_loss * mean_loss(stylizer.start(), stylizer.job.loss.weights)
         if stylizer.job.plan.training_background != "background":
@@ -178,10 +187,32 @@ def _pace(stylizer: Stylizer) -> SecondsLeft:
 
 def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
     """Run and time one step, without the one-off style setup."""
-    before, style_before = stylizer.seconds, stylizer.job.style_targets.seconds
-    record = stylizer.run_step()
+    before, style_before, stage = stylizer.seconds, stylizer.job.style_targets.seconds, stylizer.phase.stage
+    stylizer.queue_step()
     style = stylizer.job.style_targets.seconds - style_before
-    pace.add_step(record.stage, stylizer.latest, stylizer.seconds - before - style)
+    pace.add_step(stage, stylizer.latest, stylizer.seconds - before - style)
+
+
+class _Reports:
+    """Reports of the progress, with the mean loss of the last round of views."""
+
+    def __init__(self, stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> None:
+        self._stylizer, self._callbacks, self._pace = stylizer, callbacks, pace
+        self._running = RunningRound(stylizer.job.round_length, stylizer.job.loss.weights, stylizer.history)
+        self._added = self._reported = len(stylizer.history)
+        self._at = -math.inf
+
+    def __call__(self, *, last: bool) -> None:
+        """Report the latest known step, unless it has been reported, or it is not the last and a report is recent."""
+        if self._callbacks.progress is None:
+            return
+        history, now = self._stylizer.history, time.perf_counter()
+        for record in history[self._added :]:
+            self._running.add(record)
+        self._added = len(history)
+        if self._reported < self._added and (last or now - self._at >= self._callbacks.progress_seconds):
+            self._reported, self._at = self._added, now
+            self._callbacks.progress(_progress(self._stylizer, self._callbacks, self._pace, self._running))
 
 
 def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft, running: RunningRound) -> Progress:

@@ -1,6 +1,7 @@
 """Stylizer: Adam on the DC colors, in a coarse phase followed by a phase on all scales.
 
-Each call of `Stylizer.run_step` makes one step; `loop.run` makes all steps.
+Each call of `Stylizer.run_step` makes one step; `loop.run` makes all steps. On a GPU, it reads the losses of a step
+after it has queued the next one, so that the GPU does not wait for the host.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Self, TypeVar
 
 import psutil
@@ -55,8 +56,32 @@ from sgsst_core.stylizing.schedule import (
     phase_at,
 )
 from sgsst_core.stylizing.training_background import drawn_color
+from sgsst_core.timing import Timer
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _QueuedStep:
+    """Step whose work is queued on the device, and whose losses have yet to be read.
+
+    Attributes:
+        views: Indices of its views.
+        results: Results of this group's views, without gradients.
+        values: Largest magnitude in the gradient, then the values of the results; in host memory, valid after `copied`.
+        copied: Event after the copy of `values`; None if there is nothing to wait for.
+        timer: Timer of this step.
+        sent: Bytes that had been sent before the step.
+    """
+
+    step: int
+    phase: Phase
+    views: list[int]
+    results: list[SosResult]
+    values: Tensor
+    copied: torch.cuda.Event | None
+    timer: Timer
+    sent: dict[str, int]
 
 
 class Stylizer:
@@ -101,6 +126,7 @@ class Stylizer:
         self._order = ViewOrder(views.covered, settings.seed)
         #: Number of steps before a resume whose blend weights have yet to be cached again.
         self._visited_before = 0
+        self._queued: _QueuedStep | None = None
         self._start: Evaluation | None = None
         self._stylized: Tensor | None = None
 
@@ -201,12 +227,30 @@ class Stylizer:
         """Return the background color of a view in the next step; None for the background of the settings."""
         return drawn_color(self.job.plan.training_background, self.job.settings.seed, self.step, index, self.job.style)
 
+    @property
+    def reads_late(self) -> bool:
+        """Whether `queue_step` leaves the losses of its step unread.
+
+        Ranks read theirs at once, because they exchange them, and so do jobs that end at a certain loss.
+        """
+        job = self.job
+        return job.network.device.type == "cuda" and job.collectives.size == 1 and not job.settings.target_loss
+
     def run_step(self) -> StepRecord:
-        """Run one iteration.
+        """Run one iteration, and read its losses.
 
         Raises:
             DivergedError: If the gradient has left the range of float32; the colors are those before the step.
             DeviceMemoryError: If a GPU's memory is not enough.
+        """
+        self.queue_step()
+        self.read_step()
+        return self.history[-1]
+
+    def queue_step(self) -> None:
+        """Queue one iteration, then read the losses of the one before; if not `reads_late`, also those of this one.
+
+        Raises as `run_step`, if need be one step late.
         """
         started = time.perf_counter()
         self._stylized = None
@@ -221,32 +265,53 @@ class Stylizer:
             largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(done))
         with self.job.timer("communication"):
             self.job.team.check_drift(self.step + 1, self.sh_dc)
-        evaluated = self._read(largest, results)
-        terms = completed(evaluated, phase.scales(self.job.scales(views[0])), views[0], self.history)
+        before = self._queued
+        values, copied = self._copied(largest, results)
+        results = [replace(result, image_gradient=None) for result in results]  # frees the gradients
+        timer = self.job.timer.lap()
+        self._queued = _QueuedStep(self.step + 1, phase, views, results, values, copied, timer, sent)
         self.step += 1
-        self.job.timer.read()
-        speeds = self.job.team.compare_speeds(cost, self.job.timer.seconds) if phase.scale is None else None
-        if speeds:  # divide the work again, once in phase 2
-            self.job.loss.divider.speeds = speeds
-            self.job.view_targets.forget_division()
+        if phase.scale is None:
+            speeds = self.job.team.compare_speeds(cost, timer.read()) if self.job.collectives.size > 1 else None
+            if speeds:  # divide the work again, once in phase 2
+                self.job.loss.divider.speeds = speeds
+                self.job.view_targets.forget_division()
         self.seconds += time.perf_counter() - started
-        for name, seconds in self.job.timer.seconds.items():
+        if before is not None:
+            self._record(before)
+        if not self.reads_late:
+            self.read_step()
+
+    def read_step(self) -> None:
+        """Wait for the last step, unless its losses have been read."""
+        if self._queued is not None:
+            queued, self._queued = self._queued, None
+            self._record(queued)
+
+    def _record(self, queued: _QueuedStep) -> None:
+        """Append the record of a step to the history, when the device has finished it."""
+        started = time.perf_counter()
+        evaluated, view = self._read(queued), queued.views[0]
+        terms = completed(evaluated, queued.phase.scales(self.job.scales(view)), view, self.history)
+        parts = queued.timer.read()
+        for name, seconds in parts.items():
             self.seconds_by_part[name] = self.seconds_by_part.get(name, 0.0) + seconds
+        self.seconds += time.perf_counter() - started
+        every = self.job.collectives.sent
         record = StepRecord(
-            step=self.step,
-            stage=phase.stage,
-            view=views[0],
+            step=queued.step,
+            stage=queued.phase.stage,
+            view=view,
             seconds=self.seconds,
             loss=mean_loss(terms, self.job.loss.weights),
             terms=terms,
-            parts=dict(self.job.timer.seconds),
+            parts=parts,
             memory=psutil.Process().memory_info().rss,
-            sent={kind: total - sent[kind] for kind, total in self.job.collectives.sent.items() if total > sent[kind]},
+            sent={kind: total - queued.sent[kind] for kind, total in every.items() if total > queued.sent[kind]},
             device_memory=device_peak(self.job.network.device),
             evaluated=tuple(evaluated),
         )
         self.history.append(record)
-        return record
 
     def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult], int]:
         """Return the mean of dE/dsh_dc [n, 3] over some views, the results of this group's own views, and a cost.
@@ -280,33 +345,46 @@ class Stylizer:
             gradient = gradient.masked_fill(self._frozen, 0)  # Adam does not change colors with zero gradient
         return gradient, results, cost
 
-    def _read(self, largest: Tensor, results: Sequence[SosResult]) -> Evaluation:
-        """Synchronize with the device, once per step, and return the loss of each scale, mean over the step's views.
+    def _copied(self, largest: Tensor, results: Sequence[SosResult]) -> tuple[Tensor, torch.cuda.Event | None]:
+        """Queue the copy of a step's numbers to the host. Return them in a tensor, and the event after the copy.
 
         Args:
             largest: Largest magnitude in the gradient.
             results: Results of this group's views.
-
-        Raises:
-            DivergedError: If `largest` is too large for a step.
         """
         # The rasterizer, and with it the colors, may be on the CPU while the network is on a GPU.
-        first = largest.double()[None].to(self.job.network.device)
-        tensors = [first, *(result.values.flatten() for result in results)]
-        magnitude, *values = torch.cat(tensors).cpu().split([len(tensor) for tensor in tensors])
+        device = self.job.network.device
+        first = largest.double()[None].to(device)
+        values = torch.cat([first, *(result.values.flatten() for result in results)])
+        if device.type != "cuda":
+            return values, None
+        values, copied = values.to("cpu", non_blocking=True), torch.cuda.Event()
+        copied.record()
+        return values, copied
+
+    def _read(self, queued: _QueuedStep) -> Evaluation:
+        """Wait for the device, once per step, and return the loss of each scale, mean over the step's views.
+
+        Raises:
+            DivergedError: If the gradient was too large for a step.
+        """
+        if queued.copied is not None:
+            queued.copied.synchronize()
+        lengths = [result.values.numel() for result in queued.results]
+        magnitude, *values = queued.values.split([1, *lengths])
         if is_too_large(float(magnitude)):
             raise DivergedError(
-                f"Step {self.step + 1}: the color gradient has grown to {float(magnitude):.3g}, which cannot be "
+                f"Step {queued.step}: the color gradient has grown to {float(magnitude):.3g}, which cannot be "
                 f"optimized; the largest color coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a "
                 f"smaller --learning-rate than {self.job.settings.learning_rate:g}, or look for extreme coefficients "
                 "with `sgsst check`."
             )
         evaluations = [
             replace(result, values=own.view_as(result.values)).terms
-            for result, own in zip(results, values, strict=True)
+            for result, own in zip(queued.results, values, strict=True)
         ]
         if self.job.team.groups > 1:
-            with self.job.timer("communication"):
+            with queued.timer("communication"):
                 every = self.job.collectives.all_gather(evaluations)[:: self.job.group.size]
             evaluations = [terms for part in every for terms in part]
         return mean_evaluation(evaluations)
@@ -433,6 +511,7 @@ class Stylizer:
 
     def state(self) -> StylizerState:
         """Return a copy of everything that a resumed run needs."""
+        self.read_step()
         first_moment, second_moment = self._optimizer.moments()
         return StylizerState(
             sh_dc=self.sh_dc.detach().cpu().clone(),

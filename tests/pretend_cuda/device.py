@@ -196,7 +196,8 @@ def _count(name: str, func: Any, args: Any, kwargs: dict[str, Any], to_device: b
             elif isinstance(index, Tensor) and not isinstance(index, PretendTensor):
                 _count_copy(index, waits=True)
     if name == "_to_copy" and isinstance(args[0], PretendTensor) != to_device:
-        _count_copy(args[0], waits=not (kwargs.get("non_blocking") and _is_staged(args[0])))
+        staged = to_device and not _is_staged(args[0])  # to the host, PyTorch copies into pinned memory
+        _count_copy(args[0], waits=not kwargs.get("non_blocking") or staged)
     elif name == "copy_" and isinstance(args[0], PretendTensor) != isinstance(args[1], PretendTensor):
         asynchronous = (args[2:3] or (kwargs.get("non_blocking"),))[0]
         host = args[1] if isinstance(args[0], PretendTensor) else args[0]

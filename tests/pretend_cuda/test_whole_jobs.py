@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ if torch.cuda.is_available():
 
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests import networks
 from tests.pretend_cuda.counts import Counts
@@ -113,6 +116,33 @@ def test_steady_step_synchronizes_once_and_copies_scalars(
         assert 1 <= counts.waits.total() <= 1 + first, counts.waits
         assert counts.copies.total() <= SCALARS * (1 + first), counts.copies
     assert (record.stage, first) == ("sos", False)
+
+
+@pytest.mark.slow
+def test_loop_reads_a_step_after_it_has_queued_the_next(tmp_path: Path) -> None:
+    """The losses, the colors and what a checkpoint has are those of steps that are read at once."""
+    asked = request_(tmp_path, scan=False, gray=False, size=(64, 48), steps_coarse=1, steps_sos=4)
+    with pretend_cuda():
+        expected, stylizer = prepare(asked).stylizer, prepare(asked).stylizer
+        for _ in range(expected.job.total_steps):
+            expected.run_step()
+        seen, saved, reported = list[tuple[int, int]](), list[int](), list[int]()
+        callbacks = Callbacks(
+            progress=lambda progress: reported.append(progress.step),
+            progress_seconds=0,
+            stop=lambda: seen.append((stylizer.step, len(stylizer.history))) is not None,
+            checkpoint=lambda s: saved.append(len(s.state().history)),
+            checkpoint_seconds=math.inf,
+        )
+        assert run(stylizer, callbacks) == "finished"
+        assert seen == [(0, 0), (1, 0), (2, 1), (3, 2), (4, 3)]
+        assert reported == [1, 2, 3, 5], "the last two are read together"
+        assert [record.loss for record in stylizer.history] == [record.loss for record in expected.history]
+        assert torch.equal(stylizer.sh_dc.detach().cpu(), expected.sh_dc.detach().cpu())
+        other = prepare(asked).stylizer
+        callbacks = replace(callbacks, stop=lambda: other.step == 2)
+        assert run(other, callbacks) == "interrupted"
+        assert saved == [2]
 
 
 def in_regions(asked: JobSpec) -> JobSpec:

@@ -202,12 +202,28 @@ def test_stop_request_ends_the_run_between_steps(tiny_weights: BackboneWeights, 
     saved: list[int] = []
     seen: list[Progress] = []
     callbacks = Callbacks(
-        progress=seen.append, stop=lambda: stylizer.step == 3, checkpoint=lambda s: saved.append(s.step)
+        progress=seen.append,
+        progress_seconds=0,
+        stop=lambda: stylizer.step == 3,
+        checkpoint=lambda s: saved.append(s.step),
     )
     assert run(stylizer, callbacks) == "interrupted"
     assert saved == [3]
     assert [(p.step, p.total, p.stage) for p in seen] == [(1, 5, "sos"), (2, 5, "sos"), (3, 5, "sos")]
     assert all((p.eta_s or 0) > 0 for p in seen)
+
+
+def test_first_and_last_step_are_reported_and_others_at_intervals(tiny_weights: BackboneWeights, scene: Scene) -> None:
+    """The last report has the same mean loss as if every step had been reported."""
+    every, few = list[Progress](), list[Progress]()
+    run(make(tiny_weights, scene), Callbacks(progress=every.append, progress_seconds=0))
+    run(make(tiny_weights, scene), Callbacks(progress=few.append, progress_seconds=math.inf))
+    assert [report.step for report in every] == [1, 2, 3, 4, 5]
+    assert [report.step for report in few] == [1, 5]
+    assert (few[-1].mean_loss, few[-1].mean_scales) == (every[-1].mean_loss, every[-1].mean_scales)
+    ended, stopped = list[Progress](), make(tiny_weights, scene)
+    run(stopped, Callbacks(progress=ended.append, progress_seconds=math.inf, stop=lambda: stopped.step == 3))
+    assert [report.step for report in ended] == [1, 3], "a job that ends early reports its last step too"
 
 
 def test_style_time_is_not_counted_as_time_of_a_view(
