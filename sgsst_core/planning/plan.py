@@ -68,6 +68,7 @@ class Plan:
         steps_coarse: Steps of phase 1; 0 if it is skipped.
         memory_limit: Memory budget in bytes of all ranks on one machine together.
         spare: Bytes of the budget for activations that no step needs, and that data of the views may use.
+        spare_intersections: Bytes of `spare` that tile intersections may use, because data of the views do not.
         device: Device of the feature network.
         rasterizer: Rasterizer of the job; "cached" stores blend weights in the format `cached_weights`.
         uncached: Rasterizer that computes blend weights, and recomputes those that are not cached.
@@ -96,6 +97,7 @@ class Plan:
     training_background: PlannedBackground = "background"
     warm_start: bool = False
     spare: int = 0
+    spare_intersections: int = 0
     device: Device = "cpu"
     rasterizer: str = "cpu"
     uncached: str = "cpu"

@@ -261,6 +261,7 @@ def prepare_job(
         divider=loss.divider,
         timer=loss.timer,
     )
+    _limit_intersections(views, plan, memory)
     repeatable = rasterizer.repeatable
     view_targets = ViewTargets(
         views,
@@ -299,6 +300,7 @@ def continued(job: StylizationJob, plan: Plan, settings: Settings) -> Stylizatio
     memory = view_memory(plan, job.memory)
     job.views.limit(memory)
     job.view_targets.limit(memory)
+    _limit_intersections(job.views, plan, job.memory)
     return replace(job, plan=plan, settings=settings, graphs=LossGraphs(job.loss) if plan.graphs else None)
 
 
@@ -354,6 +356,12 @@ def view_memory(plan: Plan, memory: int) -> int:
     if plan.measured:
         left -= (2 if plan.is_approximated else 1) * measuring_memory(memory)
     return left
+
+
+def _limit_intersections(views: Views, plan: Plan, memory: int) -> None:
+    """Let tile intersections use the memory that a plan has to spare for them."""
+    if plan.spare_intersections:
+        views.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare_intersections)
 
 
 def with_second_attempt(job: StylizationJob, work: Callable[[], T]) -> T:

@@ -155,7 +155,9 @@ def plan_job(
         plan = collectives.broadcast(lambda: completed_plan(draft, facts, settings, pixels, trials, cost))
         plan = with_spare_memory(plan, facts, of_a_view)  # graphs, which the draft lacks, leave less
         lines += [chosen.decision(asked.within)] if chosen else []
-        plan = replace(plan, refinement=refinement, time_choice=chosen, decisions=(*lines, *plan.decisions))
+        intersections = max(trials[plan.ranks].spare - (draft.spare - plan.spare), 0)
+        plan = replace(plan, spare_intersections=intersections, refinement=refinement, time_choice=chosen)
+        plan = replace(plan, decisions=(*lines, *plan.decisions))
         if job is not None and plan.ranks == job.collectives.size:
             return continued(job, plan, settings)
         job = None  # frees its memory

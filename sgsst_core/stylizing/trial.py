@@ -19,9 +19,10 @@ import torch
 from sgsst_core.budget import device_peak, memory_for
 from sgsst_core.loss.graphs import LossGraphs, failure_is_fatal, graphs_problem
 from sgsst_core.planning.context import NetworkPixels, Saving
+from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.stylizing.capture_trial import CaptureTrial
-from sgsst_core.stylizing.job import StylizationJob, with_second_attempt
+from sgsst_core.stylizing.job import StylizationJob, view_memory, with_second_attempt
 from sgsst_core.stylizing.optimizer import ColorOptimizer
 from sgsst_core.stylizing.schedule import Phase, drawn_views
 from sgsst_core.stylizing.training_background import drawn_color
@@ -73,6 +74,7 @@ class Trial:
         growth: Bytes of the data of all other views that will be cached.
         novel: Bytes of the tile intersections of a novel view.
         free: Bytes that will be left for tile intersections of novel views.
+        spare: Bytes of `Plan.spare` that data of the views will leave for tile intersections.
     """
 
     coarse: StepCost
@@ -87,6 +89,7 @@ class Trial:
     growth: int
     novel: int
     free: int
+    spare: int
 
 
 def run_trial(job: StylizationJob, show: Callable[[int, int], None] = lambda done, total: None) -> Trial:
@@ -152,6 +155,7 @@ class _Visitor:
             growth=max(sum(final - job.caches[name].used for name, (_, final) in forecast.items()), 0),
             novel=int(self._bytes_of_a_view("intersections")),
             free=max(budget, 0),
+            spare=self._spare(forecast),
         )
 
     def _cost(self, index: int, phase: Phase) -> StepCost:
@@ -222,7 +226,8 @@ class _Visitor:
         job, result = self._job, dict[str, tuple[float, int]]()
         visits = job.total_steps * job.settings.views_per_step + (job.plan.loss_views if job.plan.measured else 0)
         views = min(visits, len(job.views.covered))
-        for name, cache in job.caches.items():  # weights come before tile intersections, whose budget they share
+        # Tile intersections come last, because they use what others leave of their budgets.
+        for name, cache in sorted(job.caches.items(), key=lambda item: item[0] == "intersections"):
             needed, capacity = self._bytes_of_a_view(name) * views, cache.capacity
             if name == "intersections":
                 needed *= 1 - result.get("weights", (0.0, 0))[0]
@@ -236,7 +241,18 @@ class _Visitor:
         rasterizer, memory = self._job.views.rasterizer, memory_for("rasterizer", self._job.memory)
         weights = forecast.get("weights", (0.0, 0))[1]
         budget = rasterizer.intersection_budget(weights) if isinstance(rasterizer, CachedRasterizer) else None
-        return memory if budget is None else budget
+        return memory + self._spare(forecast) if budget is None else budget
+
+    def _spare(self, forecast: Mapping[str, tuple[float, int]]) -> int:
+        """Return the bytes of `Plan.spare` that data of the views, by a forecast, leave for tile intersections.
+
+        With cached weights, it is 0: then a different number of cached views would change rounding.
+        """
+        job = self._job
+        if job.plan.cached_weights != "none" or not RASTERIZERS[job.plan.uncached].on_gpu:
+            return 0
+        of_views = sum(final for name, (_, final) in forecast.items() if name != "intersections")
+        return min(max(view_memory(job.plan, job.memory) - of_views, 0), job.plan.spare)
 
     def _bytes_of_a_view(self, name: str) -> float:
         """Return the mean size in bytes of the data of a view in a cache. The survey has computed its intersections."""

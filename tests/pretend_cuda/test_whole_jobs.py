@@ -14,6 +14,7 @@ from PIL import Image
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
 
+from sgsst_core.budget import memory_for
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import Callbacks, run
@@ -84,6 +85,8 @@ def test_job_runs_resumes_and_reports(
     first = prepare(asked)
     plan = first.stylizer.job.plan
     assert (plan.device, plan.uncached, plan.weighted) == ("cuda", "triton", scan)
+    used, spare = first.stylizer.job.views.caches["intersections"].capacity, plan.spare_intersections
+    assert plan.cached_weights != "none" or used == memory_for("rasterizer", plan.memory_limit) + spare > spare > 0
     assert (first.stylizer.job.styles.color_subspace(first.stylizer.job.settings) is not None) == gray
     assert run_job(first, steps=1).stopped == "interrupted"
     second = prepare(asked, resume=Resume(True))

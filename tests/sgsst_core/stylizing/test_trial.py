@@ -44,6 +44,7 @@ TRIAL = Trial(
     growth=GIGABYTE,
     novel=0,
     free=0,
+    spare=0,
 )
 
 
