@@ -19,7 +19,7 @@ from sgsst_core.quality.findings import findings_of
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
 from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
-from sgsst_core.report.document import build_report, loss_over_time, plan_json, sent_json
+from sgsst_core.report.document import build_report, loss_over_time, plan_json, seconds_json, sent_json
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
@@ -173,6 +173,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
     """
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.job.collectives.rank == 0
+    _count_remaining(job, "other")
     attenuation = stylizer.job.settings.sh_attenuation
     stylizer.job.collectives.broadcast(
         lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized(), sh_attenuation=attenuation)
@@ -199,6 +200,12 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
         compressed=compressed and compressed.text("the PLY"),
         loss_over_time=loss_over_time(stylizer, before),
     )
+
+
+def _count_remaining(job: Job, part: str) -> None:
+    """Count the seconds of the job that are not in other parts for this one."""
+    parts = job.stylizer.seconds_by_part
+    parts[part] = max(job.seconds - sum(seconds for name, seconds in parts.items() if name != part), 0.0)
 
 
 def _has_rows_of_file(job: Job) -> bool:
@@ -234,7 +241,9 @@ def _write_reports(
             write_colors(outputs.colors, stylizer.stylized())
         near, survey = stylizer.job.settings.near, stylizer.job.plan.survey
         findings = findings_of(job.scene_file, stylizer.job.views.cameras, stylizer.job.style, near=near, survey=survey)
+        _count_remaining(job, "writing")
         report = build_report(stylizer, job.sources, stopped, before, after, findings)
+        report |= seconds_json(stylizer, job.seconds)
         lost = sum(attempt["seconds_lost"] for attempt in job.workers["attempts"])
         sent = sent_json(stylizer.history)
         report["compressed"] = compressed and compressed.as_dict()
@@ -243,6 +252,9 @@ def _write_reports(
         write_contact_sheet(outputs.sheet, stylizer)
         write_loss_chart(outputs.curves, report)
         write_page(outputs.page, report, outputs.sheet, outputs.views if outputs.views.exists() else None)
+        _count_remaining(job, "writing")  # now with the time of the figures and the page
+        report |= seconds_json(stylizer, job.seconds)
+        write_json(outputs.report, report)
     except Exception as error:  # a failing report must not fail the job
         return error
     return None

@@ -9,6 +9,7 @@ import contextlib
 import json
 import os
 import socket
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -54,6 +55,7 @@ class Job:
         resumed: Checkpoint to resume from; None to start from the beginning.
         planned_ranks: Number of ranks for which the plan was made.
         workers: Participating ranks and lost attempts, as JSON for the report.
+        started: Value of `time.perf_counter` when the job started.
     """
 
     request: JobSpec
@@ -65,6 +67,13 @@ class Job:
     resumed: Checkpoint | None
     planned_ranks: int
     workers: dict[str, Any]
+    started: float
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the job started, and those of earlier sessions as far as their parts are known."""
+        earlier = self.resumed.state.seconds_by_part.values() if self.resumed else ()
+        return time.perf_counter() - self.started + sum(earlier)
 
 
 def prepare(
@@ -77,6 +86,7 @@ def prepare(
     preview: Previews | None = None,
     plan_file: Path | None = None,
     left: SecondsLeft | None = None,
+    start: float = 0.0,
 ) -> Job:
     """Read and check all inputs of a job, and plan it. Every rank must call this function.
 
@@ -92,11 +102,13 @@ def prepare(
         preview: Writer of previews, used on rank 0 of a new job; None to write none.
         plan_file: Plan that `dry_run` has handed over; None or a missing file for none.
         left: Seconds left of the time budget, which chooses what the checkpoint or the plan has not; None without one.
+        start: Seconds since the start of the program, which count as part of the job.
 
     Raises:
         InvalidInputError: If an input cannot be used. Every rank raises the same error.
         RankLeftOut: If the plan does not use this rank.
     """
+    started = time.perf_counter() - start
     timer = Timer()  # no CUDA synchronization needed: no GPU work is pending when a phase ends
     outputs = collectives.broadcast(lambda: check_request(request))
     settings = request.settings
@@ -137,12 +149,12 @@ def prepare(
     )
     with timer("preparing"):
         stylizer = Stylizer(stylization)
-    stylizer.seconds_by_part.update(timer.seconds)
+    stylizer.seconds_by_part.update(({"start": start} if start else {}) | timer.seconds)
     source, images = request.source, request.images
     styles = tuple(file.path for file in request.styles)
     sources = Sources(source.scene, scene_file.dropped, styles, source.cameras, images, weights)
     workers = {"requested": collectives.size, **_workers_used(stylizer), "attempts": []}
-    return Job(request, outputs, scene_file, sources, stylizer, fingerprint, resumed, planned_ranks, workers)
+    return Job(request, outputs, scene_file, sources, stylizer, fingerprint, resumed, planned_ranks, workers, started)
 
 
 def dry_run(

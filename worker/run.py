@@ -142,10 +142,12 @@ def run_rank(
     """
     from sgsst_core.parallel.collectives import ALONE
     from sgsst_core.planning.time_budget import seconds_left
+    from sgsst_core.timing import process_seconds
     from worker.execute import execute
     from worker.prepare import describe, prepare
     from worker.previews import Previews
 
+    start = process_seconds() if collectives is None else 0.0  # processes of ranks may have waited for their job
     preview, collectives = None, collectives or ALONE
     left = seconds_left(request.settings.within, options.started)
     if options.preview_folder:
@@ -159,6 +161,7 @@ def run_rank(
         preview=preview,
         plan_file=options.plan_file,
         left=left,
+        start=start,
     )
     job.workers |= about_ranks or {}
     if collectives.rank == 0:

@@ -100,7 +100,7 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
             "sos": {"planned": stylizer.job.settings.steps_sos, "done": len(stylizer.history) - coarse},
         },
         "seconds": round(stylizer.seconds, 3),
-        "seconds_by_part": {name: round(seconds, 3) for name, seconds in sorted(stylizer.seconds_by_part.items())},
+        **seconds_json(stylizer, sum(stylizer.seconds_by_part.values())),
         "loss": {
             "views": [stylizer.job.views.cameras[index].name for index in stylizer.job.evaluation_views],
             "before": _evaluation_json(before, weights),
@@ -115,6 +115,12 @@ def _outcome_json(stylizer: Stylizer, stopped: Stopped, before: Evaluation, afte
         "novel_views": _novel_views_json(stylizer.measured),
         "approximations": {"what": stylizer.measured[0]["approximated"], "moments": errors} if errors else None,
     }
+
+
+def seconds_json(stylizer: Stylizer, total: float) -> dict[str, Any]:
+    """Return the seconds of a whole job and their parts."""
+    parts = sorted(stylizer.seconds_by_part.items())
+    return {"seconds_total": round(total, 3), "seconds_by_part": {name: round(seconds, 3) for name, seconds in parts}}
 
 
 def _inputs_json(stylizer: Stylizer, sources: Sources) -> dict[str, Any]:

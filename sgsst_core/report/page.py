@@ -18,7 +18,6 @@ from sgsst_core.report.figures import draw_figures
 from sgsst_core.report.history import AGAINST, BINS, round_length
 from sgsst_core.report.palette import ON_DARK, PAGE
 from sgsst_core.report.tables import TABLES
-from sgsst_core.stylizing.schedule import BEFORE_STEPS
 
 #: Maximum number of list members shown in the collapsed section, followed by their total number.
 _LIST = 40
@@ -45,14 +44,15 @@ _PARTS = {
     "loss": "loss and pyramid",
     "checkpoint": "checkpoints",
     "measuring": "measuring, besides the steps",
+    "start": "start of the program, before the steps",
     "reading": "reading the inputs, before the steps",
     "refining": "splitting large Gaussians, before the steps",
     "survey": "survey of the views, before the steps",
     "planning": "planning, before the steps",
     "preparing": "preparing the job, before the steps",
+    "writing": "writing the results",
+    "other": "everything else",
 }
-#: Kinds of time that are not part of the steps.
-_BESIDE = ("checkpoint", "measuring", *BEFORE_STEPS)
 _ENVIRONMENT = Environment(
     loader=PackageLoader("sgsst_core.report"),
     autoescape=True,  # names of scenes, views and files are arbitrary user input
@@ -131,13 +131,9 @@ def _sheet_bytes(path: Path | None) -> bytes | None:
 def _time_split(report: dict[str, Any]) -> list[tuple[str, float, float]]:
     """Return the name, the seconds and the percentage of each kind of time, longest first."""
     by_part = report.get("seconds_by_part") or {}
-    parts = {_PARTS.get(name, name): seconds for name, seconds in by_part.items()}
-    measured = sum(parts.values())
-    total = max(report["seconds"] + sum(by_part.get(name, 0.0) for name in _BESIDE), measured)
-    ordered = sorted(parts.items(), key=lambda part: -part[1])
-    if total - measured > 0.001 * total:
-        ordered.append(("everything else", total - measured))
-    return [(name, seconds, 100 * seconds / total) for name, seconds in ordered] if total else []
+    total = sum(by_part.values())
+    ordered = sorted(by_part.items(), key=lambda part: (part[0] == "other", -part[1]))
+    return [(_PARTS.get(name, name), seconds, 100 * seconds / total) for name, seconds in ordered] if total else []
 
 
 def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

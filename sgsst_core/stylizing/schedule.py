@@ -14,9 +14,9 @@ from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Plan
 from sgsst_core.settings import Settings
 
-#: Parts of a job's time before its first step, as named in `seconds_by_part`: inputs, refinement, survey, the rest of
-#: planning, and preparation of the steps.
-BEFORE_STEPS = ("reading", "refining", "survey", "planning", "preparing")
+#: Parts of a job's time before its first step, as named in `seconds_by_part`: start of the program, inputs, refinement,
+#: survey, the rest of planning, and preparation of the steps.
+BEFORE_STEPS = ("start", "reading", "refining", "survey", "planning", "preparing")
 
 
 @dataclass(frozen=True)

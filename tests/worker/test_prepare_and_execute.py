@@ -226,6 +226,9 @@ def test_report_has_seconds_before_the_first_step(request_: JobSpec) -> None:
     report = json.loads(Path(request_.out).with_name("s.report.json").read_text())
     for name in names:
         assert report["seconds_by_part"][name] == pytest.approx(before[name] + own.get(name, 0.0), abs=0.002)
+    parts = report["seconds_by_part"]
+    assert sum(parts.values()) == pytest.approx(report["seconds_total"], abs=0.001 * len(parts))
+    assert report["seconds_total"] > report["seconds"] + report["seconds_by_part"]["writing"]
     assert "survey of the views, before the steps" in Path(request_.out).with_name("s.report.html").read_text()
 
 

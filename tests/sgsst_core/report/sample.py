@@ -21,7 +21,12 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
         "stopped": "finished",
         "steps": {"coarse": {"planned": coarse, "done": coarse}, "sos": {"planned": sos, "done": sos}},
         "seconds": seconds,
-        "seconds_by_part": {"vgg_forward": 0.5 * seconds, "render": 0.2 * seconds, "optimizer": 0.1 * seconds},
+        "seconds_by_part": {
+            "vgg_forward": 0.5 * seconds,
+            "render": 0.2 * seconds,
+            "optimizer": 0.1 * seconds,
+            "other": 0.2 * seconds,
+        },
         "loss": {
             "views": ["a", "b"],
             "before": {"total": 6e5, "scales": before},
