@@ -20,7 +20,9 @@ weights_app = typer.Typer(help="Weights of the feature network.", no_args_is_hel
 
 
 def doctor(as_json: JsonOption = False) -> None:
-    """Examine this machine within 30 seconds: GPU, driver, precision, memory, weights, caches, and correct results.
+    """Examine this machine: GPU, driver, precision, memory, weights, caches, and correct results.
+
+    It takes half a minute, and another one the first time, when it compiles the kernels of jobs.
 
     Exit code: 0 if everything works, 3 if jobs run but slower than they could, 1 if they fail or are wrong.
     """

@@ -45,6 +45,7 @@ class JobBar:
         self._bar = bar
         self._task = bar.add_task("Reading the scene", total=None, note="")
         self._last_line = time.monotonic()
+        self._compiled = 0
 
     def show(self, progress: Progress) -> None:
         """Show the stage, and how many of its views or steps are completed."""
@@ -57,8 +58,12 @@ class JobBar:
             self._bar.console.print(progress.text(title))
 
     def show_compiling(self) -> None:
-        """Show that kernels are being compiled, which takes half a minute in the first job on a machine."""
-        self._bar.update(self._task, description="Compiling kernels, once on this machine")
+        """Show that a kernel is being compiled. All of them take half a minute in the first job on a machine."""
+        self._compiled += 1
+        title = "Compiling kernels, once on this machine"
+        self._bar.update(self._task, description=f"{title}: {self._compiled}")
+        if self._bar.disable and self._compiled == 1:
+            self._bar.console.print(title)
 
 
 @contextmanager
