@@ -32,11 +32,11 @@ import torch
 from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.machine import RESULTS, write_result
 
-#: Time limit of each part in seconds, 955 in total, the most telling parts first. The first parts load the libraries
+#: Time limit of each part in seconds, 895 in total, the most telling parts first. The first parts load the libraries
 #: from disk and compile the kernels and the CPU rasterizer.
 BUDGETS = {
     "identity": 15,
-    "job": 420,
+    "job": 360,
     "poison": 50,
     "parity": 45,
     "kernels": 60,

@@ -11,6 +11,8 @@ from sgsst_core.bench.synthetic import surface_scene, texture, views
 from sgsst_core.budget import peak_memory
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Precision, make_settings
+from sgsst_core.stylizing.loop import Callbacks
+from sgsst_core.stylizing.loop import run as run_steps
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Warm-up steps, in which views are prepared and libraries choose their algorithms.
@@ -47,8 +49,11 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     )
     for _ in range(_WARM):
         stylizer.run_step()
+    end = stylizer.step + 2 * sizes.step_repeats
+    callbacks = Callbacks(progress=lambda progress: None, stop=lambda: stylizer.step == end)
+    in_loop = waited_seconds(lambda: run_steps(stylizer, callbacks), device()) / (2 * sizes.step_repeats)
     taken = [waited_seconds(stylizer.run_step, device()) for _ in range(sizes.step_repeats)]
-    records = stylizer.history[_WARM:]
+    records = stylizer.history[-sizes.step_repeats :]
     names = {name for record in records for name in record.parts}
     parts = {name: statistics.median(record.parts.get(name, 0.0) for record in records) for name in sorted(names)}
     prediction = stylizer.job.plan.prediction
@@ -56,6 +61,7 @@ def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Preci
     findings.add(f"{place}/rasterizer", stylizer.job.plan.rasterizer)
     findings.add(f"{place}/precision", stylizer.job.plan.precision)
     findings.add(f"{place}/seconds", statistics.median(taken))
+    findings.add(f"{place}/seconds_in_loop", in_loop)
     findings.add(f"{place}/seconds_by_part", parts)
     if device().type == "cuda":
         milliseconds, kernels = kernel_times(stylizer.run_step)

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
+from benchmarks.gpu import job
 from benchmarks.gpu.__main__ import BUDGETS
-from benchmarks.gpu.part import Findings
+from benchmarks.gpu.part import QUICK, Findings
 
 pytest.importorskip("triton")
 pytestmark = pytest.mark.slow
@@ -61,10 +62,12 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     for place, name in (("step", "render"), ("step", "slot_gradients"), ("cached_weights", "apply_pieces")):
         assert min(findings["kernels"][place][name].values()) > 0
         assert findings["kernels"]["first_launch_seconds"][name] > 0
-    job = findings["job"]["3x32x32"]["float32"]
-    assert job["steps"] == 2
-    assert {"reading", "survey", "planning", "vgg_forward"} <= set(job["seconds_by_part"])
-    assert job["other"] == pytest.approx(job["seconds"] - sum(job["seconds_by_part"].values()))
+    whole = findings["job"]["3x32x32"]["float32"]
+    assert whole["steps"] == 2
+    assert {"start", "reading", "survey", "planning", "vgg_forward", "writing"} <= set(whole["seconds_by_part"])
+    assert sum(whole["seconds_by_part"].values()) == pytest.approx(whole["seconds_total"], abs=0.02)
+    assert whole["seconds_total"] < whole["seconds"] + 0.02, "the process ends after its last report"
+    assert whole["plan"]["prediction"]["seconds"] > 0
     rates = findings["convolutions"]["conv1_1"]["bfloat16"]["forward"]
     assert set(rates) == {"channels_last", "planes"}
     assert min(rates.values()) > 0
@@ -76,6 +79,7 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     for precision in ("float32", "bfloat16"):
         assert findings["network"][precision]["both"]["tflops"] > 0
     entry = findings["step"]["32x32"]["float32"]
+    assert entry["seconds_in_loop"] > 0
     assert entry["rasterizer"] == "triton"
     assert {"vgg_forward", "vgg_backward", "render", "raster_backward"} <= set(entry["seconds_by_part"])
     assert entry["planned_process_bytes"] > 0
@@ -84,6 +88,22 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     assert findings["curve"]["loss"]["passed"]
     assert findings["ranks"]["colors"]["passed"]
     assert findings["tests"]["failed"] == {}
+
+
+def test_job_runs_on_a_simulated_gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    code = (
+        "import sys; from tests.pretend_cuda.runtime import pretend_cuda; from api.cli.main import main\n"
+        "with pretend_cuda(): sys.exit(main(sys.argv[1:]))"
+    )
+    monkeypatch.setattr(job, "PROGRAM", (sys.executable, "-c", code))
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    monkeypatch.setattr("benchmarks.gpu.job._PATIENCE", 900)
+    findings = Findings(tmp_path / "findings.json")
+    job.run(QUICK, findings)
+    assert not findings.broken, findings.broken
+    (entry,) = findings.entries["3x32x32"].values()
+    assert entry["plan"]["prediction"]["device_bytes"] is not None
+    assert sum(entry["seconds_by_part"].values()) == pytest.approx(entry["seconds_total"], abs=0.02)
 
 
 def test_failed_part_reports_reason_and_others_continue(tmp_path: Path) -> None:
