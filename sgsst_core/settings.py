@@ -327,8 +327,8 @@ class Settings(BaseModel):
     )
     measure: Annotated[Fraction, Option(unit="fraction of the steps' time", metavar="S")] = Field(
         0.1,
-        description="Measure novel views, which lie between the cameras, for S of the steps' predicted time, or 30 s "
-        "if that is more; 0 measures no novel views.",
+        description="Measure novel views, which lie between the cameras, for S of the steps' predicted time, "
+        "or, in short jobs, for half of it, at most 30 s; 0 measures no novel views.",
     )
 
     @property

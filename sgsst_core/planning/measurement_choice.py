@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from sgsst_core.planning.plan import Prediction
 from sgsst_core.settings import Settings
 
-#: Seconds that are allowed without a time budget, so that short jobs are measured too. If the steps take less than
-#: five minutes, this is more than a tenth of their time.
-LEAST_ALLOWED = 30.0
+#: Without a time budget, measuring may take half of the steps' time, but no more than the second of these numbers of
+#: seconds, and the first in any case, so that short jobs are measured too.
+SHORT = 5.0, 30.0
 #: Planned measurements may use this fraction of the time allowed, because predictions are accurate to about a fifth.
 _PLANNED = 0.8
 #: Candidate numbers of views for the initial loss; the largest that half of the time allowed covers is used.
@@ -86,8 +86,9 @@ class Prices:
 
 
 def allowed_seconds(settings: Settings, steps: float) -> float:
-    """Return the seconds that all measurements may take: `measure` of the steps' time, or a minimum."""
-    return max(0.0 if settings.within else LEAST_ALLOWED, settings.measure * steps)
+    """Return the seconds that all measurements may take: `measure` of the steps' time, or in short jobs half of it."""
+    least, most = (0.0, 0.0) if settings.within else SHORT
+    return max(settings.measure * steps, min(max(steps / 2, least), most))
 
 
 def novel_view_seconds(settings: Settings, expected: Prediction) -> float:

@@ -13,7 +13,6 @@ from sgsst_core.number_format import duration
 from sgsst_core.planning import choices
 from sgsst_core.planning.context import Facts, NetworkPixels, Saving
 from sgsst_core.planning.measurement_choice import (
-    LEAST_ALLOWED,
     LEVELS,
     RENDERED,
     Prices,
@@ -217,7 +216,7 @@ def _about_measuring(plan: Plan, settings: Settings) -> Decision:
     moments = level.moments(plan.steps_coarse + settings.steps_sos)
     when = f"at {len(moments)} moments" if len(moments) > 1 else "at the end"
     novel = f", and {when} up to {_count(level.views, 'novel view')}" if moments else " only"
-    least = "" if settings.within else f" or {LEAST_ALLOWED:.0f} s"
+    least = "" if settings.within else " or, in short jobs, half of it"
     allowed = duration(allowed_seconds(settings, steps), " ")
     return Decision(
         "measuring",

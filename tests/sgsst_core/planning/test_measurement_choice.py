@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from sgsst_core.planning.measurement_choice import (
-    LEAST_ALLOWED,
     LEVELS,
     NOTHING,
     Prices,
+    allowed_seconds,
     choose_level,
     choose_loss_views,
     novel_view_seconds,
@@ -44,17 +44,19 @@ def test_first_allowed_level_is_chosen() -> None:
     assert choose_level(prices, 1e9, 300, first=3) == 3  # the plan's level is the minimum
 
 
-def test_measuring_may_take_half_a_minute_or_its_fraction_of_the_steps() -> None:
+def test_measuring_may_take_its_fraction_of_the_steps_or_half_of_short_ones() -> None:
+    for seconds, allowed in ((0.0, 5.0), (5.0, 5.0), (20.0, 10.0), (60.0, 30.0), (300.0, 30.0), (1000.0, 100.0)):
+        assert allowed_seconds(make_settings(), seconds) == allowed
     steps = Prediction(1.0, 1.0, 0, losses=3.0, measuring=50.0, job=1050.0)
     assert novel_view_seconds(make_settings(measure=0.1), steps) == 80.0 - 3.0
-    assert novel_view_seconds(make_settings(measure=0.001), steps) == 0.8 * LEAST_ALLOWED - 3.0
+    assert novel_view_seconds(make_settings(measure=0.001), steps) == 0.8 * 30.0 - 3.0
     assert novel_view_seconds(make_settings(measure=0.001), replace(steps, losses=32.0)) == 0.0
     assert novel_view_seconds(make_settings(measure=0.0), steps) == 0.0
 
 
 def test_loss_gets_half_of_the_allowed_time_and_at_least_one_view() -> None:
-    for steps, price, views in ((0.0, 3.0, 4), (0.0, 3.01, 2), (0.0, 6.0, 2), (0.0, 6.01, 1), (0.0, 1e9, 1)):
+    for steps, price, views in ((60.0, 3.0, 4), (60.0, 3.01, 2), (60.0, 6.0, 2), (60.0, 6.01, 1), (0.0, 1e9, 1)):
         assert choose_loss_views(make_settings(measure=0.1), steps, price, 97) == views
     assert choose_loss_views(make_settings(measure=0.1), 3000.0, 6.01, 97) == 4
-    assert choose_loss_views(make_settings(measure=0.1), 0.0, 4.0, 3) == 3  # there are only three views
+    assert choose_loss_views(make_settings(measure=0.1), 60.0, 4.0, 3) == 3  # there are only three views
     assert choose_loss_views(make_settings(measure=0.0), 3000.0, 3.0, 97) == 4

@@ -13,7 +13,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.planning.choices import OPTIMIZER_BYTES, draft_plan
 from sgsst_core.planning.context import Facts, Hardware, NetworkPixels, Saving, WeightCost
-from sgsst_core.planning.measurement_choice import LEAST_ALLOWED
+from sgsst_core.planning.measurement_choice import allowed_seconds
 from sgsst_core.planning.plan import Plan, Prediction
 from sgsst_core.planning.survey import Survey
 from sgsst_core.settings import make_settings
@@ -213,7 +213,7 @@ def test_planned_measuring_stays_within_the_allowed_time() -> None:
         plan = plan_of(facts(), steps_sos=steps)
         prediction = expected(plan)
         assert prediction.losses <= prediction.measuring
-        assert prediction.measuring <= max(LEAST_ALLOWED, 0.1 * (prediction.job - prediction.measuring))
+        assert prediction.measuring <= allowed_seconds(make_settings(), prediction.job - prediction.measuring)
         assert "in addition to" in text_of(plan, "measuring")
     assert "requested" in text_of(plan_of(facts(), measure=0.0), "measuring")
 
