@@ -10,7 +10,6 @@ from statistics import mode
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
@@ -73,6 +72,8 @@ class CameraPath:
         )
         self._intrinsics = np.stack([_relative_intrinsics(camera) for camera in self.cameras])
         if len(distinct) > 1:
+            from scipy.interpolate import CubicHermiteSpline  # takes a quarter of a second to import
+
             centers = _centers(self.cameras)
             self._positions = CubicHermiteSpline(self.knots, centers, catmull_rom_tangents(self.knots, centers))
             self._rotations = Slerp(self.knots, Rotation.from_matrix(_rotations(self.cameras)))
