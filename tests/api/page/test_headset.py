@@ -76,8 +76,8 @@ def worn(tmp_path: Path, browser: Any, emulator: Path) -> Iterator[Worn]:
 
 def area(image: NDArray[np.float64], channel: int) -> NDArray[np.bool_]:
     """Return where red (0) or blue (2) Gaussians are."""
-    found: NDArray[np.bool_] = (image[..., channel] > 100) & (image[..., 2 - channel] < 80)
-    return found
+    mask: NDArray[np.bool_] = (image[..., channel] > 100) & (image[..., 2 - channel] < 80)
+    return mask
 
 
 def middle(mask: NDArray[np.bool_]) -> float:
@@ -106,7 +106,7 @@ def test_two_hands_change_the_size_of_the_scene(worn: Worn) -> None:
     before = area(worn.after(apart), 0).mean()
     worn.after("for (const hand of [left, right]) hand.updateButtonValue('squeeze', 1)")
     shrunk = area(worn.after("left.position.set(-0.1, 1.2, -0.4); right.position.set(0.1, 1.2, -0.4)"), 0).mean()
-    assert shrunk < 0.75 * before  # it shrinks towards the hands, and so comes nearer
+    assert shrunk < 0.75 * before  # it shrinks toward the hands, and so comes nearer
     worn.after("for (const hand of [left, right]) hand.updateButtonValue('squeeze', 0)")
     assert area(worn.after(apart), 0).mean() == pytest.approx(shrunk, rel=0.1)
 
