@@ -220,7 +220,8 @@ NOT_RUNNING = _wrong_status(
     "The job has status {job_status}; only a running job can be finished early.", example={"job_status": "queued"}
 )
 NOT_RETRYABLE = _wrong_status(
-    "The job has status {job_status}; only failed or canceled jobs can be retried.", example={"job_status": "running"}
+    "The job has status {job_status}; only failed, canceled and stopped jobs can be retried.",
+    example={"job_status": "running"},
 )
 NOT_ENDED = _wrong_status(
     "The job has status {job_status}. {advice}; delete it once it has ended.",

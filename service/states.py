@@ -51,7 +51,7 @@ class Transition(StrEnum):
     FINISH = "finish"
     #: The user cancels the job.
     CANCEL = "cancel"
-    #: The user retries the job.
+    #: The user retries the job, or continues one that was stopped early.
     RETRY = "retry"
     #: The retention time of the results is over.
     EXPIRE = "expire"
@@ -86,7 +86,7 @@ TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
     Transition.STOP: dict.fromkeys(ACTIVE, _S.CANCELED),
     Transition.FINISH: {_S.RUNNING: _S.FINISHING, _S.FINISHING: _S.FINISHING},
     Transition.CANCEL: {**dict.fromkeys((_S.QUEUED, _S.CANCELED), _S.CANCELED), **dict.fromkeys(ACTIVE, _S.CANCELING)},
-    Transition.RETRY: dict.fromkeys((_S.FAILED, _S.CANCELED), _S.QUEUED),
+    Transition.RETRY: dict.fromkeys(FINISHED, _S.QUEUED),  # one that succeeded only if it was stopped early
     Transition.EXPIRE: dict.fromkeys(FINISHED, _S.EXPIRED),
 }
 
@@ -110,7 +110,7 @@ ACTIONS: Mapping[Transition, Action] = {
     for action, text in {
         Transition.FINISH: "End a running job after its current step, and keep its result so far.",
         Transition.CANCEL: "Cancel a job.",
-        Transition.RETRY: "Queue a failed or canceled job again.",
+        Transition.RETRY: "Queue a failed, canceled or stopped job again; it continues from its last checkpoint.",
     }.items()
 }
 

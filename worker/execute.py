@@ -24,7 +24,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
 from sgsst_core.stylizing.stylizer import Stylizer
-from worker.job import Result
+from worker.job import CONTINUABLE, Result
 from worker.options import RunOptions
 from worker.prepare import Job, Warn
 from worker.previews import Previews
@@ -179,7 +179,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
         lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized(), sh_attenuation=attenuation)
     )
     compressed = stylizer.job.collectives.broadcast(lambda: _write_compressed(job))
-    if first and stopped != "within":
+    if first and stopped not in CONTINUABLE:
         outputs.checkpoints.remove()
     needed = measure.seconds_left(stylizer.step, ends=True)
     if stylizer.job.collectives.broadcast(lambda: left is None or left() > needed):

@@ -17,6 +17,9 @@ from worker.options import Backbone, ViewOptions
 from worker.region_requests import RegionRequest
 from worker.styles import StyleFile
 
+#: Reasons of an early end after which a job can be continued: it keeps its checkpoint.
+CONTINUABLE = ("within", "on-request")
+
 
 class SceneRequest(ViewOptions):
     """Scene and cameras of a request.

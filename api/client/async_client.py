@@ -266,7 +266,7 @@ class AsyncClient:
         return await self.act(job_id, Transition.CANCEL)
 
     async def retry(self, job_id: str) -> Job:
-        """Queue a failed or canceled job again."""
+        """Queue a failed, canceled or stopped job again."""
         return await self.act(job_id, Transition.RETRY)
 
     async def share(self, job_id: str, days: float = 7.0) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Float, String, bindparam, func, insert, select, tuple_
+from sqlalchemy import Connection, Float, String, bindparam, delete, func, insert, select, tuple_
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -261,12 +261,13 @@ class Jobs:
         return job
 
     def retry(self, job_id: str, owner: str | None, *, limit: int, quotas: Quotas = NO_QUOTAS) -> JobRow:
-        """Queue a failed or canceled job again; it resumes from its last checkpoint if there is one.
+        """Queue a failed, canceled or stopped job again; it resumes from its last checkpoint if there is one.
 
-        A retry counts toward the day's jobs.
+        A retry counts toward the day's jobs. A stopped job keeps its result until it has a new one, but not the files
+        derived from it, which are newer than its end.
 
         Raises:
-            NOT_RETRYABLE: If the job has another status.
+            NOT_RETRYABLE: If the job has another status, or has succeeded and kept no checkpoint.
             QUEUE_FULL: If the owner has `limit` unfinished jobs.
             QUOTA_EXCEEDED: If the job would exceed one of the owner's quotas.
         """
@@ -274,13 +275,19 @@ class Jobs:
         with self._database.writing() as session:
             lock_owner(session, job_of_owner(session, job_id, owner).owner)
             job = job_of_owner(session, job_id, owner, lock=True)
-            if not allowed(job.status, Transition.RETRY):
+            files = select(ArtifactRow).where(ArtifactRow.job_id == job.id)
+            ended_well = job.status == JobStatus.SUCCEEDED
+            checkpoint = session.scalar(files.where(ArtifactRow.name.startswith(".", autoescape=True)).limit(1))
+            if not allowed(job.status, Transition.RETRY) or (ended_well and checkpoint is None):
                 raise problems.NOT_RETRYABLE(job_status=job.status)
             _check_queue(session, job.owner, limit)
             count_job(session, job.owner, quotas, now)
             check_bytes(session, job.owner, quotas)
             job.queued_at, job.not_before, job.failures, job.swept = now, now, 0, False
-            job.finished_at = job.expires_at = job.error = job.progress = None
+            if ended_well:
+                derived = ArtifactRow.created_at > job.finished_at
+                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, derived))
+            job.finished_at = job.expires_at = job.error = job.progress = job.result = None
             job.finish_requested = False
             move(session, job, Transition.RETRY, now)
         return job

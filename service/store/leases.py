@@ -37,6 +37,7 @@ from service.store.tables import (
 )
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.progress import Progress
+from worker.job import CONTINUABLE
 
 #: Expiry of a lease whose dispatcher is known to be dead.
 EXPIRED = 0.0
@@ -271,8 +272,9 @@ class Leases:
         """
         with self._held(lease) as (session, job, now):
             unused = _publish(session, job, files, now)
-            # the checkpoint, and the colors of the unfinished job
-            obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in (".", LIVE)))
+            # the colors of the unfinished job, and its checkpoint unless it can be continued
+            prefixes = (LIVE,) if result.get("stopped") in CONTINUABLE else (".", LIVE)
+            obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in prefixes))
             session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, obsolete))
             job.result, job.error = result, None
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)

@@ -287,6 +287,30 @@ def test_retried_job_resumes_from_checkpoint(service: Service, files: dict[str, 
 
 
 @pytest.mark.slow
+def test_stopped_job_is_continued(service: Service, files: dict[str, Path], expected: bytes) -> None:
+    """The result stays until the new one, which is that of a job that was never stopped; its derived files do not."""
+    with service.client() as client:
+        job_id = submit(client, files)
+        wait_for_step(service, client, job_id, 10)
+        assert client.post(f"/v1/jobs/{job_id}/finish").status_code == 200
+        stopped = wait_until(service, client, job_id, "succeeded")["result"]
+        assert (stopped["stopped"], stopped["steps"] < stopped["total"]) == ("on-request", True)
+        derived = f"/v1/jobs/{job_id}/artifacts/stylized.ply?format=spz"
+        first = client.get(derived).content
+        assert client.post(f"/v1/jobs/{job_id}/retry").json()["result"] is None
+        assert "stylized.spz" not in client.get(f"/v1/jobs/{job_id}/artifacts").text
+        final = wait_until(service, client, job_id, "succeeded")
+        assert (final["result"]["stopped"], final["attempt"]) == ("finished", 2)
+        steps = [
+            data["step"] for _, kind, data in events(client, job_id) if kind == "progress" and data["attempt"] == 2
+        ]
+        assert min(step for step in steps if step) >= stopped["steps"], "it began anew"
+        assert result(client, job_id) == expected
+        assert client.get(derived).content != first
+        assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
+
+
+@pytest.mark.slow
 def test_job_that_is_finished_early_keeps_its_colors(service: Service, files: dict[str, Path]) -> None:
     """The request outlives the process of the attempt: the next one resumes, makes a step and writes its result."""
     with service.client() as client:

@@ -31,7 +31,7 @@ starting    starting  running   succeeded  failed  queued   canceled  .         
 running     starting  running   succeeded  failed  queued   canceled  finishing  canceling  .       .
 finishing   starting  .         succeeded  failed  queued   canceled  finishing  canceling  .       .
 canceling   .         canceling succeeded  .       .        canceled  .          canceling  .       .
-succeeded   .         .         .          .       .        .         .          .          .       expired
+succeeded   .         .         .          .       .        .         .          .          queued  expired
 failed      .         .         .          .       .        .         .          .          queued  expired
 canceled    .         .         .          .       .        .         .          canceled   queued  expired
 expired     .         .         .          .       .        .         .          .          .       .

@@ -168,7 +168,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
     },
 )
 def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
-    """Queue a failed or canceled job again. It resumes from its last checkpoint."""
+    """Queue a failed or canceled job again, or one that was stopped early. It resumes from its last checkpoint."""
     stored_parameters(find(context, caller, job_id).parameters)
     check_weights()
     context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key, quotas=caller.quotas)
