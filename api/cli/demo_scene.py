@@ -12,6 +12,7 @@ World: meters, the left camera's axes (x right, y down, z forward), the origin a
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.files.atomic import atomic_path, ensure_writable_folder
+from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.scene.gaussians import Scene
@@ -114,11 +116,21 @@ def build_demo(folder: Path) -> DemoScene:
     ensure_writable_folder(folder)
     demo = DemoScene(folder / "motorcycle.ply", folder / "cameras.json", folder / "starry_night.jpg")
     write_scene(demo.ply, lift_pair())
-    with atomic_path(demo.cameras) as temporary:
-        temporary.write_text(json.dumps(camera_path(), indent=1), encoding="utf-8")
+    _write_cameras(demo.cameras)
     with atomic_path(demo.style) as temporary:
         temporary.write_bytes(STARRY_NIGHT.read_bytes())
     return demo
+
+
+def build_example(folder: Path) -> None:
+    """Write the demo's scene, compressed, and its cameras into a folder, for the page (`api.http.static`)."""
+    write_scene(folder / "motorcycle.sog", lift_pair(), SOG)
+    _write_cameras(folder / "cameras.json")
+
+
+def _write_cameras(path: Path) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(camera_path(), indent=1), encoding="utf-8")
 
 
 def lift_pair() -> Scene:
@@ -302,3 +314,7 @@ def camera_path() -> list[dict[str, object]]:
         view |= {"position": position.tolist(), "rotation": rotation.tolist(), "fx": VIEW_FOCAL, "fy": VIEW_FOCAL}
         views.append(view)
     return views
+
+
+if __name__ == "__main__":
+    build_example(Path(sys.argv[1]))

@@ -15,13 +15,14 @@ export class Gallery {
   /**
    * @param {(painting: Chosen) => void} choose
    * @param {AbortSignal} signal
+   * @param {HTMLElement} example offer of an example scene
    */
-  constructor(choose, signal) {
+  constructor(choose, signal, example) {
     this.choose = choose;
     this.signal = signal;
     this.used = h("div", { hidden: true });
-    const bundled = Object.entries(say.paintings).map(([name, title]) => this.painting(address(name), title, () => fetched(name)));
-    this.element = h("details.fold.gallery", { ontoggle: () => this.loadUsed() }, h("summary", say.title), this.used, h("p.help", say.bundled), h("div.paintings", bundled));
+    const bundled = Object.entries(say.paintings).map(([name, title]) => this.painting(address(name), title, () => painting(name)));
+    this.element = h("details.fold.gallery", { ontoggle: () => this.loadUsed() }, h("summary", say.title), example, this.used, h("p.help", say.bundled), h("div.paintings", bundled));
   }
 
   /**
@@ -51,8 +52,13 @@ export class Gallery {
 /** @param {string} name */
 const address = (name) => new URL(`./paintings/${name}.jpg`, import.meta.url).href;
 
-/** Return a painting of the page as if it were chosen from this device. @param {string} name */
-async function fetched(name) {
-  const blob = await (await fetch(address(name))).blob();
-  return new File([blob], `${name}.jpg`, { type: "image/jpeg", lastModified: 0 }); // the same upload every time
+/** Return a file of the page as if it were chosen from this device. @param {string} url @param {string} name */
+export async function fetched(url, name) {
+  const answer = await fetch(url);
+  if (!answer.ok) throw new Error(words.api.status(answer.status));
+  const blob = await answer.blob();
+  return new File([blob], name, { type: blob.type, lastModified: 0 }); // the same upload every time
 }
+
+/** Return a painting of the page. @param {string} name */
+export const painting = (name) => fetched(address(name), `${name}.jpg`);

@@ -2,7 +2,8 @@
 /** View of all jobs: their images, names and states. */
 import { artifactPath, ask, get } from "./api.js";
 import { announce, h, put } from "./dom.js";
-import { badge, deleteButton } from "./job.js";
+import { deleteButton } from "./delete_button.js";
+import { badge } from "./job.js";
 import { nameOf, stylesOf } from "./names.js";
 import { sceneOf } from "./result_stage.js";
 import { stepFraction, titles, UNFINISHED } from "./statuses.js";

@@ -2,6 +2,7 @@
 /** Regions of a scene, each with its own style or frozen. */
 import { h, icon, newId, put } from "./dom.js";
 import { showWrong } from "./options.js";
+import { contentOf } from "./stored.js";
 import { strengthName } from "./strength.js";
 import { words } from "./words.js";
 
@@ -28,13 +29,39 @@ export class RegionList {
     /** @type {Row[]} */
     this.rows = [];
     this.made = 0;
+    /** Files of masks from an earlier job. @type {Chosen[]} */
+    this.earlier = [];
     /** @type {string[]} */
     this.styles = [];
     this.list = h("div.regions");
     this.element = h("div", { oninput: changed }, this.list, h("button.quiet.small", { type: "button", onclick: () => this.add().element.querySelector("button")?.focus() }, icon("plus"), say.addRegion));
   }
 
-  add() {
+  /** Box that the scene is cropped to, such as "-1,-1,-1,1,1,1"; "" for none. */
+  get box() {
+    const [first] = this.value(), frozen = this.value().some(({ name, freeze }) => name === REST && freeze);
+    return frozen && first.name === words.crop.inside ? /^box=(.*)/.exec(first.select)?.[1] ?? "" : "";
+  }
+
+  /** Paint only what is inside a box, and freeze the rest. @param {string} box "" to paint everything */
+  crop(box) {
+    for (const row of this.rows.filter((row) => [words.crop.inside, REST].includes(row.value().name))) this.drop(row);
+    if (box) {
+      this.add(true).set({ name: words.crop.inside, select: `box=${box}` });
+      this.add().set({ name: REST, freeze: true });
+    }
+    this.changed();
+  }
+
+  /** @param {Row} row */
+  drop(row) {
+    this.rows = this.rows.filter((each) => each !== row);
+    row.element.remove();
+    this.changed();
+  }
+
+  /** @param {boolean} [first] whether to add it before the others, which win where they overlap */
+  add(first = false) {
     const number = ++this.made;
     const field = (/** @type {string} */ title, /** @type {any} */ input) => {
       input.id = newId();
@@ -76,7 +103,7 @@ export class RegionList {
       this.changed();
     };
     const error = h("p.wrong", { id: newId(), hidden: true });
-    const remove = h("button.tool", { type: "button", "aria-label": say.remove(say.region(number)), onclick: () => ((this.rows = this.rows.filter((each) => each !== row)), element.remove(), this.changed()) }, icon("close"));
+    const remove = h("button.tool", { type: "button", "aria-label": say.remove(say.region(number)), onclick: () => this.drop(row) }, icon("close"));
     const element = h("fieldset.region", h("legend", say.region(number)), h("div.handmade", picked, pick, drop), field(say.regionName, name), field(say.style, style), field(say.regionStrength, strength), field(hand.weight, weight), h("label.check", freeze, h("span", say.freeze)), written, error, remove);
     const inputs = /** @type {Record<string, any>} */ ({ name, select, style, weight, content_weight: strength, freeze, pick });
     for (const input of Object.values(inputs)) input.setAttribute("aria-describedby", error.id);
@@ -101,8 +128,8 @@ export class RegionList {
     /** @type {Row} */
     const row = { element, value, mask: () => mask, setMask, set, setStyles: () => setStyle(style.value), wrong };
     element.addEventListener("input", () => wrong(""));
-    this.rows.push(row);
-    this.list.append(element);
+    this.rows.splice(first ? 0 : this.rows.length, 0, row);
+    this.list.insertBefore(element, first ? this.list.firstChild : null);
     setMask(null);
     return row;
   }
@@ -113,22 +140,23 @@ export class RegionList {
     for (let n = 1; ; n++) if (!used.includes(`mask=region_${n}.bin`)) return `region_${n}.bin`;
   }
 
-  /** Return the files of all masks. */
-  masks() {
-    return this.rows.flatMap((row) => row.mask()?.file ?? []);
+  /** Return the files of the masks: those selected by hand, and those from an earlier job that a region still names. */
+  maskFiles() {
+    const made = this.rows.flatMap((row) => row.mask()?.file ?? []), names = made.map(({ name }) => name), selections = this.value().map(({ select }) => String(select ?? ""));
+    const used = (/** @type {string} */ name) => selections.some((select) => select === `mask=${name}` || (select.startsWith("masks=") && name.startsWith(select.slice(6))));
+    return [...made, ...this.earlier.filter(({ name }) => used(name) && !names.includes(name))];
   }
 
-  /**
-   * Show a mask of an earlier job as a selection by hand.
-   *
-   * @param {Row} row region that names the mask
-   * @param {Uint8Array} bits
-   * @param {Chosen} file the mask's file, which is not sent again
-   */
-  restoreMask(row, bits, file) {
-    let total = 0;
-    for (let byte of bits) for (; byte; byte &= byte - 1) total++;
-    row.set({ ...row.value(), mask: { bits, total, file } });
+  /** Show masks of an earlier job as selections by hand. @param {() => boolean} fit whether the scene is still the same */
+  async restoreMasks(fit) {
+    for (const row of this.rows) {
+      const file = this.earlier.find(({ name }) => row.value().select === `mask=${name}` && /\.bin$/i.test(name));
+      if (!file || row.mask()) continue;
+      const bits = new Uint8Array(await (await contentOf(file)).arrayBuffer());
+      let total = 0;
+      for (let byte of bits) for (; byte; byte &= byte - 1) total++;
+      if (fit()) row.set({ ...row.value(), mask: { bits, total, file } });
+    }
   }
 
   /** Remove masks, which belong to another scene. */

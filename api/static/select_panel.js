@@ -1,7 +1,8 @@
 // @ts-check
 /** Tools to select Gaussians in the 3D view: brush, lasso, box, sphere and similar colors. */
-import { h, newId, put } from "./dom.js";
-import { outline, ShapeHandles } from "./shapes.js";
+import { h, put } from "./dom.js";
+import { button, check, radios, range } from "./fields.js";
+import { shapeAround, ShapeTool } from "./shape_tool.js";
 import { Selection } from "./viewer/selection.js";
 import { words } from "./words.js";
 
@@ -34,48 +35,33 @@ export class SelectPanel {
     this.seed = undefined;
     /** Whether a request for similar colors is running, whether another one follows, and whether the last one changed something. */
     this.asking = this.again = this.changes = false;
-    /** @type {import("./shapes.js").Shape | null} */
-    this.shape = null;
-    /** @type {HTMLInputElement[]} */
-    this.inputs = [];
     /** @type {((mask: Mask | null) => void) | null} */
     this.finish = null;
     /** Controls of the panel. @type {any} */
     this.parts = {};
     this.surface = h("canvas.surface", { hidden: true, "aria-hidden": "true" });
-    this.handleLayer = h("div.handles");
     this.counted = h("output");
+    stage.frame.append(this.surface);
+    this.shapes = new ShapeTool(stage, (lines) => {
+      stage.outline = lines;
+      stage.drawFrames();
+    });
     this.build();
-    if (stage.viewer) this.handles = new ShapeHandles(stage.viewer, this.handleLayer, () => this.shapeChanged());
-    stage.frame.append(this.surface, this.handleLayer);
     stage.element.append(this.element);
     this.listen();
   }
 
   build() {
-    const button = (/** @type {string} */ name, /** @type {() => void} */ onclick, kind = "quiet") => h(`button.${kind}.small`, { type: "button", onclick }, name);
-    const radios = (/** @type {string} */ legend, /** @type {Record<string, string>} */ names, /** @type {(value: any) => void} */ changed) => {
-      const group = newId();
-      return h("fieldset.segments", h("legend.away", legend), Object.entries(names).map(([value, name], i) => h("label", h("input", { type: "radio", name: group, value, checked: i === 0, onchange: () => changed(value) }), h("span", name))));
-    };
-    const range = (/** @type {string} */ name, /** @type {any} */ properties) => {
-      const input = h("input", { type: "range", id: newId(), ...properties });
-      return { input, element: h("div.range", h("label", { htmlFor: input.id }, name), input) };
-    };
-    const check = (/** @type {string} */ name, checked = false) => {
-      const input = h("input", { type: "checkbox", checked });
-      return { input, element: h("label.check", input, h("span", name)) };
-    };
     this.parts.title = h("h2");
     this.parts.radius = range(say.radius, { min: 2, max: 150, value: 24 });
     this.parts.tolerance = range(say.tolerance, { min: 0, max: 100, value: 12, oninput: () => this.similarAgain() });
     this.parts.through = check(say.through);
     this.parts.connected = check(say.connected, true);
     this.parts.connected.input.addEventListener("change", () => this.similarAgain());
-    this.parts.numbers = h("div.numbers");
+    this.parts.numbers = this.shapes.numbers;
     this.parts.toolHelp = h("p.help");
     this.parts.middle = button(say.atMiddle, () => this.similarAtMiddle());
-    this.parts.apply = button(say.apply, () => this.applyShape());
+    this.parts.apply = button(say.apply, () => this.shapes.shape && this.ask(...this.shapes.request(this.mode)));
     this.parts.undo = button(say.undo, () => this.ask("undo"));
     this.parts.redo = button(say.redo, () => this.ask("redo"));
     this.parts.modeRadios = radios(say.mode, say.modes, (mode) => (this.mode = mode));
@@ -122,7 +108,6 @@ export class SelectPanel {
     this.choose("brush");
     this.element.scrollIntoView({ block: "nearest" });
     /** @type {HTMLInputElement} */ (this.parts.toolRadios.querySelector("input:checked")).focus();
-    this.follow();
     return true;
   }
 
@@ -159,7 +144,7 @@ export class SelectPanel {
     for (const part of [this.parts.tolerance.element, this.parts.connected.element, this.parts.middle]) part.hidden = tool !== "similar";
     for (const part of [this.parts.numbers, this.parts.apply]) part.hidden = !shaped;
     this.seed = undefined;
-    this.showShape(shaped ? /** @type {"box" | "sphere"} */ (tool) : null);
+    this.shapes.show((tool === "box" || tool === "sphere") && this.scene?.middle ? shapeAround(tool, this.scene.middle) : null);
     this.paint();
   }
 
@@ -275,41 +260,6 @@ export class SelectPanel {
     }
   }
 
-  /** @param {"box" | "sphere" | null} kind */
-  showShape(kind) {
-    const middle = this.scene?.middle;
-    this.shape = kind && middle ? { kind, center: [...middle.center], sizes: kind === "box" ? middle.high.map((high, axis) => Math.max((high - middle.low[axis]) / 4, 1e-6)) : Array(3).fill(middle.radius / 2) } : null;
-    this.handles?.show(this.shape);
-    const names = this.shape ? [...say.center, ...(kind === "box" ? say.sizes : [say.sphereRadius])] : [];
-    this.inputs = names.map((name) => h("input", { type: "number", step: "any", "aria-label": name, title: name, oninput: () => this.numbersChanged() }));
-    put(this.parts.numbers, this.inputs.map((input, i) => h("label", h("span", names[i]), input)));
-    this.shapeChanged();
-  }
-
-  shapeChanged() {
-    const { shape, stage } = this;
-    if (shape) [...shape.center, ...shape.sizes].slice(0, this.inputs.length).forEach((value, i) => (this.inputs[i].value = String(Number(value.toPrecision(5)))));
-    stage.outline = shape ? outline(shape) : new Float32Array(0);
-    stage.drawFrames();
-  }
-
-  numbersChanged() {
-    const values = this.inputs.map((input) => Number(input.value)), { shape } = this;
-    if (!shape || values.some((value) => !Number.isFinite(value)) || values.slice(3).some((value) => value <= 0)) return;
-    Object.assign(shape, { center: values.slice(0, 3), sizes: shape.kind === "box" ? values.slice(3) : Array(3).fill(values[3]) });
-    this.handles?.place();
-    this.stage.outline = outline(shape);
-    this.stage.drawFrames();
-  }
-
-  applyShape() {
-    const { shape, mode } = this;
-    if (!shape) return;
-    const { center, sizes } = shape;
-    if (shape.kind === "sphere") this.ask("sphere", { center, radius: sizes[0], mode });
-    else this.ask("box", { low: center.map((value, axis) => value - sizes[axis]), high: center.map((value, axis) => value + sizes[axis]), mode });
-  }
-
   /** Draw the brush at a point, or the lasso. @param {number[]} [point] */
   paint(point) {
     const { surface, drawn } = this, ratio = window.devicePixelRatio || 1, context = surface.getContext("2d");
@@ -340,13 +290,6 @@ export class SelectPanel {
     if (!actions[key]) return;
     event.preventDefault();
     actions[key]();
-  }
-
-  /** Keep the handles where the camera shows the shape. */
-  follow() {
-    if (!this.selection || this.stage.viewer?.ended) return;
-    if (this.shape) this.handles?.place();
-    requestAnimationFrame(() => this.follow());
   }
 
   end() {

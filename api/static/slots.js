@@ -3,7 +3,8 @@
 import { h, icon, newId, put } from "./dom.js";
 import { installed } from "./installed.js";
 import { showWrong } from "./options.js";
-import { StoredFile } from "./stored.js";
+import { editPainting } from "./painting_editor.js";
+import { contentOf, StoredFile } from "./stored.js";
 import { size, words } from "./words.js";
 
 /** @typedef {import("./stored.js").Chosen} Chosen */
@@ -97,6 +98,19 @@ export class Slot {
       files.length > 1 ? h("button.quiet.small", { type: "button", onclick: () => this.clear() }, say.removeAll) : null);
   }
 
+  /** Let the user rotate and crop a picture, which replaces the file. @param {Chosen} file */
+  async edit(file) {
+    try {
+      const made = await editPainting(await contentOf(file), file.name);
+      if (!made || !this.files.includes(file)) return;
+      this.files = this.files.map((each) => (each === file ? made : each));
+      this.show();
+      this.changed();
+    } catch (error) {
+      this.wrong(error instanceof Error ? error.message : String(error));
+    }
+  }
+
   /** Show notes under files. @param {Record<string, string>} notes by the files' names */
   annotate(notes) {
     if (JSON.stringify(notes) === JSON.stringify(this.notes)) return;
@@ -122,9 +136,10 @@ export class Slot {
   thumb(file) {
     const remove = h("button.tool", { type: "button", "aria-label": say.remove(file.name), title: say.remove(file.name), onclick: () => this.remove(file) }, icon("close"));
     if (!this.pictures) return h("div.thumb.plain", h("span", file.name), remove);
+    const name = words.painting.edit(file.name), edit = h("button.tool.edit", { type: "button", "aria-label": name, title: name, onclick: () => this.edit(file) }, icon("crop"));
     const url = file instanceof StoredFile ? file.url : URL.createObjectURL(file);
     this.urls.push(url);
-    return h("div.thumb", h("img", { src: url, alt: file.name }), remove, this.notes[file.name] && h("small", this.notes[file.name]));
+    return h("div.thumb", h("img", { src: url, alt: file.name }), edit, remove, this.notes[file.name] && h("small", this.notes[file.name]));
   }
 
   /** @param {string} text */

@@ -41,6 +41,8 @@ export class Stage {
     this.viewer = null;
     /** Lines of the selection's box or sphere, as pairs of points. */
     this.outline = new Float32Array(0);
+    /** Lines of the box that the scene is cropped to. */
+    this.cropped = new Float32Array(0);
     this.hasFrames = false;
     this.framesShown = true;
     this.up = [0, -1, 0];
@@ -219,7 +221,7 @@ export class Stage {
     if (!viewer) return;
     const middle = viewer.sides?.left.scene.middle ?? null, length = frameSize(this.cameras, middle);
     const shown = this.hasFrames && this.framesShown ? this.cameras.filter((_, i) => i !== this.stood) : [];
-    viewer.lines = Float32Array.of(...cameraLines(shown, length), ...this.outline);
+    viewer.lines = Float32Array.of(...cameraLines(shown, length), ...this.outline, ...this.cropped);
     viewer.draw();
   }
 

@@ -1,7 +1,7 @@
 // @ts-check
 /**
  * Conversion of floats to half precision (IEEE 754 binary16), rounded to nearest and clamped to the largest finite
- * value.
+ * value, and back.
  */
 
 const BASE = new Uint16Array(512), SHIFT = new Uint8Array(512), HIDDEN = new Uint32Array(512), ROUND = new Uint32Array(512);
@@ -30,4 +30,11 @@ export function halfOf(bits) {
   const key = bits >>> 23;
   const half = BASE[key] + ((((bits & 0x7fffff) | HIDDEN[key]) + ROUND[key]) >>> SHIFT[key]);
   return (half & 0x7fff) === 0x7c00 ? half - 1 : half;
+}
+
+/** @param {number} half bits of a half */
+export function fromHalf(half) {
+  const sign = half & 0x8000 ? -1 : 1, exponent = (half >> 10) & 31, fraction = half & 1023;
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024));
 }

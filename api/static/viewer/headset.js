@@ -101,7 +101,7 @@ export class Headset {
     this.move(frame, pose, seconds);
     const eyes = pose.views.map((/** @type {any} */ view) => this.eye(view));
     this.sort(eyes);
-    viewer.renderEyes(this.layer, eyes, this.sides(), this.scale, this.lines(), this.mode === "immersive-ar");
+    viewer.painter.renderEyes(this.layer, eyes, this.sides(), this.scale, this.lines(), this.mode === "immersive-ar");
     viewer.frames++;
   }
 

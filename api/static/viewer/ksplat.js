@@ -1,7 +1,8 @@
 // @ts-check
 /** Reader of mkkellogg's .ksplat, as `sgsst_core/files/formats/ksplat.py` describes it. */
 import { SceneError } from "./byte_reader.js";
-import { COLOR, fromHalf, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, SH_C0, unpacked } from "./packed.js";
+import { fromHalf } from "./half.js";
+import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, SH_C0, unpacked } from "./packed.js";
 import { words } from "../words.js";
 
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */

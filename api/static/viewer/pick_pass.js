@@ -9,7 +9,7 @@ import { CLASSIC } from "./render_tag.js";
 import { splatVertex } from "./shaders.js";
 
 /** @typedef {import("./viewer.js").Viewer} Viewer */
-/** @typedef {import("./viewer.js").Program} Program */
+/** @typedef {import("./painter.js").Program} Program */
 
 /** Longer side of the image in pixels. */
 const LONGER = 768;
@@ -100,17 +100,17 @@ export class PickPass {
    */
   drawScene(scene, width, height) {
     const { viewer } = this, { gl } = viewer;
-    const { program, at } = this.programs.get(scene.bits) ?? viewer.program(splatVertex(0, scene.bits), pickFragment);
+    const { program, at } = this.programs.get(scene.bits) ?? viewer.painter.program(splatVertex(0, scene.bits), pickFragment);
     this.programs.set(scene.bits, { program, at });
     gl.useProgram(program);
-    viewer.setView(at, width, height);
+    viewer.painter.setView(at, width, height);
     const { antialiased, eps2d } = scene.header?.rendering ?? CLASSIC;
     gl.uniform1f(at("eps2d"), eps2d);
     gl.uniform1i(at("antialiased"), Number(antialiased));
     gl.bindTexture(gl.TEXTURE_2D, scene.geometry ?? null);
     gl.uniform1i(at("geometry"), 0);
     this.separateSamplers(program, at);
-    viewer.drawInstances(scene);
+    viewer.painter.drawInstances(scene);
   }
 
   /**

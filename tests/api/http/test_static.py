@@ -14,6 +14,7 @@ import pytest
 from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import FORMATS
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.options import STRENGTHS
 from tests.api.conftest import KEYED, Services
 from tests.api.service import Service
@@ -54,6 +55,18 @@ def test_policies_forbid_inline_scripts() -> None:
         assert "media-src 'self';" in policy
         assert "http" not in policy
         assert policy.startswith("default-src 'none'; script-src 'self';")
+
+
+def test_example_is_built_at_the_first_request(client: httpx2.Client, files: StaticFiles, tmp_path: Path) -> None:
+    scene = tmp_path / "motorcycle.sog"
+    answer = client.get(f"/static/{files.digest}/example/{scene.name}", timeout=120)
+    assert (answer.status_code, answer.headers["content-security-policy"]) == (200, POLICY)
+    scene.write_bytes(answer.content)
+    assert len(read_scene(scene).scene) > 200_000
+    assert len(client.get(f"/static/{files.digest}/example/cameras.json").json()) > 5
+    assert client.get(f"/static/{files.digest}/example/../../routes.py").status_code == 404
+    assert client.get(f"/static/{files.digest}/example/none").status_code == 404
+    assert client.get("/static/0/example/cameras.json").status_code == 404
 
 
 def test_files_are_cached_by_digest(client: httpx2.Client, files: StaticFiles) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -86,3 +87,15 @@ def drop(watched: Watched, files: dict[str, Path]) -> None:
     watched.page.locator(".frame").wait_for()
     carried = [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in files.values()]
     watched.page.evaluate(_DROP, carried)
+
+
+def started(watched: Watched, service: Service, name: str = "Start") -> dict[str, Any]:
+    """Start the job of the form, and return it."""
+    with watched.page.expect_response(
+        lambda answer: answer.url.endswith("/v1/jobs") and answer.request.method == "POST"
+    ) as answer:
+        watched.page.get_by_role("button", name=name, exact=True).click()
+    assert answer.value.status == 202, answer.value.text()
+    watched.page.wait_for_url(re.compile("#/jobs/job_"))
+    job: dict[str, Any] = httpx2.get(f"{service.url}/v1/jobs/{answer.value.json()['id']}").json()
+    return job

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from sgsst_core.options import STRENGTHS
-from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, set_options, submit
+from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, set_options, started, submit
 from tests.api.page.browser import Watched
 from tests.api.service import Service
 
@@ -36,18 +36,6 @@ def uploads_of(watched: Watched) -> list[str]:
         ),
     )
     return uploads
-
-
-def started(watched: Watched, service: Service, name: str = "Start") -> dict[str, Any]:
-    """Start the job of the form, and return it."""
-    with watched.page.expect_response(
-        lambda answer: answer.url.endswith("/v1/jobs") and answer.request.method == "POST"
-    ) as answer:
-        watched.page.get_by_role("button", name=name, exact=True).click()
-    assert answer.value.status == 202, answer.value.text()
-    watched.page.wait_for_url(re.compile("#/jobs/job_"))
-    job: dict[str, Any] = httpx2.get(f"{service.url}/v1/jobs/{answer.value.json()['id']}").json()
-    return job
 
 
 def digests(job: dict[str, Any], role: str) -> list[str]:

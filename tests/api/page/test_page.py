@@ -193,7 +193,7 @@ def test_server_killed_and_back(visit: Visit, service: Service, files: dict[str,
     page.reload()
     page.get_by_role("img", name="Loss over time").wait_for()
     page.get_by_role("button", name="Cancel").click()
-    page.get_by_role("button", name="Retry").wait_for()
+    page.get_by_role("button", name="Continue").wait_for()
     watched.check("net::ERR", "Failed to load resource")
 
 

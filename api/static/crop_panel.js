@@ -1,0 +1,74 @@
+// @ts-check
+/** Panel to crop a scene to a box in the 3D view: what lies outside keeps its colors. */
+import { announce, h, icon } from "./dom.js";
+import { button } from "./fields.js";
+import { outline } from "./shapes.js";
+import { shapeAround, ShapeTool } from "./shape_tool.js";
+import { words } from "./words.js";
+
+/** @typedef {import("./shapes.js").Shape} Shape */
+
+const say = words.crop;
+
+/** Return the box of numbers "X0,Y0,Z0,X1,Y1,Z1". @param {string} text @returns {Shape} */
+export function boxOf(text) {
+  const numbers = text.split(",").map(Number), far = numbers.slice(3);
+  return { kind: "box", center: far.map((value, axis) => (value + numbers[axis]) / 2), sizes: far.map((value, axis) => Math.abs(value - numbers[axis]) / 2) };
+}
+
+/** Return the text of a box. @param {Shape} shape */
+export const boxText = ({ center, sizes }) => [-1, 1].flatMap((sign) => center.map((value, axis) => Number((value + sign * sizes[axis]).toPrecision(5)))).join(",");
+
+export class CropPanel {
+  /**
+   * @param {import("./stage.js").Stage} stage
+   * @param {(box: string) => void} apply receives the text of the box; "" for none
+   */
+  constructor(stage, apply) {
+    this.stage = stage;
+    this.apply = apply;
+    /** Text of the box in use; "" for none. */
+    this.box = "";
+    this.button = h("button.tool", { type: "button", title: say.crop, "aria-label": say.crop, "aria-pressed": "false", hidden: true, onclick: () => (this.element.hidden ? this.open() : this.close()) }, icon("crop"));
+    this.remove = button(say.remove, () => this.use(""));
+    this.first = button(say.use, () => this.use(this.tool.shape ? boxText(this.tool.shape) : ""), "primary");
+    this.tool = new ShapeTool(stage, (lines) => this.draw(lines));
+    this.element = h("section.selecting", { hidden: true, "aria-label": say.crop }, h("p.help", say.help), h("div.row", this.tool.numbers), h("div.row", this.remove, h("span.spring"), button(words.select.cancel, () => this.close()), this.first));
+    stage.tools.prepend(this.button);
+    stage.element.append(this.element);
+  }
+
+  open() {
+    const middle = this.stage.viewer?.sides?.left.scene.middle;
+    if (!middle) return announce(words.select.notLoaded);
+    this.remove.hidden = !this.box;
+    this.element.hidden = false;
+    this.tool.show(this.box ? boxOf(this.box) : shapeAround("box", middle, 1));
+    this.first.focus({ preventScroll: true });
+    this.element.scrollIntoView({ block: "nearest" });
+  }
+
+  close() {
+    this.element.hidden = true;
+    this.tool.show(null);
+  }
+
+  /** @param {string} box */
+  use(box) {
+    this.close();
+    this.apply(box);
+  }
+
+  /** Show a box as the one in use. @param {string} box */
+  show(box) {
+    this.box = box;
+    this.button.setAttribute("aria-pressed", String(!!box));
+    if (this.element.hidden) this.draw(new Float32Array(0));
+  }
+
+  /** Draw the outline of the box that is being changed, or of the one in use. @param {Float32Array<ArrayBuffer>} lines */
+  draw(lines) {
+    this.stage.cropped = lines.length || !this.box ? lines : outline(boxOf(this.box));
+    this.stage.drawFrames();
+  }
+}

@@ -1,0 +1,141 @@
+// @ts-check
+/** What a job's view shows of its scene: previews and colors so far while it runs, then its result. */
+import { artifactPath, get } from "./api.js";
+import { h, put } from "./dom.js";
+import { labels } from "./names.js";
+import { ResultStage } from "./result_stage.js";
+import { words } from "./words.js";
+
+const say = words.job;
+
+export class JobStage {
+  /**
+   * @param {string} id id of the job
+   * @param {AbortSignal} leaving aborted when the view ends
+   */
+  constructor(id, leaving) {
+    this.id = id;
+    this.leaving = leaving;
+    this.title = "";
+    this.picture = h("figure.preview");
+    this.element = h("div.show", this.picture);
+    /** Name of the shown preview. */
+    this.preview = "";
+    /** @type {ResultStage | undefined} */
+    this.live = undefined;
+    /** @type {ResultStage | undefined} */
+    this.result = undefined;
+    this.finishing = false;
+  }
+
+  /** @param {string} title title of the job */
+  name(title) {
+    this.title = title;
+    for (const stage of [this.result, this.live]) if (stage) stage.stage.title = title;
+  }
+
+  /** Show a preview, unless a newer one or the result is shown. @param {string} name name of the artifact */
+  showPreview(name) {
+    if (this.result || (this.preview && name <= this.preview)) return;
+    this.preview = name;
+    const picture = h("img", { alt: say.preview, decoding: "async" });
+    picture.onload = () => {
+      if (this.preview === name && !this.result) put(this.picture, picture);
+    };
+    picture.src = artifactPath(this.id, name);
+  }
+
+  /** Show a text while there is no preview. @param {string} text */
+  showNoPreview(text) {
+    if (!this.preview && !this.result) put(this.picture, h("p.quiet", text));
+  }
+
+  /**
+   * Show the scene with its colors so far.
+   *
+   * @param {any} job
+   * @param {boolean} ownScene whether its Gaussians are other ones than those of its input
+   */
+  showLive(job, ownScene) {
+    if (this.live || this.result || job.status === "succeeded") return;
+    const live = new ResultStage([job], { signal: this.leaving, live: { ownScene } });
+    if (!live.stage.viewer) return;
+    this.live = live;
+    live.stage.title = this.title;
+    const open = this.showTabs([[say.threeD, live.element], [say.preview, this.picture]]);
+    live.loading.then(() => live.original || open(1)); // this format cannot be shown in a browser
+  }
+
+  /**
+   * Show the result, in the stage that has shown the job while it ran if there is one.
+   *
+   * @param {any} job
+   * @param {boolean} hasSheet whether there is an image of views before and after
+   */
+  async finish(job, hasSheet) {
+    if (this.finishing) return;
+    this.finishing = true;
+    const { live } = this;
+    this.live = undefined;
+    await live?.loading;
+    const kept = await live?.finish(job);
+    if (!kept) live?.end();
+    if (!this.leaving.aborted) this.showResult(job, hasSheet, kept ? live : undefined);
+  }
+
+  /**
+   * @param {any} job
+   * @param {boolean} hasSheet
+   * @param {ResultStage} [kept] stage that has shown the job while it ran
+   */
+  showResult(job, hasSheet, kept) {
+    this.result = kept ?? new ResultStage([job], { signal: this.leaving });
+    this.result.stage.title = this.title;
+    const stage = h("div", this.result.element), sheet = h("figure.sheet", { hidden: true });
+    /** @type {[string, HTMLElement][]} */
+    const tabs = [[say.threeD, stage]];
+    if (hasSheet) {
+      if (this.result.stage.viewer) tabs.push([say.sheet, sheet]);
+      else tabs.unshift([say.sheet, sheet]);
+    }
+    const fillSheet = () => put(sheet, h("a", { href: artifactPath(this.id, "before_after.jpg"), target: "_blank", rel: "noopener" }, h("img", { src: artifactPath(this.id, "before_after.jpg"), alt: say.sheetOf(this.title) })));
+    this.showTabs(tabs, (body) => body === sheet && !sheet.firstChild && fillSheet(), this.compareLink(job));
+  }
+
+  /**
+   * @param {[string, HTMLElement][]} tabs titles and bodies; the first one is opened
+   * @param {(body: HTMLElement) => void} [opened] called when a tab is opened
+   * @param {HTMLElement} [beside] element beside the titles
+   * @returns {(index: number) => void} function that opens a tab
+   */
+  showTabs(tabs, opened = () => {}, beside) {
+    const inputs = tabs.map((_, i) => h("input", { type: "radio", name: `tab${this.id}`, onchange: () => open(i) }));
+    const open = (/** @type {number} */ at) => {
+      inputs[at].checked = true;
+      tabs.forEach(([, body], i) => (body.hidden = i !== at));
+      opened(tabs[at][1]);
+    };
+    const picker = h("fieldset.segments", h("legend.away", say.view3d), tabs.map(([name], i) => h("label", inputs[i], h("span", name))));
+    put(this.element, h("div.row.tabs", picker, beside), tabs.map(([, body]) => body));
+    open(0);
+    return open;
+  }
+
+  /** Create a link to compare this job with other finished runs of the same scene. @param {any} job */
+  compareLink(job) {
+    const chooser = h("select", { "aria-label": say.compareWith, hidden: true, onchange: () => chooser.value && (location.hash = `#/compare/${this.id}/${chooser.value}`) });
+    const scene = job.inputs.find((/** @type {any} */ input) => input.role === "scene")?.sha256;
+    get("v1/jobs?status=succeeded&limit=100", this.leaving).then(({ jobs }) => {
+      const others = jobs.filter((/** @type {any} */ job) => job.id !== this.id && job.inputs.some((/** @type {any} */ input) => input.role === "scene" && input.sha256 === scene));
+      chooser.hidden = !others.length;
+      const names = labels(others);
+      put(chooser, h("option", { value: "" }, `${say.compare}…`), others.map((/** @type {any} */ job, /** @type {number} */ i) => h("option", { value: job.id }, names[i])));
+    }).catch(() => {});
+    return chooser;
+  }
+
+  end() {
+    this.live?.end();
+    this.result?.end();
+  }
+}

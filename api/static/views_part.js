@@ -1,0 +1,114 @@
+// @ts-check
+/** Views of a new job: those of camera files, or an orbit around the scene, shown in the 3D view. */
+import { readCameras, ringCameras } from "./cameras.js";
+import { h, put } from "./dom.js";
+import { contentOf } from "./stored.js";
+import { UPS, uprightButtons } from "./upright.js";
+import { words } from "./words.js";
+
+/** @typedef {import("./slots.js").Slot} Slot */
+/** @typedef {import("./cameras.js").JobCamera} JobCamera */
+
+const say = words.submit;
+
+/**
+ * @param {string} group
+ * @param {string} name
+ * @param {boolean} checked
+ * @param {() => void} changed
+ */
+export function choice(group, name, checked, changed) {
+  const input = h("input", { type: "radio", name: group, checked, onchange: changed });
+  return { input, element: h("label", input, h("span", name)) };
+}
+
+export class ViewsPart {
+  /**
+   * @param {Record<"scene" | "cameras" | "photos", Slot>} slots
+   * @param {import("./stage.js").Stage} stage
+   * @param {import("./options_part.js").OptionsPart} options
+   * @param {() => void} changed called after the views have changed
+   */
+  constructor(slots, stage, options, changed) {
+    this.slots = slots;
+    this.stage = stage;
+    this.options = options;
+    this.changed = changed;
+    /** Whether the user has chosen between cameras and an orbit; otherwise the files decide. */
+    this.chosen = false;
+    /** Number of the last request to show the cameras. */
+    this.turn = 0;
+    this.around = choice("views", say.around, false, () => this.choose());
+    this.fromFiles = choice("views", say.fromFiles, true, () => this.choose());
+    this.automatic = h("p.help", say.noCameras, " ", h("button.quiet.small", { type: "button", onclick: () => slots.cameras.input.click() }, say.chooseCameras));
+    this.body = h("div.views-body");
+    this.found = h("p.quiet");
+    this.upright = uprightButtons(stage, (up) => {
+      options.controls.get("up")?.set(up);
+      this.showCameras();
+    });
+    stage.tools.prepend(this.upright);
+    options.ring.addEventListener("input", () => this.showCameras());
+    this.element = h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.body, this.found);
+  }
+
+  /** Whether the views orbit the scene. */
+  get orbiting() {
+    return this.around.input.checked;
+  }
+
+  choose() {
+    this.chosen = true;
+    this.show();
+  }
+
+  /** Follow the camera files, or their absence. */
+  filesChanged() {
+    if (this.slots.cameras.files.length) this.chosen = false;
+    this.show();
+  }
+
+  /** Show what belongs to the choice of views. Without it, a scene without cameras is orbited. */
+  show() {
+    const { scene, cameras, photos } = this.slots, { ring } = this.options, orbits = !this.chosen && scene.files.length > 0 && !cameras.files.length;
+    if (!this.chosen) (orbits ? this.around : this.fromFiles).input.checked = true;
+    put(this.body, orbits ? [this.automatic, cameras.element, ring] : this.orbiting ? [ring] : [cameras.element, photos.element]);
+    this.upright.hidden = !this.orbiting || !scene.files.length;
+    this.showCameras();
+  }
+
+  async showCameras() {
+    const { cameras: slot } = this.slots, { viewer } = this.stage, turn = ++this.turn;
+    slot.wrong("");
+    let cameras = /** @type {JobCamera[]} */ ([]), told = "";
+    if (this.orbiting) [cameras, told] = this.ringNow();
+    else if (slot.files.length) {
+      try {
+        cameras = await readCameras(await Promise.all(slot.files.map(async (file) => ({ name: file.name, blob: await contentOf(file) }))));
+        told = words.cameras.found(cameras.length);
+      } catch {
+        told = words.cameras.notReadHere;
+      }
+    }
+    if (turn !== this.turn) return;
+    this.found.textContent = told;
+    if (viewer) this.stage.setCameras(cameras, { frames: true, stand: !this.orbiting && !viewer.touched });
+    this.changed();
+  }
+
+  /** @returns {[JobCamera[], string]} */
+  ringNow() {
+    const { controls } = this.options, middle = this.stage.viewer?.sides?.left.scene.middle;
+    const count = controls.get("orbit")?.value(), number = typeof count === "number" && count >= 1 ? Math.min(count, 400) : 0;
+    const told = number ? words.cameras.ring(number) : words.cameras.ringAuto;
+    if (!middle) return [[], told];
+    const up = UPS[controls.get("up")?.value()] ?? [0, -1, 0];
+    return [ringCameras(middle, { count: number || 24, up, elevation: controls.get("elevation")?.value() ?? 10, radius: controls.get("radius")?.value() }), told];
+  }
+
+  /** Choose an orbit as in a draft. */
+  restore() {
+    this.around.input.checked = true;
+    this.chosen = this.slots.cameras.files.length > 0;
+  }
+}

@@ -1,0 +1,114 @@
+"""Tests of what precedes a job in a browser: the example, and scenes and paintings that are turned and cropped."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+from PIL import Image
+
+from sgsst_core.files.scene_file import read_scene
+from tests.api.page.actions import STEPS, Visit, choose, done, set_options, started
+from tests.api.page.browser import Watched
+from tests.api.service import Service
+
+pytestmark = pytest.mark.slow
+
+
+def test_example_is_one_click_from_a_job(visit: Visit, service: Service) -> None:
+    watched = visit()
+    page = watched.page
+    page.locator(".presets input").first.wait_for()
+    job = started(watched, service, "Try the example: a motorcycle")
+    assert [each["name"] for each in job["inputs"]] == ["motorcycle.sog", "starry_night.jpg", "cameras.json"]
+    assert job["parameters"]["preset"] == "preview"
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".badge", has_text="Canceled").wait_for()
+    page.get_by_role("button", name="Same with changes").click()
+    page.get_by_role("button", name="Remove motorcycle.sog").wait_for()
+    assert page.get_by_role("button", name="Try the example").count() == 0, "the example would replace the scene"
+    watched.check()
+
+
+def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
+    watched = visit(width=1200, height=800)
+    page = watched.page
+    choose(watched, {"scene": files["scene"], "style": files["style"]})
+    set_options(watched, orbit=3, resolution=64, **STEPS)
+    watched.settled()
+    page.get_by_role("button", name="Turn the scene by 90°").click()
+    assert page.locator("[data-name=up] select").input_value() == "-x"
+    page.get_by_role("button", name="Tip the scene by 90°").click()
+    assert page.locator("[data-name=up] select").input_value() in ("z", "-z")
+    page.get_by_role("button", name="Crop to a box").click()
+    handle = page.get_by_role("button", name="Resize +Y")
+    for _ in range(8):
+        handle.press("ArrowUp")
+        handle.press("ArrowLeft")
+    page.get_by_role("button", name="Crop to this box").click()
+    watched.settled()
+
+    job = started(watched, service)
+    up, regions = job["parameters"]["up"], job["parameters"]["regions"]
+    assert up in ("z", "-z")
+    assert [(region["name"], region["freeze"]) for region in regions] == [("inside", False), ("rest", True)]
+    low, high = np.array(regions[0]["select"].removeprefix("box=").split(","), dtype=float).reshape(2, 3)
+    out = tmp_path / "stylized.ply"
+    out.write_bytes(httpx2.get(f"{service.url}/v1/jobs/{done(service, job['id'])}/artifacts/stylized.ply").content)
+    before, after = read_scene(files["scene"]).scene, read_scene(out).scene
+    inside = ((before.means.numpy() >= low) & (before.means.numpy() <= high)).all(axis=1)
+    painted = (before.sh_dc != after.sh_dc).any(dim=1).numpy()
+    assert 0 < inside.sum() < len(inside)
+    assert painted[inside].any()
+    assert not painted[~inside].any()
+    assert np.array_equal(before.means, after.means), "the stored geometry is never turned"
+
+    page.get_by_role("button", name="Same with changes").click()
+    watched.settled()
+    crop = page.get_by_role("button", name="Crop to a box")
+    assert crop.get_attribute("aria-pressed") == "true"
+    crop.click()
+    page.get_by_role("button", name="Remove the crop").click()
+    assert crop.get_attribute("aria-pressed") == "false"
+    assert page.get_by_role("group", name="Region").count() == 0
+    watched.check()
+
+
+def test_painting_is_turned_and_cropped(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    quarters = np.zeros((40, 80, 3), dtype=np.uint8)
+    quarters[:20, 40:, 0], quarters[20:, :40, 1], quarters[20:, 40:, 2] = 200, 200, 200  # black, red, green, blue
+    Image.fromarray(quarters).save(files["style"])
+    watched = visit()
+    choose(watched, files)
+    set_options(watched, **STEPS)
+    edit(watched, files["style"].name, "Rotate right", {"Bottom %": "50"})  # green and black remain, side by side
+    job = started(watched, service)
+    sent = httpx2.get(f"{service.url}/v1/jobs/{job['id']}/inputs/style:0").content
+    with Image.open(io.BytesIO(sent)) as image:
+        assert image.size == (40, 40)
+        assert (image.getpixel((5, 20)), image.getpixel((35, 20))) == ((0, 200, 0), (0, 0, 0))
+    done(service, job["id"])
+    watched.check()
+
+
+def test_unreadable_painting_is_used_as_it_is(visit: Visit, files: dict[str, Path]) -> None:
+    painting = files["style"].with_suffix(".tiff")
+    Image.new("RGB", (64, 48)).save(painting)
+    watched = visit()
+    choose(watched, {"style": painting})
+    watched.page.get_by_role("button", name=f"Rotate or crop {painting.name}").click()
+    watched.page.get_by_text("can't be edited in this browser").wait_for()
+    watched.check()
+
+
+def edit(watched: Watched, name: str, button: str, edges: dict[str, str]) -> None:
+    """Edit a painting in its dialog."""
+    watched.page.get_by_role("button", name=f"Rotate or crop {name}").click()
+    watched.page.get_by_role("button", name=button).click()
+    for edge, value in edges.items():
+        watched.page.get_by_label(edge).fill(value)
+    watched.page.get_by_role("button", name="Use it").click()
+    watched.page.get_by_role("dialog").wait_for(state="detached")
