@@ -26,7 +26,7 @@ def take(watched: Watched, url: str, scene: Path, folder: Path) -> None:
     watched.settled()
     page.locator("details.gallery summary").click()
     page.get_by_role("button", name="Add Wheat Field").click()
-    page.get_by_role("button", name="Crop to a box").click()
+    page.get_by_role("button", name="Crop the scene").click()
     for axis, key in (("+X", "ArrowLeft"), ("-Y", "ArrowDown")):
         for _ in range(6):
             page.get_by_role("button", name=f"Resize {axis.replace('-', '−')}").press(key)

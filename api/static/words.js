@@ -126,7 +126,7 @@ export const words = {
     undo: "Undo", redo: "Redo", invert: "Invert", grow: "Grow", clear: "Clear", cancel: "Cancel", done: "Use selection",
   },
   upright: { turn: "Turn the scene by 90°", tip: "Tip the scene by 90°, toward you" },
-  crop: { crop: "Crop to a box", help: "Only what is inside the box is painted; the rest keeps its colors. Drag the handles, or use the arrow keys on them.", use: "Crop to this box", remove: "Remove the crop", inside: "inside" },
+  crop: { crop: "Crop the scene", help: "Only what is inside the box is painted; the rest keeps its colors. Drag the handles, or use the arrow keys on them.", use: "Crop to this box", remove: "Remove the crop", inside: "inside" },
   painting: {
     edit: (/** @type {string} */ name) => `Rotate or crop ${name}`, help: "Drag over the painting to keep a part of it.", left: "Rotate left", right: "Rotate right", whole: "Whole painting", use: "Use it", edges: ["Left %", "Top %", "Right %", "Bottom %"],
     unreadable: (/** @type {string} */ name) => `${name} can't be edited in this browser. You can still use it as it is.`, tooLarge: "This image is too large to edit in this browser. Use it as it is, or make it smaller first.",

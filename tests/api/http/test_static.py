@@ -64,7 +64,7 @@ def test_example_is_built_at_the_first_request(client: httpx2.Client, files: Sta
     scene.write_bytes(answer.content)
     assert len(read_scene(scene).scene) > 200_000
     assert len(client.get(f"/static/{files.digest}/example/cameras.json").json()) > 5
-    assert client.get(f"/static/{files.digest}/example/../../routes.py").status_code == 404
+    assert client.get(f"/static/{files.digest}/example/..%2F..%2Fapp.py").status_code == 404
     assert client.get(f"/static/{files.digest}/example/none").status_code == 404
     assert client.get("/static/0/example/cameras.json").status_code == 404
 
