@@ -2,7 +2,7 @@
 /**
  * Reader of GLB with KHR_gaussian_splatting, converted to rows of PLY values.
  *
- * Files with float32 attributes and without node transformations are shown, as splat-transform and sgsst write them.
+ * Nodes may move the Gaussians and scale them evenly. Files with rotated nodes or sparse values are not shown.
  */
 import { SceneError } from "./byte_reader.js";
 import { HARMONICS, OPACITY, ROTATION, SCALES, COLOR, unpacked } from "./packed.js";
@@ -12,7 +12,11 @@ import { words } from "../words.js";
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
-const EXTENSION = "KHR_gaussian_splatting", FLOAT = 5126, MAX_JSON = 1 << 20;
+const EXTENSION = "KHR_gaussian_splatting", MAX_JSON = 1 << 20, MAX_DEPTH = 64;
+/** Readers of component types: method of a DataView, bytes, and the integer that stands for 1 if integers are normalized. */
+const COMPONENTS = /** @type {Record<number, ["getInt8" | "getUint8" | "getInt16" | "getUint16" | "getFloat32", number, number]>} */ ({
+  5120: ["getInt8", 1, 127], 5121: ["getUint8", 1, 255], 5122: ["getInt16", 2, 32767], 5123: ["getUint16", 2, 65535], 5126: ["getFloat32", 4, 1],
+});
 const TYPES = /** @type {Record<string, number>} */ ({ SCALAR: 1, VEC3: 3, VEC4: 4 });
 const NAMES = ["POSITION", ...["ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"].map((name) => `${EXTENSION}:${name}`)];
 /**
@@ -39,14 +43,16 @@ export async function glb(reader) {
     data ??= new DataView((await reader.take(bytes)).buffer);
     for (let i = 0; i < some; i++) {
       while (begin + i >= first + parts[current].count) first += parts[current++].count;
-      unpack(data, parts[current].places, begin + i - first, into, i * width, coefficients);
+      unpack(data, parts[current], begin + i - first, into, i * width, coefficients);
     }
   }, rendering);
 }
 
-/** @typedef {{offset: number, stride: number}} Place place of an attribute's values in the data */
+/** @typedef {{offset: number, stride: number, value: (data: DataView, at: number, part: number) => number}} Place place of an attribute's values in the data; `value` reads a part of one */
 
-/** @typedef {{count: number, places: Place[]}} Part set of Gaussians: places of `NAMES`, then of harmonics */
+/** @typedef {{scale: number, moved: number[]}} Pose scale of a node, then its translation */
+
+/** @typedef {Pose & {count: number, places: Place[]}} Part set of Gaussians: places of `NAMES`, then of harmonics */
 
 /**
  * Return all sets of Gaussians, their largest SH degree and their render mode.
@@ -68,16 +74,39 @@ function partsOf(text, bytes) {
  */
 function partsIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
   const isSplats = (/** @type {any} */ each) => Boolean(each.extensions?.[EXTENSION]);
-  const shown = nodes.map((/** @type {any} */ node) => meshes[node.mesh]).filter((/** @type {any} */ mesh) => mesh?.primitives.some(isSplats));
-  const primitives = (shown.length ? shown : meshes).flatMap((/** @type {any} */ mesh) => mesh.primitives).filter(isSplats);
-  if (!primitives.length) throw new SceneError(words.scene.noSplats);
-  const plain = nodes.every((/** @type {any} */ node) => !node.matrix && !node.rotation && !node.scale && !node.translation);
+  /** @type {{primitives: any[], pose: Pose}[]} */
+  const shown = nodes.flatMap((/** @type {any} */ node, /** @type {number} */ i) => {
+    const primitives = meshes[node.mesh]?.primitives.filter(isSplats) ?? [];
+    return primitives.length ? [{ primitives, pose: poseOf(nodes, i) }] : [];
+  });
+  const still = meshes.map((/** @type {any} */ mesh) => ({ primitives: mesh.primitives.filter(isSplats), pose: { scale: 1, moved: [0, 0, 0] } }));
+  const used = shown.length ? shown : still, [first] = used.flatMap((/** @type {any} */ each) => each.primitives);
+  if (!first) throw new SceneError(words.scene.noSplats);
   /** @type {Part[]} */
-  const parts = primitives.map((/** @type {any} */ primitive) => partOf(primitive, accessors, bufferViews, bytes));
+  const parts = used.flatMap((/** @type {any} */ { primitives, pose }) => primitives.map((/** @type {any} */ primitive) => ({ ...pose, ...partOf(primitive, accessors, bufferViews, bytes) })));
   const count = parts.reduce((sum, part) => sum + part.count, 0);
-  if (!plain || !(count <= bytes)) throw new SceneError(words.scene.notShown("This kind of GLB"));
+  if (!(count <= bytes)) throw new SceneError(words.scene.notShown("This kind of GLB"));
   const degree = Math.max(...parts.map(({ places }) => Math.sqrt(places.length - NAMES.length + 1) - 1));
-  return { parts, degree, rendering: extrasRendering(primitives[0].extras) };
+  return { parts, degree, rendering: extrasRendering(first.extras) };
+}
+
+/**
+ * Return the pose of a node, with those of the nodes above it.
+ *
+ * @param {any[]} nodes
+ * @param {number} index
+ * @returns {Pose}
+ */
+function poseOf(nodes, index) {
+  let scale = 1, moved = [0, 0, 0];
+  for (let at = index, depth = 0; at >= 0; at = nodes.findIndex(({ children = [] }) => children.includes(at)), depth++) {
+    const { matrix, rotation = [0, 0, 0, 1], scale: [own, ...others] = [1, 1, 1], translation = [0, 0, 0] } = nodes[at];
+    const even = others.every((/** @type {number} */ other) => other === own) && own > 0;
+    if (matrix || !even || rotation.slice(0, 3).some(Boolean) || depth > MAX_DEPTH) throw new SceneError(words.scene.notShown("This kind of GLB"));
+    moved = moved.map((value, axis) => own * value + translation[axis]);
+    scale *= own;
+  }
+  return { scale, moved };
 }
 
 /**
@@ -85,7 +114,6 @@ function partsIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
  * @param {any} accessors
  * @param {any} bufferViews
  * @param {number} bytes
- * @returns {Part}
  */
 function partOf(primitive, accessors, bufferViews, bytes) {
   const names = [...NAMES];
@@ -95,39 +123,40 @@ function partOf(primitive, accessors, bufferViews, bytes) {
   }
   const count = Number(accessors[primitive.attributes.POSITION].count);
   const places = names.map((name) => {
-    const { bufferView, byteOffset = 0, componentType, type, sparse } = accessors[primitive.attributes[name]], view = bufferViews[bufferView];
-    const stride = view.byteStride ?? 4 * TYPES[type], offset = (view.byteOffset ?? 0) + byteOffset;
-    const inside = count > 0 && offset >= 0 && stride > 0 && offset + (count - 1) * stride + 4 * TYPES[type] <= bytes;
-    if (componentType !== FLOAT || sparse || !inside) throw new SceneError(words.scene.notShown("This kind of GLB"));
-    return { offset, stride };
+    const { bufferView, byteOffset = 0, componentType, type, normalized, sparse } = accessors[primitive.attributes[name]], view = bufferViews[bufferView];
+    const [method, size, largest] = COMPONENTS[componentType] ?? ["getFloat32", NaN, 1];
+    const stride = view.byteStride ?? size * TYPES[type], offset = (view.byteOffset ?? 0) + byteOffset;
+    const inside = count > 0 && offset >= 0 && stride > 0 && offset + (count - 1) * stride + size * TYPES[type] <= bytes;
+    if (sparse || !inside) throw new SceneError(words.scene.notShown("This kind of GLB"));
+    const read = (/** @type {DataView} */ data, /** @type {number} */ at, /** @type {number} */ part) => data[method](at + size * part, true);
+    return { offset, stride, value: normalized && largest > 1 ? (/** @type {DataView} */ data, /** @type {number} */ at, /** @type {number} */ part) => Math.max(read(data, at, part) / largest, -1) : read };
   });
   return { count, places };
 }
 
 /**
  * @param {DataView} data
- * @param {Place[]} places
+ * @param {Part} part
  * @param {number} i index of the Gaussian
  * @param {Float32Array} into
  * @param {number} o offset of its row
  * @param {number} coefficients number of harmonics per color channel in a row, which may be more than the part has
  */
-function unpack(data, places, i, into, o, coefficients) {
-  const [position, rotation, scale, opacity, color] = places.map(({ offset, stride }) => offset + i * stride);
-  const value = (/** @type {number} */ at, /** @type {number} */ part) => data.getFloat32(at + 4 * part, true);
+function unpack(data, { places, scale: larger, moved }, i, into, o, coefficients) {
+  const [position, rotation, scale, opacity, color] = places.map(({ offset, stride, value }) => (/** @type {number} */ axis) => value(data, offset + i * stride, axis));
   for (let axis = 0; axis < 3; axis++) {
-    into[o + axis] = value(position, axis) * (axis < 2 ? -1 : 1);
-    into[o + SCALES + axis] = Math.log(value(scale, axis));
-    into[o + COLOR + axis] = value(color, axis);
+    into[o + axis] = (larger * position(axis) + moved[axis]) * (axis < 2 ? -1 : 1);
+    into[o + SCALES + axis] = Math.log(larger * scale(axis));
+    into[o + COLOR + axis] = color(axis);
   }
-  const alpha = Math.min(Math.max(value(opacity, 0), 1e-7), 1 - 1e-7);
+  const alpha = Math.min(Math.max(opacity(0), 1e-7), 1 - 1e-7);
   into[o + OPACITY] = Math.log(alpha / (1 - alpha));
-  into[o + ROTATION] = -value(rotation, 2);
-  into[o + ROTATION + 1] = -value(rotation, 1);
-  into[o + ROTATION + 2] = value(rotation, 0);
-  into[o + ROTATION + 3] = value(rotation, 3);
+  into[o + ROTATION] = -rotation(2);
+  into[o + ROTATION + 1] = -rotation(1);
+  into[o + ROTATION + 2] = rotation(0);
+  into[o + ROTATION + 3] = rotation(3);
   for (let n = 0; n < places.length - NAMES.length; n++) {
-    const { offset, stride } = places[NAMES.length + n];
-    for (let c = 0; c < 3; c++) into[o + HARMONICS + c * coefficients + n] = ROTATED[n] * value(offset + i * stride, c);
+    const { offset, stride, value } = places[NAMES.length + n];
+    for (let c = 0; c < 3; c++) into[o + HARMONICS + c * coefficients + n] = ROTATED[n] * value(data, offset + i * stride, c);
   }
 }

@@ -131,6 +131,48 @@ def test_glb_of_several_sets_and_spz_without_gzip_are_shown(visit: Visit, tmp_pa
     assert_shown_like(watched, tmp_path, ply, differs=True)
 
 
+def test_quantized_and_moved_glb_is_shown(visit: Visit, tmp_path: Path) -> None:
+    ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
+    write_scene(ply, dust(), by_name("glb"))
+    ply.write_bytes(quantized(ply.read_bytes()))
+    assert len(read_scene(ply).scene) == 616
+    assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=False)
+
+
+def quantized(data: bytes) -> bytes:
+    """Return a GLB with normalized positions of 16 bits, in a node below another one; both move and scale them."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    document, binary = json.loads(data[20 : 20 + size]), bytearray(data[20 + size + 8 :])
+    (primitive,) = document["meshes"][0]["primitives"]
+    entry = document["accessors"][primitive["attributes"]["POSITION"]]
+    view = document["bufferViews"][entry["bufferView"]]
+    start, stride = view.get("byteOffset", 0) + entry.get("byteOffset", 0), view.get("byteStride", 12)
+    rows = [struct.unpack_from("<3f", binary, start + i * stride) for i in range(entry["count"])]
+    for i, row in enumerate(rows):
+        struct.pack_into("<3h", binary, start + i * stride, *(round(32767 * (value - 0.5) / 8) for value in row))
+    entry |= {"componentType": 5122, "normalized": True}
+    for name in ("min", "max"):
+        entry.pop(name, None)
+    view["byteStride"] = stride
+    scales = document["accessors"][primitive["attributes"]["KHR_gaussian_splatting:SCALE"]]
+    place = document["bufferViews"][scales["bufferView"]]
+    start, stride = place.get("byteOffset", 0) + scales.get("byteOffset", 0), place.get("byteStride", 12)
+    for i in range(entry["count"]):
+        values = struct.unpack_from("<3f", binary, start + i * stride)
+        struct.pack_into("<3f", binary, start + i * stride, *(value / 8 for value in values))
+    mesh = {"mesh": 0, "scale": [4, 4, 4], "translation": [0, 0, 0.25]}
+    document["nodes"] = [{"children": [1], "scale": [2, 2, 2], "translation": [0.5, 0.5, 0]}, mesh]
+    document["scenes"] = [{"nodes": [0]}]
+    return as_glb(document, bytes(binary))
+
+
+def as_glb(document: dict[str, Any], binary: bytes) -> bytes:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
+    return head + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+
+
 def with_two_sets(data: bytes) -> bytes:
     """Return a GLB of one set of Gaussians as one of two sets: the first 300, and the others."""
     size = struct.unpack_from("<I", data, 12)[0]
