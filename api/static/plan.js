@@ -5,8 +5,14 @@ import { count, seconds, size, words } from "./words.js";
 
 const say = words.plan;
 
-/** @param {any} view answer to a dry run */
-export function costCard(view) {
+/** Seconds above which something faster is offered. */
+const LONG = 3600;
+
+/**
+ * @param {any} view answer to a dry run
+ * @param {(() => void) | null} [hurry] called when the user prefers a time budget to a long job; null offers none
+ */
+export function costCard(view, hurry = null) {
   const figure = (/** @type {string} */ name, /** @type {string} */ value, note = "") => h("div", h("dt", name), h("dd", value, note && h("small", note)));
   return h("section.card.cost", { "aria-label": say.title }, h("h2", say.title),
     warnings(view.warnings),
@@ -17,6 +23,7 @@ export function costCard(view) {
       view.workers === null ? null : figure(say.workers, String(view.workers)),
       figure(say.gaussians, count(view.gaussians), view.dropped ? say.dropped(view.dropped) : ""),
       figure(say.views, count(view.views), say.pixels(view.pixels))),
+    hurry && view.total_seconds > LONG ? h("div.row.faster", h("span", say.long), h("button.primary.small", { type: "button", onclick: hurry }, say.faster)) : null,
     h("details.fold", h("summary", say.decided), decisions(view.plan?.decisions ?? [])));
 }
 

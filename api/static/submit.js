@@ -19,9 +19,9 @@ import { SelectPanel } from "./select_panel.js";
 import { oneModel, Slot } from "./slots.js";
 import { Stage } from "./stage.js";
 import { Submission } from "./submission.js";
-import { forgetUnfinished, unfinished } from "./uploads.js";
+import { UnfinishedNotice } from "./unfinished.js";
 import { ViewsPart } from "./views_part.js";
-import { percent, size, words } from "./words.js";
+import { words } from "./words.js";
 
 /** @typedef {import("./stored.js").Chosen} Chosen */
 
@@ -40,6 +40,7 @@ export class SubmitView {
     };
     this.stage = new Stage();
     this.draft = keptDraft();
+    this.unfinished = new UnfinishedNotice(() => Object.values(this.slots).flatMap(({ files }) => files));
     this.leaving = new AbortController();
     this.created = false;
     /** What the service is asked to do. @type {false | "planning" | "starting"} */
@@ -71,10 +72,9 @@ export class SubmitView {
     this.costButton = h("button.quiet", { type: "button", onclick: () => this.act(true) }, say.cost);
     this.startButton = h("button.primary", { type: "submit" }, say.start);
     this.result = h("div.result", { "aria-live": "polite" });
-    this.notice = h("div.notice", { hidden: true });
     this.unused = h("p.wrong.block", { hidden: true, role: "alert" });
     this.form = h("form.panel", { noValidate: true, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.act(false)) },
-      h("header", h("h1", say.heading), h("p.lead", say.lead)), this.notice, this.name.element,
+      h("header", h("h1", say.heading), h("p.lead", say.lead)), this.unfinished.element, this.name.element,
       h("section", h("h2", say.files), this.unused, slots.scene.element, this.paintings.elements),
       this.views.element,
       h("section", h("h2", say.essentials), options.presets, options.main),
@@ -82,7 +82,7 @@ export class SubmitView {
       h("div.actions", this.refusals.element, submission.card.element, h("div.row", this.costButton, this.startButton)), this.result);
     this.element = h("div.split", h("div.pinned", this.stage.element), this.form);
     this.views.show();
-    this.showUnfinished();
+    this.unfinished.show();
   }
 
   restoreFiles() {
@@ -119,17 +119,6 @@ export class SubmitView {
       /** @type {HTMLElement} */ (row.element.querySelector(".handmade button")).focus();
     });
     row.wrong(opened ? "" : words.select.notLoaded);
-  }
-
-  showUnfinished() {
-    const chosen = Object.values(this.slots).flatMap(({ files }) => files).filter((file) => file instanceof File);
-    const isOf = (/** @type {File} */ file, /** @type {any} */ { size, modified }) => file.size === size && file.lastModified === modified;
-    const first = unfinished().find((upload) => chosen.every((file) => file.name !== upload.name || isOf(file, upload)));
-    this.notice.hidden = !first;
-    if (!first) return;
-    const again = chosen.some(({ name }) => name === first.name), share = percent(first.sent / first.size);
-    put(this.notice, h("p", again ? say.resumed(first.name, share) : say.resumable(first.name, size(first.size), share)),
-      h("button.quiet", { type: "button", onclick: () => (forgetUnfinished(), this.showUnfinished()) }, say.forget));
   }
 
   saveDraft() {
@@ -200,7 +189,7 @@ export class SubmitView {
     this.name.suggest(defaultName(scene, this.paintings.own.map(({ name }) => name)));
     this.stage.title = this.name.value() ?? defaultName(scene, []);
     this.clearWrong();
-    this.showUnfinished();
+    this.unfinished.show();
     if (this.options.schema) this.saveDraft();
   }
 
@@ -273,8 +262,14 @@ export class SubmitView {
     if (!plan) return;
     const { jobs } = this.paintings;
     this.options.showTimes(body, plan);
-    put(this.result, costCard(plan), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
+    put(this.result, costCard(plan, this.options.controls.has("within") ? () => this.hurry() : null), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
     this.result.scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
+  }
+
+  /** Plan the job again, with a time budget. */
+  hurry() {
+    this.options.restore({ within: 600 }, undefined);
+    this.act(true);
   }
 
   /** Open the view of created jobs. @param {any[]} jobs */

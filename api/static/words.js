@@ -171,6 +171,7 @@ export const words = {
   plan: {
     title: "Estimate", decided: "How it will run", ran: "How it ran", seconds: "Estimated time", wholeJob: "for the whole job, once it starts", memory: "Memory", gpuMemory: "GPU memory", workers: "Workers", gaussians: "Gaussians", views: "Views",
     items: /** @type {Record<string, string>} */ ({ "second forward": "Second pass of the network", "uncovered pixels": "Empty parts of the views", "unseen Gaussians": "Gaussians that no view shows" }),
+    long: "Shall it be faster?", faster: "As good as it gets in 10 minutes",
     unknown: "unknown", dropped: (/** @type {number} */ n) => `${count(n)} left out`, pixels: (/** @type {number} */ n) => `${hundredths.format(n / 1e6)} megapixels`,
     none: "Nothing was left out.",
   },
