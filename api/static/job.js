@@ -24,7 +24,7 @@ const AGAIN = 3000;
 const ELSEWHERE = 5000;
 
 /** Reasons of an early end after which a job can be continued. */
-const CONTINUABLE = ["max-seconds", "within", "on-request"];
+const CONTINUABLE = ["within", "on-request"];
 
 /** Open the view of the same job again, whose result is out of date. */
 const reopen = () => void dispatchEvent(new HashChangeEvent("hashchange"));

@@ -205,3 +205,18 @@ def test_estimate_warns_and_can_be_stopped(visit: Visit, files: dict[str, Path])
     cost.get_by_role("alert").get_by_text("region empty: ignored, because it has no Gaussians").wait_for()
     cost.get_by_text("for the whole job").wait_for()
     watched.check("net::ERR")
+
+
+def test_ten_minutes_are_offered_for_a_long_job(visit: Visit, files: dict[str, Path]) -> None:
+    watched = visit()
+    page = watched.page
+    choose(watched, files)
+    set_options(watched, steps_sos=10_000_000, measure=0, backbone="vgg16")
+    page.get_by_role("button", name="Estimate time").click()
+    page.get_by_role("region", name="Estimate").get_by_text("Shall it be faster?").wait_for()
+    with page.expect_request(lambda request: request.url.endswith("dry_run=true")) as asked:
+        page.get_by_role("button", name="As good as it gets in 10 minutes").click()
+    assert asked.value.post_data_json["parameters"]["within"] == 600
+    page.get_by_role("region", name="Estimate").wait_for()
+    assert page.locator("[data-name=within] input").input_value() == "600"
+    watched.check()
