@@ -302,7 +302,7 @@ def _as_kernels(counted: Counted) -> AbstractContextManager[Any]:
 
     stack = ExitStack()
     stack.enter_context(mock.patch.multiple(vgg, max_pool=pool, max_pool_backward=pool_backward))
-    kernels = {"has_kernels": lambda weight: weight.element_size() == 2, "convolve_pixels": convolve}
+    kernels: dict[str, Any] = {"has_kernels": lambda weight: weight.element_size() == 2, "convolve_pixels": convolve}
     stack.enter_context(mock.patch.multiple(first_layer, pixel_gradient=gradient, **kernels))
     return stack
 

@@ -194,11 +194,12 @@ KERNELS: dict[str, Target] = {
     **{
         f"{kernel.__name__}_{form}": Target(
             kernel,
-            {"CHANNELS": _WIDEST, "BLOCK": _WIDEST, "P": CONTENT_POSITIONS, "WEIGHTED": True, **more},
+            {"CHANNELS": _WIDEST, "BLOCK": _WIDEST, "P": CONTENT_POSITIONS, "WEIGHTED": True}
+            | ({"RELU": True} if kernel is content_kernels.add_content_gradient else {}),
             4,
             dict.fromkeys(("features", "content", "gradient"), types) | {"sums": "*fp32", "factor": "*fp64"},
         )
-        for kernel, more in ((content_kernels.content_sums, {}), (content_kernels.add_content_gradient, {"RELU": True}))
+        for kernel in (content_kernels.content_sums, content_kernels.add_content_gradient)
         for form, types in (("float32", "*fp32"), ("bfloat16", "*bf16"))
     },
     **{
