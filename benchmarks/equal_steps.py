@@ -2,12 +2,14 @@
 
 python -m benchmarks.equal_steps SCENE CAMERAS|orbit:N STYLE NAME 'ROW={"content_weight": 3000}' 'ROW=...'
 
-Each row is a JSON object of settings that override the standard preset. The additional setting `factor` scales VGG16's
-features: a number scales all layers (1 = unchanged), an object individual layers ({"relu1_1": 16, "relu2_1": 8}). A
-layer without a factor takes that of the previous layer. Results are added to benchmarks/results/equal_steps.json, under
-NAME. With several seeds, figures are means, and "spread" is the largest difference between two seeds. "sliced" is the
-sliced Wasserstein distance between the colors of pixels and style, in 8-bit levels; no loss term and no color
-initialization optimizes it.
+Each row is a JSON object of settings that override the standard preset, in float32 unless it says otherwise. The
+additional setting `factor` scales VGG16's features: a number scales all layers (1 = unchanged), an object individual
+layers ({"relu1_1": 16, "relu2_1": 8}). A layer without a factor takes that of the previous layer. The additional
+setting `rounded` emulates a GPU: a float32 network rounds as in "tf32" or "float16". Results are added to
+benchmarks/results/equal_steps.json, under NAME. With several seeds, figures are means, and "spread" is the largest
+difference between two seeds. "loss" is the float32 loss of the job's own views, relative to the unstylized scene.
+"sliced" is the sliced Wasserstein distance between the colors of pixels and style, in 8-bit levels; no loss term and no
+color initialization optimizes it.
 
 With --region SPEC, the cameras are those that show the region. The additional setting `region_content_weight` is its
 own content weight, and "region_content" is "content" over its pixels alone, on black.
@@ -18,8 +20,10 @@ from __future__ import annotations
 import json
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 
@@ -30,6 +34,8 @@ from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.loss.feature_scale import with_scales
+from sgsst_core.loss.scale_weights import EVEN
+from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.measure import make_judge, make_novel_views
@@ -38,10 +44,12 @@ from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
+from tests.rounding import RoundedToFloat16, RoundedToTf32
 from worker.region_requests import parse_selection
 from worker.selecting import select
 
 COLUMNS = (
+    "loss",
     "style",
     "interior_style",
     "sliced_features",
@@ -56,6 +64,8 @@ COLUMNS = (
 DIRECTIONS, QUANTILES = 64, 1024
 #: Minimum fraction of a view's pixels that must belong to the region of `--region`.
 LEAST_REGION = 0.01
+#: Networks of the setting `rounded`.
+ROUNDED = {"tf32": RoundedToTf32, "float16": RoundedToFloat16}
 
 
 def main() -> None:
@@ -83,7 +93,8 @@ def main() -> None:
     description |= {"resolution": arguments.resolution, "steps": [arguments.steps_coarse, arguments.steps_sos]}
     description |= {"settings": json.loads(arguments.settings)}
     description |= {"region": arguments.region} if region else {}
-    judge, wanted = _judge(scene, cameras, style, base), quantiles(style, torch.ones(style.shape[:2]))
+    judge, exact = _judge(scene, cameras, style, base)
+    wanted = quantiles(style, torch.ones(style.shape[:2]))
     rows = {name: json.loads(text or "{}") for name, _, text in (row.partition("=") for row in arguments.rows)}
 
     def run(row: str, seed: int) -> tuple[torch.Tensor, dict[str, float]]:
@@ -91,8 +102,13 @@ def main() -> None:
         own = values.pop("region_content_weight", None)
         regions = region.regions(own) if region and own is not None else None
         colors, seconds = _run(scene, cameras, style, values, regions)
-        return colors, {**_judged(judge, colors, wanted, region), "seconds": seconds}
+        return colors, {"loss": loss(colors) / start, **_judged(judge, colors, wanted, region), "seconds": seconds}
 
+    def loss(colors: torch.Tensor) -> float:
+        terms = exact.evaluate(exact.views.covered, colors)
+        return EVEN.mean({scale: each.total for scale, each in terms.items()})
+
+    start = loss(scene.sh_dc)
     unstylized = scene.sh_dc, _judged(judge, scene.sh_dc, wanted, region)
     colors = compare_rows(
         "equal_steps", arguments.name, description, COLUMNS, unstylized, list(rows), arguments.seeds, run
@@ -134,10 +150,13 @@ class JudgedRegion:
         return distance / pixels
 
 
-def _judge(scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]) -> Judge:
-    """Return a judge of the novel views between a job's views."""
-    stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings))
-    return make_judge(stylizer, make_novel_views(stylizer), Lpips())
+def _judge(
+    scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]
+) -> tuple[Judge, Float32Reference]:
+    """Return a judge of the novel views between a job's views, and the exact loss of its views."""
+    values = {"precision": "float32", **settings}
+    stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **values), weights=_weights(None))
+    return make_judge(stylizer, make_novel_views(stylizer), Lpips()), Float32Reference(stylizer)
 
 
 def _judged(judge: Judge, sh_dc: torch.Tensor, wanted: torch.Tensor, region: JudgedRegion | None) -> dict[str, float]:
@@ -174,8 +193,10 @@ def _run(
 ) -> tuple[torch.Tensor, float]:
     """Run a job, and return its colors [N, 3] and the CPU seconds of its steps."""
     weights = _weights(values.pop("factor", None))
-    settings = make_settings("standard", **values)
-    stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, regions=regions)
+    network = ROUNDED.get(values.pop("rounded", None))
+    settings = make_settings("standard", **{"precision": "float32", **values})
+    with mock.patch("sgsst_core.planning.context.FeatureNetwork", network) if network else nullcontext():
+        stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, regions=regions)
     before = time.process_time()
     for _ in range(stylizer.job.total_steps):
         stylizer.run_step()

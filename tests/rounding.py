@@ -1,4 +1,4 @@
-"""Emulation of NVIDIA's TF32 on a CPU: factors are rounded to 10 mantissa bits, products are summed in float32."""
+"""Emulation of a GPU's TF32 and float16 on a CPU: factors are rounded, products are summed in float32."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class RoundedToTf32(FeatureNetwork):
             of the rounded network itself.
     """
 
-    def __init__(self, *arguments: Any, decisions: FeatureNetwork | None = None) -> None:
-        super().__init__(*arguments, tf32=True)
+    def __init__(self, *arguments: Any, decisions: FeatureNetwork | None = None, tf32: bool = True) -> None:
+        super().__init__(*arguments, tf32=tf32)
         self._decisions = decisions
 
     def forward(self, rgb: Tensor, *, cache: bool = True, until: str | None = None) -> Activations:
@@ -45,3 +45,29 @@ class RoundedToTf32(FeatureNetwork):
 
     def _convolve_back(self, gradient: Tensor, step: vgg._Convolution) -> Tensor:
         return super()._convolve_back(to_tf32(gradient), replace(step, backward_weight=to_tf32(step.backward_weight)))
+
+
+class RoundedToFloat16(FeatureNetwork):
+    """Float32 network that rounds weights, features and gradients as one in float16 does, with the same powers of two.
+
+    Attributes:
+        feature_unit: Feature that float16 holds as 1.
+        gradient_unit: Gradient with respect to a feature that float16 holds as 1.
+    """
+
+    feature_unit, gradient_unit = 2.0**6, 2.0**16
+
+    def _convolve(self, x: Tensor, step: vgg._Convolution) -> Tensor:
+        unit = self.feature_unit
+        rounded = replace(step, weight=to_float16(step.weight), bias=to_float16(step.bias, unit))
+        return to_float16(super()._convolve(to_float16(x, unit), rounded), unit)
+
+    def _convolve_back(self, gradient: Tensor, step: vgg._Convolution) -> Tensor:
+        unit = self.gradient_unit
+        rounded = replace(step, backward_weight=to_float16(step.backward_weight))
+        return to_float16(super()._convolve_back(to_float16(gradient, unit), rounded), unit)
+
+
+def to_float16(values: Tensor, unit: float = 1.0) -> Tensor:
+    """Round float32 values, divided by a unit, to float16."""
+    return (values / unit).half().float() * unit

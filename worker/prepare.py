@@ -137,6 +137,8 @@ def prepare(
             refinement = refinement if known else _refine(inputs, settings, weights, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     plan = _usable_plan(known, collectives)
+    if known and not plan and known.plan.device == common_device(collectives):
+        settings = settings.model_copy(update={"precision": known.plan.precision})  # a job has one precision
     planned_ranks = known.ranks if known and plan else collectives.size
     stylization = _planner(inputs, asked, weights, scene_file.scene, refinement, chosen)(
         plan=plan,

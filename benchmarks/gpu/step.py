@@ -10,7 +10,7 @@ from benchmarks.gpu.part import QUICK, Findings, Sizes, device
 from sgsst_core.bench.synthetic import surface_scene, texture, views
 from sgsst_core.budget import peak_memory
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import Precision, make_settings
+from sgsst_core.settings import PlannedPrecision, make_settings
 from sgsst_core.stylizing.loop import Callbacks
 from sgsst_core.stylizing.loop import run as run_steps
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -23,14 +23,17 @@ ZOOM = 2.1
 
 def run(sizes: Sizes, findings: Findings) -> None:
     """Measure all sizes; on a GPU in all precisions, the fastest first."""
-    precisions: tuple[Precision, ...] = ("bfloat16", "float32", "tf32") if device().type == "cuda" else ("float32",)
+    every: tuple[PlannedPrecision, ...] = ("bfloat16", "float16", "float32", "tf32")
+    precisions = every if device().type == "cuda" else ("float32",)
     for width, height, gaussians in sizes.steps:
         scene = surface_scene(gaussians, degree=3)
         for precision in precisions:
             _measure(sizes, scene, (width, height), precision, findings)
 
 
-def _measure(sizes: Sizes, scene: Scene, size: tuple[int, int], precision: Precision, findings: Findings) -> None:
+def _measure(
+    sizes: Sizes, scene: Scene, size: tuple[int, int], precision: PlannedPrecision, findings: Findings
+) -> None:
     width, height = size
     place = f"{width}x{height}/{precision}"
     forget_peak(device())

@@ -251,15 +251,21 @@ def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:
 
 
 def _precision(device: torch.device) -> Diagnosis:
-    from sgsst_core.features.vgg import has_bfloat16, has_tf32
+    from sgsst_core.features.vgg import has_bfloat16, has_float16, has_tf32
     from sgsst_core.planning.context import convolution_ratio
+    from sgsst_core.settings import PlannedPrecision
 
     kind: Literal["cpu", "cuda"] = "cuda" if device.type == "cuda" else "cpu"
-    texts = []
-    if has_tf32(device):
-        texts.append(f"TF32 convolutions are {convolution_ratio('tf32', kind):.1f} times as fast as float32")
-    if has_bfloat16(device):
-        texts.append(f"bfloat16 convolutions are {convolution_ratio('bfloat16', kind):.1f} times as fast as float32")
+    has: dict[PlannedPrecision, bool] = {
+        "tf32": has_tf32(device),
+        "float16": has_float16(device),
+        "bfloat16": has_bfloat16(device),
+    }
+    texts = [
+        f"{name.replace('tf', 'TF')} convolutions are {convolution_ratio(name, kind):.1f} times as fast as float32"
+        for name in has
+        if has[name]
+    ]
     return Diagnosis("precision", "works", "; ".join(texts) or "float32 only")
 
 

@@ -104,6 +104,7 @@ VARIANTS = {
             "standard; colors that fall below 0 stay there",
             settings={"clamp_aware_gradient": False},
         ),
+        Variant("float32", "standard with features in float32", {"precision": "float32"}),
         Variant("bfloat16", "standard with features in bfloat16", {"precision": "bfloat16"}),
         Variant("tf32", "standard with TF32 convolutions", {"precision": "tf32"}),
         Variant("half-weights", "standard with blend weights in half precision", {"cached_weights": "half"}),
@@ -217,7 +218,7 @@ def _prepared(
     """
     settings = base.model_copy(update=variant.settings)
     stylizer = Stylizer.planned(*inputs, settings, weights=weights)
-    if settings.precision != stylizer.job.network.precision:
+    if settings.precision not in ("auto", stylizer.job.network.precision):
         reason = next(d.reason for d in stylizer.job.plan.decisions if d.item == "precision")
         return Curve(variant, [], left_out=reason), None
     started = time.perf_counter()

@@ -291,9 +291,9 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     """Compute `layer_statistics` on a GPU in four launches, without a temporary tensor as large as the features.
 
     Moments are summed in float32 about a shift, the mean of some rows, which only has to be close to the true mean. In
-    bfloat16, they are summed about 0, and position weights are rounded to bfloat16 (see `shifted_moments`).
+    16 bits, they are summed about 0, and position weights are rounded likewise (see `shifted_moments`).
 
-    Features are float32 or bfloat16 with contiguous channels, and c is below 16 or a power of two.
+    Features are float32, bfloat16 or float16 with contiguous channels, and c is below 16 or a power of two.
     """
     from sgsst_core.features import statistics_kernels as kernels
 
@@ -302,7 +302,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
     span, tile = span_positions(positions, channels), block_of_channels(channels, TILE)
     block = block_of_positions(POSITIONS[features.element_size()])
     shift = None
-    if features.dtype != torch.bfloat16:
+    if features.dtype == torch.float32:
         shift = features[:: max(1, height // _SHIFT_ROWS)].mean(dim=(0, 1))
     sums = torch.empty((-(-positions // span), channels**2 + channels + 1), device=device)
     weights = features if position_weights is None else position_weights

@@ -47,10 +47,13 @@ def load_weights(weights, row_step, column_step, width, position, there, dtype: 
 
 
 @triton.jit
-def halves(x):
-    """Return the two bfloat16 numbers whose sum is closest to a float32 number. Together they have 16 bits."""
-    high = x.to(tl.bfloat16)
-    return high, (x - high.to(tl.float32)).to(tl.bfloat16)
+def halves(x, dtype: tl.constexpr):
+    """Return the two 16-bit numbers whose sum is closest to a float32 number.
+
+    Together they have 16 bits in bfloat16, and 22 in float16.
+    """
+    high = x.to(dtype)
+    return high, (x - high.to(tl.float32)).to(dtype)
 
 
 @triton.jit
@@ -68,11 +71,11 @@ def add_block(
     )
     left = load_features(features, cell, own, there, CHANNELS, TILE)
     right = left if CHANNELS <= TILE else load_features(features, cell, other, there, CHANNELS, TILE)
-    if features.dtype.element_ty == tl.bfloat16:
+    if features.dtype.element_ty != tl.float32:
         scaled = left.to(tl.float32)
         if WEIGHTED:
             scaled *= a[:, None]
-            high, low = halves(scaled)
+            high, low = halves(scaled, features.dtype.element_ty)
             second = tl.dot(tl.trans(high), right, tl.dot(tl.trans(low), right, second))
         else:
             second = tl.dot(tl.trans(left), right, second)
@@ -93,14 +96,14 @@ def shifted_moments(
     Only blocks on and above the diagonal are computed. Second moments are accumulated over PARTS * P positions at a
     time, so that no float32 chain is long. Below, a_p is a position weight and x_p = F_p - shift.
 
-    In bfloat16 there is no shift: a product of two features, or of a feature and a rounded weight, has 16 bits, so that
-    sums of products are nearly exact in float32. After cancellation, their error is less than that of rounded
-    features.
+    In 16 bits there is no shift: a product of two features, or of a feature and a rounded weight, has 16 bits (22 in
+    float16), so that sums of products are nearly exact in float32. After cancellation, their error is less than that of
+    rounded features.
 
     Args:
-        features: [h, width, CHANNELS], float32 or bfloat16.
+        features: [h, width, CHANNELS], float32, bfloat16 or float16.
         weights: Position weights [h, width]; ignored if WEIGHTED is false.
-        shift: [CHANNELS] float32; None if the features are bfloat16.
+        shift: [CHANNELS] float32; None if the features have 16 bits.
         sums: Output [spans, CHANNELS^2 + CHANNELS + 1] float32: the sum of a_p x_p x_p^T, of a_p x_p, and of a_p.
             Entries of lower blocks are not written.
         positions: Number of positions, h * width.

@@ -40,6 +40,10 @@ HALO = {"vgg16": 64, "vgg19": 80}
 ALIGNMENT = 16
 #: PyTorch's cuDNN settings. Untyped, because the type stubs lack the newer attributes.
 _CUDNN: Any = torch.backends.cudnn
+#: Unit of float16 features, which reach 43,000 in units of a 0-255 input, and factor of gradients with respect to
+#: features of such an input. Gradients grow with the inverse of a view's covered pixels: at 240x180, they reach 8e5 and
+#: have a root mean square of 1e4.
+FLOAT16_FEATURES, FLOAT16_GRADIENTS = 2.0**6, 2.0**-16
 #: Relative rounding error of TF32 multiplication, the counterpart of `torch.finfo(...).eps`.
 _TF32_EPS = 2.0**-10
 #: Number of values from which a tensor overflows 32-bit indices. cuDNN's fused convolution has no fallback, and other
@@ -116,6 +120,11 @@ def has_tf32(device: torch.device | str) -> bool:
     return _is_nvidia(device) and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
+def has_float16(device: torch.device | str) -> bool:
+    """Return whether a network may run in float16 on a device: the GPUs that support TF32 too."""
+    return has_tf32(device)
+
+
 def has_bfloat16(device: torch.device | str) -> bool:
     """Return whether a device computes in bfloat16, as all do but NVIDIA GPUs below compute capability 8.0.
 
@@ -166,7 +175,7 @@ class FeatureNetwork:
         weights: Convolutions and input normalization, with features in units of a 0-255 input.
         layers: Layers to report (for instance `STYLE_LAYERS` and `CONTENT_LAYER`), at least one of them a convolution.
             The network ends at the deepest of them.
-        dtype: torch.float32, torch.float64 (reference) or torch.bfloat16.
+        dtype: torch.float32, torch.float64 (reference), torch.bfloat16 or torch.float16.
         tf32: Whether convolutions of a float32 network round their factors to the 10-bit mantissa of TF32. Only NVIDIA
             GPUs do this.
 
@@ -174,6 +183,10 @@ class FeatureNetwork:
         unit: Factor of the content layer's features relative to the units of a 0-255 input.
         pixel_weight: Weight of the terms of `PIXELS`: the layer's factor squared. The features of `PIXELS` are not
             multiplied by this factor.
+        feature_unit: Unit of the features of all layers but `PIXELS`: a power of two in float16, whose range ends at
+            65504, and otherwise 1. A ReLU network is homogeneous, so that dividing its input and its biases divides
+            its features.
+        loss_factor: Factor of a loss whose gradient with respect to such features float16 can represent; otherwise 1.
     """
 
     def __init__(
@@ -197,8 +210,11 @@ class FeatureNetwork:
         # Map from pixels to the values that the first convolution reads. In bfloat16, each of the 256 gray levels would
         # be rounded twice.
         precision = torch.promote_types(dtype, torch.float32)
-        self._scale = weights.input_scale.to(self.device, precision)
-        self._shift = weights.input_shift.to(self.device, precision)
+        half = dtype == torch.float16
+        self.feature_unit = FLOAT16_FEATURES if half else 1.0
+        self.loss_factor = FLOAT16_GRADIENTS / FLOAT16_FEATURES if half else 1.0
+        self._scale = weights.input_scale.to(self.device, precision) / self.feature_unit
+        self._shift = weights.input_shift.to(self.device, precision) / self.feature_unit
         self._gray = weights.gray
         self._steps = self._build(weights)
         self._fuse()
@@ -219,7 +235,7 @@ class FeatureNetwork:
                     _Convolution(
                         f"relu{block}_{index}",
                         weight.contiguous(memory_format=torch.channels_last),
-                        bias.to(self.device, self.dtype),
+                        (bias / self.feature_unit).to(self.device, self.dtype),
                         weight.transpose(0, 1).flip(2, 3).contiguous(memory_format=torch.channels_last),
                     )
                 )

@@ -100,7 +100,9 @@ class ContentTerm(PositionTerm):
         if inputs.content is None:
             return None
         count = inputs.view.count(CONTENT_LAYER, inputs.coverage)
-        factor = content_factor(count, inputs.network.channels(CONTENT_LAYER), inputs.objective.content_weight)
+        network = inputs.network
+        weight = inputs.objective.content_weight * network.feature_unit**2 * network.loss_factor
+        factor = content_factor(count, network.channels(CONTENT_LAYER), weight)
         weights = inputs.coverage if inputs.content_weights is None else inputs.content_weights
         return cls(inputs.view, inputs.content, weights, factor)
 

@@ -223,7 +223,7 @@ class NearestTerm(PositionTerm):
         for style in inputs.regions if layers else ():
             if style.vectors is not None:
                 count = inputs.view.count(layers[0], style.positions)
-                weight = style.weight * nearest_weight(inputs.objective.style_loss, network.unit)
+                weight = style.weight * nearest_weight(inputs.objective.style_loss, network.unit) * network.loss_factor
                 factor = weight / torch.where(count > 0, count, torch.inf)
                 regions.append((style.vectors, factor, style.positions))
         return cls(inputs.view, layers[0], network.rounding, inputs.timer, regions) if regions else None

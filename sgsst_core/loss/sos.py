@@ -126,6 +126,10 @@ class SosLoss:
         )
         self._compared = compared_layers(style_loss, network)
 
+    def use(self, network: FeatureNetwork) -> None:
+        """Use another network with the same layers, and activations of the same size. Compute all targets again."""
+        self.network = self.targets.network = network
+
     def halve_memory(self, pixels: int) -> None:
         """Halve the memory budget for activations, after reducing it to what views of at most `pixels` pixels need."""
         held = min(self.tiling.held, pixels * (1 + self.tiling.working)) / 2
@@ -162,8 +166,11 @@ class SosLoss:
             values |= {pass_.view.scale: pass_.values for pass_ in passes}
             gradients = self._backward(passes, cached) if gradient else []
             for pass_, pixel_gradient in zip(passes, gradients, strict=gradient):
-                images.add_gradient(pass_.view.scale, pixel_gradient, weights[pass_.view.scale])
+                fraction = weights[pass_.view.scale] / self.network.loss_factor
+                images.add_gradient(pass_.view.scale, pixel_gradient, fraction)
         stacked = torch.stack(list(values.values()))
+        if self.network.loss_factor != 1:
+            stacked = stacked / self.network.loss_factor
         return SosResult(tuple(values), stacked, images.gradient() if gradient else None, self.weights)
 
     def _division(self, view: ViewTarget, sizes: Mapping[int, Size]) -> Division:

@@ -46,6 +46,8 @@ GRAM_WEIGHT = 1e3
 MEAN_WEIGHT = 1e4
 #: w_s.
 STD_WEIGHT = 1e4
+#: Factor of the matrix of a `SplitGradient`: in float16, large views have entries below its normal numbers.
+SPLIT_UNITS = {torch.bfloat16: 1.0, torch.float16: 2.0**10}
 #: Positions per program of the gradient kernel.
 POSITIONS = 64
 #: Channels per step of that kernel, by bytes per feature. More would cause register spilling.
@@ -76,26 +78,32 @@ def statistics_layers(style_loss: StyleLossName, weights: BackboneWeights) -> tu
     return (PIXELS, *STYLE_LAYERS) if PIXELS in weights.scales else STYLE_LAYERS
 
 
-def term_weights(layer: str, pixel_weight: float) -> TermWeights:
+def term_weights(
+    layer: str, pixel_weight: float, *, feature_unit: float = 1.0, loss_factor: float = 1.0
+) -> TermWeights:
     """Return the weights of a layer's terms.
 
     They are the paper's weights, except that `PIXELS` has no Gram term, and its other terms are multiplied by
     `pixel_weight`.
+
+    Args:
+        feature_unit: See `FeatureNetwork`.
+        loss_factor: See `FeatureNetwork`.
     """
-    if layer != PIXELS:
-        return PAPERS_WEIGHTS
-    return TermWeights(0.0, MEAN_WEIGHT * pixel_weight, STD_WEIGHT * pixel_weight)
+    square = pixel_weight if layer == PIXELS else feature_unit**2
+    gram = 0.0 if layer == PIXELS else GRAM_WEIGHT * square**2 * loss_factor
+    return TermWeights(gram, MEAN_WEIGHT * square * loss_factor, STD_WEIGHT * square * loss_factor)
 
 
 class SplitGradient(NamedTuple):
-    """`StyleGradient` for bfloat16 features on a GPU: dE/dF_p = a_p ((high + low) F_p + constant).
+    """`StyleGradient` for 16-bit features on a GPU: dE/dF_p = a_p ((high + low) F_p / unit + constant).
 
-    The two matrices together hold 16 bits of each entry. After cancellation with the constant, the error of the
-    product is less than that of rounded features.
+    The two matrices together hold 16 bits of each entry, or 22 in float16. After cancellation with the constant, the
+    error of the product is less than that of rounded features.
     """
 
-    high: Tensor  # [c, c] bfloat16
-    low: Tensor  # [c, c] bfloat16
+    high: Tensor  # [c, c] bfloat16 or float16
+    low: Tensor  # [c, c] in the same dtype
     constant: Tensor  # [c] float32
 
 
@@ -126,11 +134,12 @@ class StyleGradient:
         mean = self.mean.float().double()
         return StyleGradient(self.matrix, mean, self.offset + self.matrix @ (mean - self.mean))
 
-    def about_zero(self) -> SplitGradient:
-        """Return the same map for bfloat16 features."""
-        high = self.matrix.bfloat16()
-        low = (self.matrix - high).bfloat16()
-        constant = self.offset - (high.double() + low.double()) @ self.mean.double()
+    def about_zero(self, dtype: torch.dtype) -> SplitGradient:
+        """Return the same map for 16-bit features."""
+        matrix = self.matrix * SPLIT_UNITS[dtype]
+        high = matrix.to(dtype)
+        low = (matrix - high).to(dtype)
+        constant = self.offset - (high.double() + low.double()) @ self.mean.double() / SPLIT_UNITS[dtype]
         return SplitGradient(high, low, constant.float())
 
     def apply(self, features: Tensor, position_weights: Tensor | None = None) -> Tensor:
@@ -176,6 +185,7 @@ def style_loss(
     *,
     feature_eps: float = 2.0**-23,
     weights: TermWeights = PAPERS_WEIGHTS,
+    dtype: torch.dtype = torch.float32,
 ) -> tuple[Tensor, StyleGradient]:
     """Compute the style loss of one layer and its gradient with respect to the features.
 
@@ -185,13 +195,14 @@ def style_loss(
 
     Args:
         feature_eps: Relative rounding error of the features (2^-23 for float32, 2^-52 for float64).
+        dtype: Dtype of the features.
 
     Returns:
         Contribution of the layer to each of `STATISTICS_TERMS`, [3] float64, and the gradient.
     """
     channels = statistics.mean.shape[0]
     if has_kernels(statistics.mean.device, channels) and feature_eps > torch.finfo(torch.float64).eps:
-        return fused_style_loss(statistics, (target.gram, target.mean, target.std), weights, feature_eps)
+        return fused_style_loss(statistics, (target.gram, target.mean, target.std), weights, feature_eps, dtype)
     some = statistics.count > 0
     gram_error = statistics.gram() - target.gram
     mean_error = statistics.mean - target.mean
@@ -253,6 +264,7 @@ class StatisticsTerms:
         Returns:
             Float64 scalar of each of `STATISTICS_TERMS`.
         """
+        network = self._network
         total = torch.zeros(len(STATISTICS_TERMS), dtype=torch.float64, device=self._view.image.device)
         pairs = [(region, layer) for region in self._regions for layer in self._layers]
         for (region, layer), own in zip(pairs, statistics, strict=True):
@@ -261,8 +273,11 @@ class StatisticsTerms:
             terms, gradient = style_loss(
                 own,
                 region.layers[layer],
-                feature_eps=self._network.rounding_of(layer),
-                weights=term_weights(layer, self._network.pixel_weight),
+                feature_eps=network.rounding_of(layer),
+                weights=term_weights(
+                    layer, network.pixel_weight, feature_unit=network.feature_unit, loss_factor=network.loss_factor
+                ),
+                dtype=network.dtype,
             )
             if layer == PIXELS and gradient.matrix.dtype == torch.float64:  # the GPU kernels already do this
                 gradient = gradient.about_rounded_mean()
@@ -303,6 +318,7 @@ def fused_style_loss(
     target: tuple[Tensor, Tensor, Tensor],
     weights: tuple[float, float, float],
     feature_eps: float,
+    dtype: torch.dtype = torch.bfloat16,
 ) -> tuple[Tensor, StyleGradient]:
     """Compute `style_loss` on a GPU.
 
@@ -314,7 +330,8 @@ def fused_style_loss(
     terms = torch.empty((channels, 3), dtype=torch.float64, device=device)
     matrix = torch.empty((channels, channels), device=device)
     mean, offset, constant = torch.empty((3, channels), device=device)
-    high, low = torch.empty((2, channels, channels), dtype=torch.bfloat16, device=device)
+    half = dtype if dtype in SPLIT_UNITS else torch.bfloat16
+    high, low = torch.empty((2, channels, channels), dtype=half, device=device)
     gram_weight, mean_weight, std_weight = weights
     columns = block_of_channels(channels)
     rows = block_of_entries(channels) // columns
@@ -323,7 +340,7 @@ def fused_style_loss(
             statistics.count, statistics.mean, statistics.centered, *target, terms, matrix, mean, offset,
             high, low, constant,
             GRAM=gram_weight, MEAN=mean_weight, STD=std_weight, EPS=feature_eps, CHANNELS=channels, ROWS=rows,
-            COLUMNS=columns,
+            COLUMNS=columns, UNIT=SPLIT_UNITS[half],
         )  # fmt: skip
     return terms.sum(dim=0), StyleGradient(matrix, mean, offset, SplitGradient(high, low, constant))
 
@@ -342,8 +359,8 @@ def fused_add_style_gradient(
     height, width, channels = features.shape
     positions, tile, block = height * width, block_of_channels(channels, TILE), block_of_positions(POSITIONS)
     weights = features if position_weights is None else position_weights
-    if features.dtype == torch.bfloat16:
-        matrix, low, offset = style.split or style.about_zero()
+    if features.dtype in SPLIT_UNITS:
+        matrix, low, offset = style.split or style.about_zero(features.dtype)
         mean = None
     else:
         matrix, low, mean, offset = style.matrix, None, style.mean, style.offset
@@ -352,5 +369,5 @@ def fused_add_style_gradient(
             features, weights, gradient, matrix, low, mean, offset,
             positions, width, row_cells(features), *weights.stride()[:2], row_cells(gradient),
             CHANNELS=channels, TILE=tile, K=block_of_channels(channels, STEPS[features.element_size()]), P=block,
-            WEIGHTED=position_weights is not None, RELU=relu,
+            WEIGHTED=position_weights is not None, RELU=relu, UNIT=SPLIT_UNITS.get(features.dtype, 1.0),
         )  # fmt: skip

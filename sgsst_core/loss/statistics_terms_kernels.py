@@ -18,7 +18,7 @@ from sgsst_core.features.statistics_kernels import cells_of, halves, load_featur
 def compare(
     count, mean, centered, target_gram, target_mean, target_std, terms, matrix, own_mean, offset, high, low, constant,
     GRAM: tl.constexpr, MEAN: tl.constexpr, STD: tl.constexpr, EPS: tl.constexpr, CHANNELS: tl.constexpr,
-    ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+    ROWS: tl.constexpr, COLUMNS: tl.constexpr, UNIT: tl.constexpr,
 ):  # fmt: skip
     """Compute `statistics_terms.style_loss` in float64.
 
@@ -30,8 +30,9 @@ def compare(
         terms: Output [CHANNELS, 3] float64, contribution of each channel to each term.
         matrix, own_mean, offset: Outputs [CHANNELS, CHANNELS], [CHANNELS] and [CHANNELS] float32, the fields of
             `statistics_terms.StyleGradient`.
-        high, low, constant: Outputs [CHANNELS, CHANNELS] bfloat16 (two) and [CHANNELS] float32, the fields of
-            `statistics_terms.SplitGradient`.
+        high, low, constant: Outputs [CHANNELS, CHANNELS] bfloat16 or float16 (two) and [CHANNELS] float32, the fields
+            of `statistics_terms.SplitGradient`.
+        UNIT: Factor of `high` and `low`.
     """
     i = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     j = tl.arange(0, COLUMNS)
@@ -54,8 +55,8 @@ def compare(
     drawn = (tl.sum(line * means[None, :], 1) + (2 * MEAN / CHANNELS) * mean_error) * fraction
     line += tl.where(i[:, None] == j[None, :], (2 * STD / CHANNELS) * slope[:, None], 0.0)
     rounded = (line * fraction).to(tl.float32)
-    first, second = halves(rounded)
-    stored = first.to(tl.float32).to(tl.float64) + second.to(tl.float32).to(tl.float64)
+    first, second = halves(rounded * UNIT, high.dtype.element_ty)
+    stored = (first.to(tl.float32).to(tl.float64) + second.to(tl.float32).to(tl.float64)) / UNIT
     tl.store(constant + i, (drawn - tl.sum(stored * means[None, :], 1)).to(tl.float32), mask=row)
     # `add_style_gradient` centers features about the float32 mean; the offset compensates for its rounding error.
     drawn += tl.sum(line * (means.to(tl.float32).to(tl.float64) - means)[None, :], 1) * fraction
@@ -78,20 +79,20 @@ def add_style_gradient(
     features, weights, gradient, matrix, low, mean, offset,
     positions, width, row_cells, weight_row_step, weight_column_step, out_row_cells,
     CHANNELS: tl.constexpr, TILE: tl.constexpr, K: tl.constexpr, P: tl.constexpr, WEIGHTED: tl.constexpr,
-    RELU: tl.constexpr,
+    RELU: tl.constexpr, UNIT: tl.constexpr,
 ):  # fmt: skip
     """Compute gradient_p += a_p (matrix (F_p - mean) + offset); if RELU, zero it where the features are not positive.
 
     Each program handles P positions and TILE output channels; it sums over the input channels in steps of K. In
-    bfloat16, features are multiplied as they are: products of 8-bit factors are exact.
+    16 bits, features are multiplied as they are: products are exact.
 
     Args:
-        features: [h, width, CHANNELS], float32 or bfloat16.
+        features: [h, width, CHANNELS], float32, bfloat16 or float16.
         weights: Position weights [h, width]; ignored if WEIGHTED is false.
         gradient: [h, width, CHANNELS] in the dtype of the features, updated in place.
-        matrix, mean, offset: Outputs of `compare` for float32; the matrix is symmetric. For bfloat16 features, `matrix`
+        matrix, mean, offset: Outputs of `compare` for float32; the matrix is symmetric. For 16-bit features, `matrix`
             and `offset` are the outputs `high` and `constant`, and `mean` is None.
-        low: Output of `compare` for bfloat16 features; otherwise None.
+        low: Output of `compare` for 16-bit features; otherwise None.
         positions: Number of positions, h * width.
         row_cells, out_row_cells: Distances of two rows of features and gradient in cells of CHANNELS values.
         RELU: Whether the features are the outputs of a ReLU, through which the gradient is passed on.
@@ -119,6 +120,8 @@ def add_style_gradient(
     a = load_weights(
         weights, weight_row_step, weight_column_step, width, position, there, features.dtype.element_ty, WEIGHTED
     )
+    if UNIT != 1.0:
+        sums /= UNIT
     sums = (sums + tl.load(offset + own, mask=own < CHANNELS, other=0.0)[None, :]) * a[:, None]
     target = gradient + cells_of(position, width, out_row_cells)[:, None] * CHANNELS + own[None, :]
     mask = mask_of(there, own, CHANNELS)

@@ -45,7 +45,7 @@ class TargetBuilder:
         style_scale: float = 1.0,
     ) -> None:
         self.style_scale = style_scale
-        self._network = network
+        self.network = network
         self._divider = divider
         self._timer = timer
         self._collectives = collectives
@@ -78,7 +78,7 @@ class TargetBuilder:
     def _style_pyramid(self, image: Tensor, view_size: Size) -> dict[int, Tensor]:
         """Return a style image at the scales that are evaluated for views of a given size, on the network's device."""
         size = style_size(_size(image), view_size, self.style_scale)
-        resized = resize_area(image, size).to(self._network.device)
+        resized = resize_area(image, size).to(self.network.device)
         return {scale: downscale(resized, scale) for scale in self._divider.tiling.scales(view_size)}
 
     def _mixed_layers(
@@ -126,7 +126,7 @@ class TargetBuilder:
             with self._timer("statistics"):
                 own = [layer_statistics(features[c][tile.owned_cells(c, size)[1].slices]) for c in self._compared]
                 total = [merge(*pair) for pair in zip(total, own, strict=True)] if total else own
-        return total or [LayerStatistics.zero(self._network.channels(layer), device) for layer in self._compared]
+        return total or [LayerStatistics.zero(self.network.channels(layer), device) for layer in self._compared]
 
     def _style_vectors(self, images: Sequence[Tensor], weights: Sequence[float]) -> StyleVectors | None:
         """Compute the style vectors of weighted images [h, w, 3] at one scale.
@@ -158,7 +158,7 @@ class TargetBuilder:
         size = _size(image)
         width = size[1] // layer_stride(self._matched[0])
         vectors = {
-            layer: torch.empty((len(positions), self._network.channels(layer)), dtype=self._network.dtype)
+            layer: torch.empty((len(positions), self.network.channels(layer)), dtype=self.network.dtype)
             for layer in self._matched
         }
         for tile in self._divider.tiles(size):
@@ -194,13 +194,13 @@ class TargetBuilder:
         """Downscale coverage [H, W] in 0..1 by every power of two that a layer needs at some scale."""
         coarsest = self._divider.tiling.scales(_size(coverage))[-1]
         levels = coarsest + 1 + layer_stride("relu5_1").bit_length()
-        dtype = torch.promote_types(self._network.dtype, torch.float32)
-        finest = coverage.to(self._network.device, dtype)
+        dtype = torch.promote_types(self.network.dtype, torch.float32)
+        finest = coverage.to(self.network.device, dtype)
         return [downscale(finest, level) for level in range(levels)]
 
     def scaled(self, content: Tensor, scale: int) -> ScaledView:
         """Return a scale of a content image [H, W, 3]."""
-        return ScaledView.of(downscale(content.to(self._network.device), scale), scale)
+        return ScaledView.of(downscale(content.to(self.network.device), scale), scale)
 
     def content_features(self, content: ScaledView, tiles: Sequence[PartitionTile]) -> ContentFeatures:
         """Compute the content features of a scale of a content image, on the cells owned by some tiles."""
@@ -217,12 +217,12 @@ class TargetBuilder:
         Args:
             pieces: Pieces of the scale for every rank.
         """
-        value = torch.finfo(self._network.dtype).bits // 8 * self._network.channels(CONTENT_LAYER)
+        value = torch.finfo(self.network.dtype).bits // 8 * self.network.channels(CONTENT_LAYER)
         return max(sum(piece.cells(CONTENT_LAYER) for piece in own) for own in pieces) * value
 
     def _forward(self, pixels: Tensor, until: str | None = None) -> Activations:
         with self._timer("vgg_forward"):
-            return self._network.forward(pixels, cache=False, until=until)
+            return self.network.forward(pixels, cache=False, until=until)
 
 
 def _size(image: Tensor) -> Size:

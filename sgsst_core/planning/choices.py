@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from sgsst_core.budget import memory_for
@@ -14,12 +14,13 @@ from sgsst_core.loss.nearest import MAX_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.number_format import duration
-from sgsst_core.planning.context import LEAST_VISITS, Facts, NetworkPixels, Saving, precision_of
+from sgsst_core.parallel.division import Size
+from sgsst_core.planning.context import LEAST_VISITS, Facts, NetworkPixels, Saving
 from sgsst_core.planning.measurement_choice import LOSS_VIEWS
 from sgsst_core.planning.plan import Plan
 from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.scene.pyramid import scale_count
-from sgsst_core.settings import CachedWeights, PlannedBackground, Settings
+from sgsst_core.settings import CachedWeights, PlannedBackground, PlannedPrecision, Settings
 
 #: Fraction of uncovered pixels above which statistics are weighted by coverage, unless the settings say otherwise.
 _UNCOVERED = 0.01
@@ -31,9 +32,17 @@ _SCAN = 0.2
 _VIEW_DEPENDENT = 0.05
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
-#: Speedup of convolutions from which on bfloat16 is recommended: at 1.9, less of the float32 loss is left than with
-#: float32 after the same seconds, on each of four pairs (docs/performance.md).
+#: Speedup of convolutions from which on a CPU uses bfloat16. Processors with the instructions reach 2.2 to 2.3, or much
+#: more with matrix units, and others stay below 1, so that runs on one machine choose alike. The speedup of a view's
+#: loss would depend on its size.
 _MUCH_FASTER = 1.5
+#: Fraction of the greatest speedup that a more accurate precision must reach on a GPU.
+_AS_FAST = 0.9
+#: Relative error of the pixel gradient up to which a precision is chosen. With errors of 0.3, the float32 loss falls as
+#: with float32 (docs/quality.md).
+_LARGEST_ERROR = 0.5
+#: Pixels through the network in all steps below which no precisions are compared: seconds on two cores.
+_COMPARED_PIXELS = 2_000_000
 #: Minimum visits per view size for which a CUDA graph of the loss is considered at all.
 LEAST_GRAPH_VISITS = 20
 #: The same if the capture is first tried in a child process, whose start takes as long as so many visits save: 6 s.
@@ -75,12 +84,50 @@ def draft_plan(facts: Facts, settings: Settings, *, measured: bool) -> Plan:
         device=facts.machine.device,
         rasterizer=facts.rasterizer,
         uncached=facts.rasterizer,
-        precision=precision_of(settings.precision, facts.precision_ratio),
+        precision=choose_precision(facts, settings),
         measured=measured,
         loss_views=min(LOSS_VIEWS[0], len(survey.covered)),
     )
     cached = _blend_weights(draft, facts, settings)[0]
     return draft if cached == "none" else replace(draft, rasterizer="cached", cached_weights=cached)
+
+
+def compares_precisions(sizes: Sequence[Size], settings: Settings) -> bool:
+    """Return whether a job without float32 would save enough time to compare precisions.
+
+    Args:
+        sizes: (height, width) of each view.
+        settings: Settings of the job.
+    """
+    if settings.precision != "auto":
+        return settings.precision != "float32"
+    pixels = 0.0
+    for height, width in sizes:
+        coarsest = scale_count(height, width, settings.coarsest_side) - 1
+        pixels += height * width * (settings.steps_sos + settings.steps_coarse / 4**coarsest) / len(sizes)
+    return settings.views_per_step * pixels >= _COMPARED_PIXELS
+
+
+def choose_precision(facts: Facts, settings: Settings) -> PlannedPrecision:
+    """Choose the precision of the network: the requested one if its convolutions are faster than in float32.
+
+    With "auto", a CPU uses bfloat16 if it is much faster; a GPU uses the most accurate of the fastest precisions.
+    """
+    measured = facts.precisions or {}
+    if settings.precision != "auto":
+        requested = measured.get(settings.precision) if settings.precision != "float32" else None
+        return settings.precision if requested and requested.error else "float32"
+    on_cpu = facts.machine.device == "cpu"
+    errors = {
+        name: own.error.relative_error
+        for name, own in measured.items()
+        if own.error
+        and own.error.relative_error <= _LARGEST_ERROR
+        and (own.convolution >= _MUCH_FASTER if on_cpu else own.speedup > 1)
+    }
+    most = max((measured[name].speedup for name in errors), default=0.0)
+    fastest = [name for name in errors if measured[name].speedup >= _AS_FAST * most]
+    return min(fastest, key=lambda name: errors[name], default="float32")
 
 
 def _has_one_phase(facts: Facts, settings: Settings) -> bool:
@@ -216,7 +263,7 @@ def decisions(
     yield weights if plan.cached_weights == "none" else replace(weights, seconds=parts["cached weights"])
     yield from _about_schedule(plan, facts, settings)
     yield from _about_ranks(plan, facts, seconds)
-    yield from _about_precision(facts, settings)
+    yield from _about_precision(plan, facts, settings, parts)
 
 
 def _about_gaussians(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
@@ -422,27 +469,44 @@ def _about_ranks(plan: Plan, facts: Facts, seconds: Mapping[int, float]) -> Iter
     yield Decision("ranks", f"{who} take part, {seconds[1] / seconds[chosen]:.2f} times as fast as one", measured)
 
 
-def _about_precision(facts: Facts, settings: Settings) -> Iterator[Decision]:
-    """Yield the decision about the network's precision. If float32 was requested, at most recommend bfloat16."""
-    requested, ratio, error = settings.precision, facts.precision_ratio, facts.gradient_error
-    float32 = "features in float32"
+def _about_precision(plan: Plan, facts: Facts, settings: Settings, parts: Mapping[str, float]) -> Iterator[Decision]:
+    """Yield the decision about the network's precision; none if float32 was requested."""
+    requested, measured = settings.precision, facts.precisions or {}
     if requested == "float32":
-        if ratio is not None and ratio >= _MUCH_FASTER:
-            reason = f"exact; with --precision bfloat16 (approximate), convolutions are {ratio:.1f} times faster here"
-            yield Decision("precision", float32, reason)
-    elif ratio is None:
-        needed = "an NVIDIA GPU" if requested == "tf32" else "a CPU, an AMD GPU, or an NVIDIA GPU"
-        reason = f"{requested} was requested, but needs {needed} of compute capability 8.0 or higher"
-        yield Decision("precision", float32, reason)
-    elif precision_of(requested, ratio) == "float32":
-        reason = f"{requested} was requested, but takes {1 / ratio:.1f} times as long as float32 on this processor"
-        yield Decision("precision", float32, reason)
+        return
+    compared = [
+        f"convolutions in {name} are {own.convolution:.2g} times as fast as in float32"
+        + (
+            f", a view's loss {own.speedup:.2g} times, with an error of {own.error.relative_error:.2g}"
+            if own.error
+            else ""
+        )
+        for name, own in measured.items()
+    ]
+    reason = "; ".join(compared)
+    if plan.precision != "float32":
+        own = measured[plan.precision]
+        assert own.error is not None
+        known = (
+            f"the first view's pixel gradient has a relative error of {own.error.relative_error:.2g} (cosine "
+            f"{own.error.cosine:.5f}); the error of the colors is measured during the run"
+        )
+        what = "convolutions in TF32" if plan.precision == "tf32" else f"features in {plan.precision}"
+        saved = max(own.speedup - 1, 0.0) * sum(
+            parts.get(name, 0.0) for name in ("vgg_forward", "vgg_backward", "statistics")
+        )
+        how = "requested" if requested != "auto" else "measured on the first view"
+        yield Decision("precision", what, f"{how}: {reason}", seconds=saved, error=known)
+        return
+    if requested != "auto":
+        needed = "an NVIDIA GPU" if requested != "bfloat16" else "a CPU, an AMD GPU, or an NVIDIA GPU"
+        missing = f"{requested} needs {needed} of compute capability 8.0 or higher"
+        reason = f"{requested} was requested, but {reason or missing}"
+    elif facts.precisions is None:
+        reason = "exact; the steps take too little time to compare others"
+    elif not measured:
+        reason = "exact; this device has no faster precision"
     else:
-        known = "the error of the colors is measured during the run"
-        if error is not None:
-            known = (
-                f"the first view's pixel gradient has a relative error of {error.relative_error:.2g} (cosine "
-                f"{error.cosine:.5f}); {known}"
-            )
-        what = {"bfloat16": "features in bfloat16", "tf32": "convolutions in TF32"}[requested]
-        yield Decision("precision", what, f"requested, {ratio:.1f} times faster here", error=known)
+        least = f"{_MUCH_FASTER} times faster convolutions" if facts.machine.device == "cpu" else "a faster loss"
+        reason = f"exact; {reason}, but {least} and an error of at most {_LARGEST_ERROR} are needed"
+    yield Decision("precision", "features in float32", reason)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import torch
@@ -18,6 +19,7 @@ from sgsst_core.features.vgg import (
     convolutions,
     has_bfloat16,
     has_bfloat16_instructions,
+    has_float16,
     has_tf32,
     use_whole_float32,
 )
@@ -36,18 +38,29 @@ from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import downscale
 from sgsst_core.scene.spherical_harmonics import scene_colors
-from sgsst_core.settings import Precision, Settings
+from sgsst_core.settings import PlannedPrecision, Settings
 from sgsst_core.style import Style
 from sgsst_core.timing import Timer, wait_for
 
-DTYPES: dict[Precision, torch.dtype] = {"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16}
-#: Channels and side of the timed convolution: about a millisecond of work on a CPU core, and enough to fill a GPU.
+DTYPES: dict[PlannedPrecision, torch.dtype] = {
+    "float32": torch.float32,
+    "tf32": torch.float32,
+    "bfloat16": torch.bfloat16,
+    "float16": torch.float16,
+}
+#: Channels and side of the timed convolution: a few milliseconds of work on a CPU core, and enough to fill a GPU.
 _CHANNELS: dict[Device, int] = {"cpu": 128, "cuda": 256}
-_SIDE: dict[Device, int] = {"cpu": 24, "cuda": 256}
-#: Number of measurements, of which the fastest counts: another process can interrupt one.
+_SIDE: dict[Device, int] = {"cpu": 48, "cuda": 256}
+#: Number of measurements, of which the fastest counts: another process can interrupt one. A single one counts if it is
+#: slower than `_SLOW` seconds, as on CPUs that emulate the precision.
 _MEASUREMENTS = 5
-#: Maximum longer side of the view on which another precision is compared with float32.
-_COMPARED_SIDE: dict[Device, int] = {"cpu": 384, "cuda": 2048}
+_SLOW = 0.5
+#: Maximum longer side of the view on which another precision is compared with float32, and number of comparisons, of
+#: which the fastest counts. CPUs take processor time, which other processes hardly change.
+_COMPARED_SIDE: dict[Device, int] = {"cpu": 160, "cuda": 2048}
+_COMPARISONS: dict[Device, int] = {"cpu": 1, "cuda": 3}
+#: Side of the image whose evaluation compiles kernels.
+_WARM_UP_SIDE = 32
 #: Precisions of cached blend weights, the exact one first, and number of views whose weights are counted.
 _FORMATS: tuple[WeightPrecision, ...] = ("float32", "half")
 _SAMPLED_VIEWS = 3
@@ -130,6 +143,21 @@ class Hardware:
 
 
 @dataclass(frozen=True)
+class Comparison:
+    """Comparison of a precision of the network with float32.
+
+    Attributes:
+        convolution: Ratio of the time of a convolution in float32 to that in this precision.
+        speedup: The same ratio for the loss of a view and its gradient; 0 if a convolution is not faster.
+        error: Error of the view's pixel gradient relative to float32; None if a convolution is not faster.
+    """
+
+    convolution: float
+    speedup: float = 0.0
+    error: Difference | None = None
+
+
+@dataclass(frozen=True)
 class Facts:
     """All facts from which the decisions before the trial follow, apart from the settings.
 
@@ -145,9 +173,7 @@ class Facts:
         weights: Cost of cached blend weights.
         frozen: [N] bool, frozen Gaussians; None if there are none.
         deepest: Name of the deepest layer in use.
-        precision_ratio: Ratio of a convolution's time in float32 to that in the requested precision, or in bfloat16 if
-            float32 was requested; None if it is unavailable.
-        gradient_error: Error of a view's pixel gradient relative to float32; None if the network runs in float32.
+        precisions: Comparison of each precision that may be used; None if the job is too short to compare any.
     """
 
     gaussians: int
@@ -161,8 +187,7 @@ class Facts:
     weights: WeightCost
     frozen: Tensor | None = None
     deepest: str = "relu5_1"
-    precision_ratio: float | None = None
-    gradient_error: Difference | None = None
+    precisions: Mapping[PlannedPrecision, Comparison] | None = None
 
 
 @dataclass(frozen=True)
@@ -247,8 +272,7 @@ class PlanningContext:
         settings: Settings of the job.
         machine: Facts about the machine.
         weights: Weights of the network.
-        network: Network in the precision in which it will run.
-        precision_ratio: See `Facts`.
+        network: Network, in float32 until the precision is chosen.
         rasterizer: Rasterizer of the whole scene that computes blend weights.
         sh_degree: SH degree of the original scene.
     """
@@ -259,7 +283,6 @@ class PlanningContext:
     machine: Hardware
     weights: BackboneWeights
     network: FeatureNetwork
-    precision_ratio: float | None
     rasterizer: Rasterizer
     sh_degree: int
 
@@ -285,8 +308,7 @@ def equip(
     sh_degree, scene = scene.sh_degree, scene.attenuated(settings.sh_attenuation)
     device = common_device(collectives)
     problems = gpu_problems(collectives) if device == "cuda" else {}
-    ratio = precision_ratio(settings.precision, device, collectives)
-    network = make_network(weights, settings, precision_of(settings.precision, ratio), device)
+    network = make_network(weights, settings, "float32", device)
     limit = settings.memory_limit or default_memory_limit(network.device)
     machine = Hardware(
         device,
@@ -299,7 +321,7 @@ def equip(
     name = rasterizer or rasterizer_for(device, problems)
     memory = memory_for("rasterizer", machine.memory)
     of_scene = make_rasterizer(name, scene, background=settings.background, near=settings.near, memory=memory)
-    return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, ratio, of_scene, sh_degree)
+    return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, of_scene, sh_degree)
 
 
 def common_device(collectives: Collectives) -> Device:
@@ -331,60 +353,51 @@ def sharing_memory(collectives: Collectives, device: Device) -> int:
     return collectives.gpu_sharing if device == "cuda" else max(collectives.all_gather(collectives.local_size))
 
 
-def make_network(weights: BackboneWeights, settings: Settings, precision: Precision, device: Device) -> FeatureNetwork:
+def make_network(
+    weights: BackboneWeights, settings: Settings, precision: PlannedPrecision, device: Device
+) -> FeatureNetwork:
     """Create the feature network with layers up to the deepest one used."""
     layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0, settings=settings)
     use_whole_float32()
     return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
 
 
-def precision_ratio(requested: Precision, device: Device, collectives: Collectives) -> float | None:
-    """Return how many times faster a convolution is in the requested precision than in float32.
+def available_precisions(settings: Settings, device: Device, collectives: Collectives) -> list[PlannedPrecision]:
+    """Return the precisions other than float32 that a job may use. All ranks must call this.
 
-    If float32 was requested, measure bfloat16, so that the plan can recommend it. All ranks must call this.
-
-    Returns:
-        Ratio measured on the first rank. None if some rank lacks the precision, or would have to emulate one that was
-            not requested.
+    With "auto", a CPU must have instructions for bfloat16.
     """
-    if requested == "float32":
-        measured: Precision = "bfloat16"
-        supported = has_bfloat16_instructions(device)
-    else:
-        measured = requested
-        supported = has_tf32(device) if requested == "tf32" else has_bfloat16(device)
-    if not all(collectives.all_gather(supported)):
-        return None
-    return collectives.broadcast(lambda: convolution_ratio(measured, device))
+    has: dict[PlannedPrecision, bool] = {
+        "tf32": has_tf32(device),
+        "float16": has_float16(device),
+        "bfloat16": has_bfloat16(device) if settings.precision != "auto" else has_bfloat16_instructions(device),
+    }
+    everywhere = collectives.all_gather(has)
+    return [name for name in has if settings.precision in (name, "auto") and all(each[name] for each in everywhere)]
 
 
-def precision_of(requested: Precision, ratio: float | None) -> Precision:
-    """Return the precision of the network: the requested one if it is faster than float32, else float32.
-
-    Processors without bfloat16 instructions compute it hundreds of times more slowly than float32.
-
-    Args:
-        requested: Requested precision.
-        ratio: See `precision_ratio`.
-    """
-    return requested if ratio is not None and ratio > 1 else "float32"
-
-
-def convolution_ratio(precision: Precision, device: Device) -> float:
+def convolution_ratio(precision: PlannedPrecision, device: Device) -> float:
     """Return the ratio of a convolution's time in float32 to its time in another precision.
 
-    On a CPU, one thread is measured: several would wait for each other while other processes use their cores.
+    On a CPU, these are processor times of one thread, which other processes hardly change.
     """
+    with _one_thread(device):
+        return _convolution_seconds("float32", device) / _convolution_seconds(precision, device)
+
+
+@contextmanager
+def _one_thread(device: Device) -> Iterator[None]:
+    """Compute on one thread on a CPU inside a `with` block."""
     threads = torch.get_num_threads()
     if device == "cpu":
         torch.set_num_threads(1)
     try:
-        return _convolution_seconds("float32", device) / _convolution_seconds(precision, device)
+        yield
     finally:
         torch.set_num_threads(threads)
 
 
-def _convolution_seconds(precision: Precision, device: Device) -> float:
+def _convolution_seconds(precision: PlannedPrecision, device: Device) -> float:
     """Return the time in seconds of a 3x3 convolution, the fastest of some; the first one warms up."""
     channels, side, dtype = _CHANNELS[device], _SIDE[device], DTYPES[precision]
     image = torch.ones((1, channels, side, side), dtype=dtype, device=device)
@@ -394,42 +407,70 @@ def _convolution_seconds(precision: Precision, device: Device) -> float:
     seconds = []
     with convolutions(image.device, tf32=precision == "tf32"):
         for _ in range(1 + _MEASUREMENTS):
-            timer = Timer(device)
+            timer, started = Timer(device), time.thread_time()
             with timer("convolution"):
                 torch.nn.functional.conv2d(image, kernel, padding=1)
-            seconds.append(timer.read()["convolution"])
-    return min(seconds[1:])
+            seconds.append(timer.read()["convolution"] if device == "cuda" else time.thread_time() - started)
+            if seconds[-1] > _SLOW:
+                break
+    return min(seconds[1:] or seconds)
 
 
-def gradient_error(context: PlanningContext, camera: Camera) -> Difference | None:
-    """Compare the pixel gradient of a view with that of the same network in full float32, for a synthetic style.
+def compare_precisions(
+    context: PlanningContext, camera: Camera, precisions: Sequence[PlannedPrecision]
+) -> dict[PlannedPrecision, Comparison]:
+    """Compare precisions with float32 on a view, for a synthetic style.
+
+    A precision in which a convolution is not faster is not tried: processors without bfloat16 instructions compute it
+    hundreds of times more slowly than float32.
 
     Args:
         context: Objects to measure with.
         camera: View, which is rendered unstylized and then downscaled.
-
-    Returns:
-        Difference of the gradients; None if the network runs in float32.
+        precisions: Precisions other than float32.
     """
-    network, rasterizer = context.network, context.rasterizer
-    if network.precision == "float32":
-        return None
+    device = context.machine.device
+    ratios = {name: convolution_ratio(name, device) for name in precisions}
+    faster = [name for name in precisions if ratios[name] > 1]
+    if not faster:
+        return {name: Comparison(ratio) for name, ratio in ratios.items()}
     colors = scene_colors(context.scene, camera)
-    image = rasterizer.render(colors.to(rasterizer.device), camera).to(network.device)
-    longer, shorter = max(image.shape[:2]) / _COMPARED_SIDE[context.machine.device], min(image.shape[:2])
-    image = downscale(
-        image,
-        min(max(0, math.ceil(math.log2(longer))), shorter.bit_length() - 1),
-    )
-    reference = FeatureNetwork(context.weights, network.layers, torch.float32, network.device)
-    memory, gradients = memory_for("activations", context.machine.memory), []
-    for each in (network, reference):
-        loss = SosLoss(each, content_weight=0, style_loss=context.settings.style_loss, memory=memory)
-        style = loss.targets.of_style(Style.of(soft_image(max(image.shape[:2]))), (image.shape[0], image.shape[1]))
-        result = loss.evaluate(image, style, loss.targets.of_view(image), [0])
-        assert result.image_gradient is not None
-        gradients.append(result.image_gradient)
-    return Difference.of(*gradients)
+    image = context.rasterizer.render(colors.to(context.rasterizer.device), camera).to(context.network.device)
+    longer, shorter = max(image.shape[:2]) / _COMPARED_SIDE[device], min(image.shape[:2])
+    image = downscale(image, min(max(0, math.ceil(math.log2(longer))), shorter.bit_length() - 1))
+    exact, seconds = compared_gradient(context, context.network, image)
+    result = {}
+    for name in precisions:
+        result[name] = Comparison(ratios[name])
+        if name in faster:
+            network = make_network(context.weights, context.settings, name, device)
+            gradient, own = compared_gradient(context, network, image)
+            result[name] = Comparison(ratios[name], seconds / own, Difference.of(gradient, exact))
+    return result
+
+
+def compared_gradient(context: PlanningContext, network: FeatureNetwork, image: Tensor) -> tuple[Tensor, float]:
+    """Return the pixel gradient [h, w, 3] of an image for a synthetic style, and the seconds to compute it.
+
+    On a CPU, these are the seconds of one thread.
+    """
+    device, memory = context.machine.device, memory_for("activations", context.machine.memory)
+    loss = SosLoss(network, content_weight=0, style_loss=context.settings.style_loss, memory=memory)
+    size = int(image.shape[0]), int(image.shape[1])
+    style = loss.targets.of_style(Style.of(soft_image(max(size))), size)
+
+    def evaluate(side: int) -> tuple[Tensor, float]:
+        part = image[:side, :side].contiguous()
+        view, timer, started = loss.targets.of_view(part), Timer(device), time.process_time()
+        with timer("evaluation"):
+            gradient = loss.evaluate(part, style, view, [0]).image_gradient
+        assert gradient is not None
+        return gradient, timer.read()["evaluation"] if device == "cuda" else time.process_time() - started
+
+    with _one_thread(device):
+        evaluate(_WARM_UP_SIDE)
+        every = [evaluate(max(size)) for _ in range(_COMPARISONS[device])]
+    return every[-1][0], min(seconds for _, seconds in every)
 
 
 def soft_image(side: int) -> Tensor:

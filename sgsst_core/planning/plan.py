@@ -11,7 +11,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.refine.split import Refinement
-from sgsst_core.settings import CachedWeights, PlannedBackground, Precision
+from sgsst_core.settings import CachedWeights, PlannedBackground, PlannedPrecision
 
 Device = Literal["cpu", "cuda"]
 
@@ -101,7 +101,7 @@ class Plan:
     device: Device = "cpu"
     rasterizer: str = "cpu"
     uncached: str = "cpu"
-    precision: Precision = "float32"
+    precision: PlannedPrecision = "float32"
     graphs: bool = False
     cached_weights: CachedWeights = "none"
     measured: bool = False

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.budget import Cache, forget_device_peak, least_intersection_memory, measuring_memory, memory_for
+from sgsst_core.decision import Decision
 from sgsst_core.errors import DeviceMemoryError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
@@ -69,6 +70,10 @@ class StyleTargetCache:
             self._targets[size] = self._styles.targets(self._loss, size)
             self.seconds += time.perf_counter() - started
         return self._targets[size]
+
+    def clear(self) -> None:
+        """Clear the cache."""
+        self._targets.clear()
 
 
 @dataclass(frozen=True)
@@ -302,6 +307,19 @@ def continued(job: StylizationJob, plan: Plan, settings: Settings) -> Stylizatio
     job.view_targets.limit(memory)
     _limit_intersections(job.views, plan, job.memory)
     return replace(job, plan=plan, settings=settings, graphs=LossGraphs(job.loss) if plan.graphs else None)
+
+
+def in_bfloat16(job: StylizationJob, step: int) -> StylizationJob:
+    """Return a job whose network continues in bfloat16 from a step in which float16 has overflowed."""
+    network = make_network(job.weights, job.settings, "bfloat16", job.plan.device)
+    job.loss.use(network)
+    job.view_targets.forget_division()
+    job.style_targets.clear()
+    if job.graphs is not None:
+        job.graphs.clear()
+    line = Decision("precision", f"features in bfloat16 from step {step} on", "float16 has overflowed")
+    plan = replace(job.plan, precision="bfloat16", decisions=(*job.plan.decisions, line))
+    return replace(job, network=network, plan=plan)
 
 
 def _job_styles(

@@ -21,9 +21,11 @@ from sgsst_core.planning.context import (
     Facts,
     NetworkPixels,
     PlanningContext,
+    available_precisions,
     common_device,
+    compare_precisions,
     equip,
-    gradient_error,
+    make_network,
     weight_cost,
 )
 from sgsst_core.planning.plan import Device, Plan
@@ -37,7 +39,7 @@ from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.colors import color_subspace_of
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import harmonics_energy
-from sgsst_core.settings import Settings
+from sgsst_core.settings import PlannedPrecision, Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import StylizationJob, continued, prepare_job
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
@@ -130,8 +132,12 @@ def plan_job(
                 survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
         if show:
             show(Progress(stage="probing"))
-        facts = collectives.broadcast(lambda: _facts(context, survey, regions))
+        precisions = available_precisions(settings, context.machine.device, collectives)
+        facts = collectives.broadcast(lambda: _facts(context, survey, regions, precisions))
         draft = choices.draft_plan(facts, settings, measured=measured)
+        if draft.precision != "float32":
+            network = make_network(context.weights, settings, draft.precision, draft.device)
+            context = replace(context, network=network)
         activations = memory_for("activations", context.machine.memory)
         pixels = NetworkPixels.of(draft, facts.sizes, make_loss(context.network, settings, activations).tiling)
         of_a_view = int(pixels.held * context.network.held_bytes_per_pixel())
@@ -267,25 +273,28 @@ def _rank_counts(available: int, settings: Settings) -> list[int]:
     return sorted({max(available >> halvings, 1) for halvings in range(available.bit_length())})
 
 
-def _facts(context: PlanningContext, survey: Survey, regions: Regions | None) -> Facts:
+def _facts(
+    context: PlanningContext, survey: Survey, regions: Regions | None, precisions: Sequence[PlannedPrecision]
+) -> Facts:
     """Gather the facts on which the decisions before the trial depend; one rank does this for all."""
     scene, settings = context.scene, context.settings
     views = [context.cameras[index] for index in survey.covered]
     budget = memory_for("rasterizer", context.machine.memory)
+    sizes = tuple((camera.height, camera.width) for camera in context.cameras)
+    compares = choices.compares_precisions(sizes, settings)
     return Facts(
         gaussians=len(scene),
         sh_degree=context.sh_degree,
         used_degree=scene.used_degree(survey.total_blend_weights > 0),
         harmonics_energy=harmonics_energy(scene, survey.total_blend_weights),
-        sizes=tuple((camera.height, camera.width) for camera in context.cameras),
+        sizes=sizes,
         survey=survey,
         machine=context.machine,
         rasterizer=context.rasterizer.name,
         weights=weight_cost(context.rasterizer, views, settings, budget),
         frozen=None if regions is None else regions.resolved(survey.total_blend_weights).frozen,
         deepest=max(context.network.layers),
-        precision_ratio=context.precision_ratio,
-        gradient_error=gradient_error(context, views[0]),
+        precisions=compare_precisions(context, views[0], precisions) if compares else None,
     )
 
 

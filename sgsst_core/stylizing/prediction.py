@@ -195,7 +195,7 @@ def _peak_bytes(plan: Plan, facts: Facts, settings: Settings, trial: Trial) -> t
 
 def _reference_size(plan: Plan) -> float:
     """Return the size of a feature value in the float32 reference, relative to the job's network."""
-    return 2.0 if plan.precision == "bfloat16" else 1.0
+    return 2.0 if plan.precision in ("bfloat16", "float16") else 1.0
 
 
 def _searches_neighbors(plan: Plan, settings: Settings) -> bool:

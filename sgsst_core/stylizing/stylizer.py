@@ -22,7 +22,7 @@ from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft, seconds_left
 from sgsst_core.regions.definition import Regions
@@ -39,7 +39,7 @@ from sgsst_core.stylizing.evaluation import (
     mean_loss,
     show_nothing,
 )
-from sgsst_core.stylizing.job import StylizationJob, with_second_attempt
+from sgsst_core.stylizing.job import StylizationJob, in_bfloat16, with_second_attempt
 from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.planner import choose_within, plan_job
@@ -81,7 +81,13 @@ class _QueuedStep:
     values: Tensor
     copied: torch.cuda.Event | None
     timer: Timer
-    sent: dict[str, int]
+    sent: dict[Traffic, int]
+
+    def largest(self) -> float:
+        """Wait for the device, and return the largest magnitude in the gradient."""
+        if self.copied is not None:
+            self.copied.synchronize()
+        return float(self.values[0])
 
 
 class Stylizer:
@@ -259,17 +265,11 @@ class Stylizer:
         sent = dict(self.job.collectives.sent)
         phase = self.phase
         self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
-        gradient, results, cost = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
-        with self.job.timer("optimizer"):
-            done = self.step / max(self.job.total_steps - 1, 1)
-            largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(done))
-        with self.job.timer("communication"):
-            self.job.team.check_drift(self.step + 1, self.sh_dc)
         before = self._queued
-        values, copied = self._copied(largest, results)
-        results = [replace(result, image_gradient=None) for result in results]  # frees the gradients
-        timer = self.job.timer.lap()
-        self._queued = _QueuedStep(self.step + 1, phase, views, results, values, copied, timer, sent)
+        cost, timer = self._queue(views, phase, sent)
+        if self.job.plan.precision == "float16" and self._queued is not None and is_too_large(self._queued.largest()):
+            self.job = in_bfloat16(self.job, self.step + 1)  # colors and moments are unchanged
+            cost, timer = self._queue(views, phase, sent)
         self.step += 1
         if phase.scale is None:
             speeds = self.job.team.compare_speeds(cost, timer.read()) if self.job.collectives.size > 1 else None
@@ -312,6 +312,20 @@ class Stylizer:
             evaluated=tuple(evaluated),
         )
         self.history.append(record)
+
+    def _queue(self, views: list[int], phase: Phase, sent: dict[Traffic, int]) -> tuple[int, Timer]:
+        """Queue a step, and return the cost of `_mean_gradient`, and the timer of its parts."""
+        gradient, results, cost = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
+        with self.job.timer("optimizer"):
+            done = self.step / max(self.job.total_steps - 1, 1)
+            largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(done))
+        with self.job.timer("communication"):
+            self.job.team.check_drift(self.step + 1, self.sh_dc)
+        values, copied = self._copied(largest, results)
+        results = [replace(result, image_gradient=None) for result in results]  # frees the gradients
+        timer = self.job.timer.lap()
+        self._queued = _QueuedStep(self.step + 1, phase, views, results, values, copied, timer, sent)
+        return cost, timer
 
     def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult], int]:
         """Return the mean of dE/dsh_dc [n, 3] over some views, the results of this group's own views, and a cost.
@@ -368,13 +382,12 @@ class Stylizer:
         Raises:
             DivergedError: If the gradient was too large for a step.
         """
-        if queued.copied is not None:
-            queued.copied.synchronize()
+        magnitude = queued.largest()
         lengths = [result.values.numel() for result in queued.results]
-        magnitude, *values = queued.values.split([1, *lengths])
-        if is_too_large(float(magnitude)):
+        _, *values = queued.values.split([1, *lengths])
+        if is_too_large(magnitude):
             raise DivergedError(
-                f"Step {queued.step}: the color gradient has grown to {float(magnitude):.3g}, which cannot be "
+                f"Step {queued.step}: the color gradient has grown to {magnitude:.3g}, which cannot be "
                 f"optimized; the largest color coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a "
                 f"smaller --learning-rate than {self.job.settings.learning_rate:g}, or look for extreme coefficients "
                 "with `sgsst check`."

@@ -16,7 +16,10 @@ if torch.cuda.is_available():
 
 from sgsst_core.budget import memory_for
 from sgsst_core.files.scene_file import read_scene
+from sgsst_core.loss.gradient_error import Difference
+from sgsst_core.planning.context import Comparison
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing import planner
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests import networks
@@ -98,6 +101,19 @@ def test_job_runs_resumes_and_reports(
     assert not torch.equal(before.sh_dc, after.sh_dc)
     assert torch.isfinite(after.sh_dc).all()
     assert torch.equal(before.means, after.means)
+
+
+@pytest.mark.slow
+def test_float16_job_follows_one_in_float32(counts: Counts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The simulated device is slower in float16."""
+    faster = Comparison(2.0, 2.0, Difference(0.05, 0.999))
+    monkeypatch.setattr(planner, "compare_precisions", lambda context, camera, names: dict.fromkeys(names, faster))
+    losses = {}
+    for precision in ("float16", "float32"):
+        stylizer = prepare(request_(tmp_path / precision, precision=precision)).stylizer
+        losses[precision] = [stylizer.run_step().loss for _ in range(stylizer.job.total_steps)]
+        assert stylizer.job.network.precision == stylizer.job.plan.precision == precision
+    assert losses["float16"] == pytest.approx(losses["float32"], rel=0.1)
 
 
 @pytest.mark.slow

@@ -390,15 +390,15 @@ def _store_matrix(instruction: Instruction) -> Execute:
 
 
 def _mma(instruction: Instruction) -> Execute:
-    """Return the execution of `mma.m16n8k8` in TF32 and `mma.m16n8k16` in bfloat16 (PTX ISA, "Matrix Fragments").
+    """Return the execution of `mma.m16n8k8` in TF32 and `mma.m16n8k16` in 16 bits (PTX ISA, "Matrix Fragments").
 
     A register of a factor holds a row's part of 32 bits: one value of TF32, to which it is truncated, or two of
-    bfloat16. Products are summed in float64 and rounded once.
+    bfloat16 or float16. Products are summed in float64 and rounded once.
     """
     opcode = instruction.opcode
     if {"m16n8k8", "tf32"} <= set(opcode):
         packed, significant = 1, np.uint32(0xFFFFE000)
-    elif {"m16n8k16", "bf16"} <= set(opcode):
+    elif "m16n8k16" in opcode and {"bf16", "f16"} & set(opcode):
         packed, significant = 2, np.uint32(0xFFFF0000)
     else:
         raise UnsupportedError(str(instruction))
@@ -416,11 +416,17 @@ def _mma(instruction: Instruction) -> Execute:
         def fragments(reads: list[Read]) -> list[np.ndarray]:
             return [read(state).reshape(warps, WARP) for read in reads]
 
+        def values_of(bits: np.ndarray) -> np.ndarray:
+            """Return the values in the high bits of registers."""
+            if "f16" in opcode:
+                return (bits >> np.uint32(16)).astype(np.uint16).view(np.float16).astype(np.float32)
+            return (bits & significant).view(np.float32)
+
         def factors(reads: list[Read]) -> list[tuple[int, int, np.ndarray]]:
             """Return the values of each register, with its number and the place of the value in it."""
             shifts = (0,) if packed == 1 else (16, 0)
             return [
-                (number, place, ((bits << np.uint32(shift)) & significant).view(np.float32))
+                (number, place, values_of(bits << np.uint32(shift)))
                 for number, bits in enumerate(fragments(reads))
                 for place, shift in enumerate(shifts)
             ]

@@ -129,7 +129,7 @@ def sparse(shape: tuple[int, ...], strides: tuple[int, ...], dtype: torch.dtype)
     return torch.frombuffer(mapping, dtype=dtype, count=count).as_strided(shape, strides)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 def test_offsets_beyond_32_bits_are_correct(dtype: torch.dtype) -> None:
     """The last row starts after 2.5e9 values."""
     generator = torch.Generator().manual_seed(0)
@@ -147,12 +147,13 @@ def test_offsets_beyond_32_bits_are_correct(dtype: torch.dtype) -> None:
     assert relative_error(gradient.double(), expected) < tolerance
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("channels", [64, 128])
-def test_products_of_bfloat16_features_are_not_rounded(channels: int) -> None:
+def test_products_of_16_bit_features_are_not_rounded(channels: int, dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(0)
-    features = torch.randn((13, 29, channels), generator=generator).relu().bfloat16()
+    features = torch.randn((13, 29, channels), generator=generator).relu().to(dtype)
     weights = torch.rand((13, 29), generator=generator)
-    exact = layer_statistics_reference(features, weights.bfloat16())
+    exact = layer_statistics_reference(features, weights.to(dtype))
     matrix, mean, offset = (torch.randn(shape, generator=generator) for shape in (2 * (channels,), channels, channels))
     matrix = matrix + matrix.T
     expected = ((features.double() - mean.double()) @ matrix.double() + offset.double()) * weights[..., None]
@@ -162,7 +163,7 @@ def test_products_of_bfloat16_features_are_not_rounded(channels: int) -> None:
         instructions = driver.kernels["shifted_moments"].program.instructions
         assert any(one.opcode[:2] == ("cp", "async") for one in instructions), "loads do not overlap with products"
         fused_add_style_gradient(gradient, features, StyleGradient(matrix, mean, offset), weights)
-    assert relative_error(gradient.double(), expected) < 4e-3
+    assert relative_error(gradient.double(), expected) < torch.finfo(dtype).eps / 2
 
 
 # --- mutations: a defect in a kernel must be reported ---------------------------------------------------------------

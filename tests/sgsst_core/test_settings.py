@@ -58,7 +58,7 @@ def test_learning_rate_is_exponential_in_the_fraction_of_steps() -> None:
         ({"learning_rate": float("nan")}, "learning_rate"),
         ({"content_weight": -1}, "content_weight"),
         ({"content_weight": "weak"}, "content_weight"),
-        ({"precision": "float16"}, "precision"),
+        ({"precision": "float8"}, "precision"),
         ({"within": 0}, "within"),
         ({"unheard_of": 1}, "unheard_of"),
     ],

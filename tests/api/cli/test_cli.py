@@ -585,7 +585,7 @@ def test_missing_weights_error_names_fetch_command(
     "options",
     [
         ["--preset", "fast"],
-        ["--precision", "float16"],
+        ["--precision", "float8"],
         ["--background", "0,0,256"],
         ["--background", "blue"],
         ["--memory-limit", "lots"],

@@ -21,6 +21,7 @@ from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error
 pytest.importorskip("triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
+HALVES = [torch.bfloat16, torch.float16]
 WEIGHTS = (terms.GRAM_WEIGHT, terms.MEAN_WEIGHT, terms.STD_WEIGHT)
 
 
@@ -51,7 +52,7 @@ def on_cpu(statistics: LayerStatistics) -> LayerStatistics:
 def fused_gradient(x: Tensor, weights: Tensor | None, target: LayerTarget) -> tuple[Tensor, Tensor]:
     """Return terms [4] and gradient [h, w, c]. Check that the gradient is added, and only within the crop."""
     terms, map_ = fused_style_loss(
-        fused_statistics(x, weights), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23
+        fused_statistics(x, weights), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23, x.dtype
     )
     around = torch.zeros((x.shape[0] + 2, x.shape[1] + 2, x.shape[2]), dtype=x.dtype, device=x.device)
     gradient = around[1:-1, 1:-1]
@@ -156,10 +157,13 @@ def test_zero_weights_give_zero_terms_and_maps(shape: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize(("channels", "height", "width", "weighted"), [(32, 20, 30, True), (128, 20, 33, False)])
-def test_products_of_bfloat16_features_are_not_rounded(channels: int, height: int, width: int, weighted: bool) -> None:
-    x = features(height, width, channels, seed=3).bfloat16()
+@pytest.mark.parametrize("dtype", HALVES)
+def test_products_of_16_bit_features_are_not_rounded(
+    dtype: torch.dtype, channels: int, height: int, width: int, weighted: bool
+) -> None:
+    x = features(height, width, channels, seed=3).to(dtype)
     a = position_weights(height, width) if weighted else None
-    exact = layer_statistics_reference(x.cpu(), None if a is None else a.bfloat16().cpu())
+    exact = layer_statistics_reference(x.cpu(), None if a is None else a.to(dtype).cpu())
     actual = on_cpu(fused_statistics(x, a))
     assert relative_error(actual.count, exact.count) < 1e-6
     assert relative_error(actual.mean, exact.mean) < 1e-6
@@ -168,7 +172,7 @@ def test_products_of_bfloat16_features_are_not_rounded(channels: int, height: in
     _, gradient = fused_gradient(x, a, target)
     cpu_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
     expected = style_loss(exact, cpu_target)[1].apply(x.cpu().double(), None if a is None else a.cpu())
-    assert relative_error(gradient.double(), expected) < 4e-3
+    assert relative_error(gradient.double(), expected) < torch.finfo(dtype).eps / 2
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -189,7 +193,7 @@ def test_bfloat16_features_may_differ_in_their_last_bit_only(weighted: bool) -> 
     assert relative_error(gradient.cpu().double(), expected) < 8e-3
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("dtype", [torch.float32, *HALVES])
 @pytest.mark.parametrize(("channels", "weighted"), [(8, True), (128, False)])
 def test_gradient_passes_the_relu_of_the_features(dtype: torch.dtype, channels: int, weighted: bool) -> None:
     x, a = features(20, 33, channels, seed=3).to(dtype), position_weights(20, 33) if weighted else None
@@ -209,7 +213,7 @@ def test_gradient_passes_the_relu_of_the_features(dtype: torch.dtype, channels: 
     assert gradient[0, 0].isnan().any()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("dtype", [torch.float32, *HALVES])
 @pytest.mark.parametrize(("channels", "weighted"), [(8, True), (512, False)])
 def test_content_term_agrees_with_float64(dtype: torch.dtype, channels: int, weighted: bool) -> None:
     x, content = (features(9, 13, channels, seed=seed).to(dtype) for seed in (1, 2))
@@ -230,11 +234,12 @@ def test_content_term_of_no_positions_is_0() -> None:
     fused_add_content_gradient(x.clone(), x, x, None, factor)
 
 
-def test_kernel_splits_the_gradient() -> None:
+@pytest.mark.parametrize("dtype", HALVES)
+def test_kernel_splits_the_gradient(dtype: torch.dtype) -> None:
     target = target_of(64)
-    statistics = fused_statistics(features(20, 30, 64, seed=6).bfloat16())
-    _, map_ = fused_style_loss(statistics, (target.gram, target.mean, target.std), WEIGHTS, 2.0**-7)
-    expected = map_.about_zero()
+    statistics = fused_statistics(features(20, 30, 64, seed=6).to(dtype))
+    _, map_ = fused_style_loss(statistics, (target.gram, target.mean, target.std), WEIGHTS, 2.0**-7, dtype)
+    expected = map_.about_zero(dtype)
     assert map_.split
     assert torch.equal(map_.split.high, expected.high)
     assert torch.equal(map_.split.low, expected.low)

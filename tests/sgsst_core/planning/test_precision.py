@@ -1,4 +1,4 @@
-"""Tests of measuring speedup and gradient error of lower precisions."""
+"""Tests of measuring speedup and gradient error of lower precisions, and of choosing one."""
 
 from __future__ import annotations
 
@@ -13,19 +13,37 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning import context as module
-from sgsst_core.planning.context import convolution_ratio, equip, gradient_error, precision_ratio
-from sgsst_core.settings import make_settings
+from sgsst_core.planning.choices import choose_precision, compares_precisions
+from sgsst_core.planning.context import (
+    Comparison,
+    Hardware,
+    available_precisions,
+    compare_precisions,
+    compared_gradient,
+    convolution_ratio,
+    equip,
+)
+from sgsst_core.planning.plan import Device
+from sgsst_core.scene.spherical_harmonics import scene_colors
+from sgsst_core.settings import PlannedPrecision, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.rounding import RoundedToTf32, to_tf32
+from tests.rounding import RoundedToFloat16, RoundedToTf32, to_tf32
+from tests.sgsst_core.stylizing.test_trial import facts
 from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def error_of(network: FeatureNetwork, weights: BackboneWeights) -> Difference | None:
+def context_of(weights: BackboneWeights) -> module.PlanningContext:
     settings = make_settings(memory_limit=2 << 30)
-    context = equip(wall(sh_degree=1), cameras(1), settings, weights, ALONE, "cpu")
-    return gradient_error(replace(context, network=network), cameras(1)[0])
+    return equip(wall(sh_degree=1), cameras(1), settings, weights, ALONE, "cpu")
+
+
+def error_of(network: FeatureNetwork, weights: BackboneWeights) -> Difference:
+    """Return the gradient error of a network on a view of a wall."""
+    context, camera = context_of(weights), cameras(1)[0]
+    image = context.rasterizer.render(scene_colors(context.scene, camera), camera)
+    return Difference.of(*(compared_gradient(context, each, image)[0] for each in (network, context.network)))
 
 
 def test_tf32_gradient_error_is_a_thousandth_without_flipped_decisions(vgg16_weights: BackboneWeights) -> None:
@@ -36,9 +54,10 @@ def test_tf32_gradient_error_is_a_thousandth_without_flipped_decisions(vgg16_wei
     flipping = error_of(RoundedToTf32(vgg16_weights), vgg16_weights)
     deciding = error_of(RoundedToTf32(vgg16_weights, decisions=FeatureNetwork(vgg16_weights)), vgg16_weights)
     bfloat16 = error_of(FeatureNetwork(vgg16_weights, dtype=torch.bfloat16), vgg16_weights)
-    assert deciding is not None
-    assert flipping is not None
-    assert bfloat16 is not None
+    float16 = error_of(FeatureNetwork(vgg16_weights, dtype=torch.float16), vgg16_weights)
+    assert float16.relative_error == pytest.approx(flipping.relative_error, rel=0.2)
+    rounded = error_of(RoundedToFloat16(vgg16_weights), vgg16_weights)
+    assert rounded.relative_error == pytest.approx(float16.relative_error, rel=0.1)
     print(f"TF32: {flipping}, without flips: {deciding}; bfloat16: {bfloat16}")
     assert 1e-4 < deciding.relative_error < 3e-3
     assert deciding.relative_error < 0.1 * flipping.relative_error
@@ -46,8 +65,7 @@ def test_tf32_gradient_error_is_a_thousandth_without_flipped_decisions(vgg16_wei
     assert 0.95 < bfloat16.cosine < flipping.cosine < deciding.cosine <= 1
 
 
-def test_float32_has_no_gradient_error_and_tf32_on_a_cpu_is_float32(tiny_weights: BackboneWeights) -> None:
-    assert error_of(FeatureNetwork(tiny_weights), tiny_weights) is None
+def test_tf32_on_a_cpu_has_no_gradient_error(tiny_weights: BackboneWeights) -> None:
     assert error_of(FeatureNetwork(tiny_weights, tf32=True), tiny_weights) == Difference(0.0, pytest.approx(1.0))  # type: ignore[arg-type]
 
 
@@ -60,24 +78,37 @@ def test_rounding_is_to_nearest_and_even() -> None:
 # --- speedup -------------------------------------------------------------------------------------------------------
 
 
-def test_convolutions_are_timed_in_available_precisions() -> None:
+def test_precisions_are_compared_on_a_view(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A precision whose convolutions are not faster is not tried."""
+    context = context_of(tiny_weights)
+    for ratio in (0.5, 2.0):
+        monkeypatch.setattr(module, "convolution_ratio", lambda precision, device, ratio=ratio: ratio)
+        compared = compare_precisions(context, cameras(1)[0], ["bfloat16"])["bfloat16"]
+        if ratio < 1:
+            assert compared == Comparison(ratio)
+        else:
+            assert compared.error is not None
+            assert compared.speedup > 0
+            assert 0 < compared.error.relative_error < 1
+
+
+def test_convolutions_are_timed() -> None:
     assert convolution_ratio("bfloat16", "cpu") > 0
-    assert precision_ratio("bfloat16", "cpu", ALONE) is not None
-    assert precision_ratio("tf32", "cpu", ALONE) is None
 
 
 @pytest.mark.parametrize(
-    ("capabilities", "ratio"), [({"avx512_bf16": True}, 3.0), ({"amx_bf16": False}, None), (None, None)]
+    ("capabilities", "native"), [({"avx512_bf16": True}, True), ({"amx_bf16": False}, False), (None, False)]
 )
-def test_bfloat16_is_measured_beside_float32_unless_emulated(
-    monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool] | None, ratio: float | None
+def test_bfloat16_is_tried_unless_it_is_emulated(
+    monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool] | None, native: bool
 ) -> None:
-    """Without the list of capabilities, as in earlier versions of PyTorch, nothing is measured."""
+    """Without the list of capabilities, as in earlier versions of PyTorch, it must be requested."""
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
     if capabilities is None:
         monkeypatch.delattr(torch.cpu, "get_capabilities")
-    monkeypatch.setattr(module, "convolution_ratio", lambda precision, device: 3.0 * (precision == "bfloat16"))
-    assert precision_ratio("float32", "cpu", ALONE) == ratio
+    for requested, expected in (("auto", native), ("bfloat16", True), ("float32", False), ("tf32", False)):
+        names = available_precisions(make_settings(precision=requested), "cpu", ALONE)
+        assert names == ["bfloat16"] * expected
 
 
 def test_one_thread_is_timed_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,17 +124,98 @@ def test_one_thread_is_timed_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (threads, torch.get_num_threads()) == ([1, 1], 2)
 
 
-def test_tf32_needs_every_rank_to_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_rank_must_have_the_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     class Others(type(ALONE)):  # type: ignore[misc]
         def all_gather(self, value: Any) -> list[Any]:
-            return [value, has_it]
+            return [value, {"tf32": has_it, "float16": has_it, "bfloat16": True}]
 
-    monkeypatch.setattr(module, "has_tf32", lambda device: True)
-    monkeypatch.setattr(module, "convolution_ratio", lambda asked, device: 3.0)
-    has_it = True
-    assert precision_ratio("tf32", "cuda", Others()) == 3.0
-    has_it = False
-    assert precision_ratio("tf32", "cuda", Others()) is None
+    for name in ("has_tf32", "has_float16", "has_bfloat16_instructions"):
+        monkeypatch.setattr(module, name, lambda device: True)
+    for has_it in (True, False):
+        names = available_precisions(make_settings(), "cuda", Others())
+        assert ("tf32" in names) is ("float16" in names) is has_it
+
+
+# --- choice --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("device", "measured", "chosen"),
+    [
+        ("cpu", None, "float32"),
+        ("cpu", {}, "float32"),
+        ("cpu", {"bfloat16": (0.01, None)}, "float32"),
+        ("cpu", {"bfloat16": (1.4, 0.3)}, "float32"),
+        ("cpu", {"bfloat16": (1.8, 0.1)}, "bfloat16"),
+        ("cpu", {"bfloat16": (1.8, 0.9)}, "float32"),
+        ("cuda", {"tf32": (5.0, 0.05), "bfloat16": (9.0, 0.15)}, "bfloat16"),
+        ("cuda", {"tf32": (8.5, 0.05), "bfloat16": (9.0, 0.15)}, "tf32"),
+        ("cuda", {"tf32": (1.2, 0.05), "bfloat16": (9.0, 0.6)}, "tf32"),
+        ("cuda", {"tf32": (5.0, 0.05), "float16": (8.9, 0.05), "bfloat16": (9.0, 0.15)}, "float16"),
+        ("cuda", {"tf32": (5.0, 0.05), "float16": (8.9, float("inf")), "bfloat16": (9.0, 0.15)}, "bfloat16"),
+    ],
+)
+def test_precision_is_chosen_by_speed_and_error(
+    device: Device, measured: dict[PlannedPrecision, tuple[float, float | None]] | None, chosen: str
+) -> None:
+    compared = (
+        None
+        if measured is None
+        else {
+            name: Comparison(speedup, speedup, None if error is None else Difference(error, 0.99))
+            for name, (speedup, error) in measured.items()
+        }
+    )
+    known = replace(facts(), machine=Hardware(device, 1 << 33), precisions=compared)
+    assert choose_precision(known, make_settings()) == chosen
+    assert choose_precision(known, make_settings(precision="float32")) == "float32"
+    assert choose_precision(known, make_settings("paper")) == "float32"
+    tried = measured and measured.get("bfloat16", (0.0, None))[1] is not None
+    assert choose_precision(known, make_settings(precision="bfloat16")) == ("bfloat16" if tried else "float32")
+
+
+def test_precisions_are_compared_only_for_long_jobs() -> None:
+    """Steps of phase 1 count as much as their pixels."""
+    size = (545, 980)
+    assert compares_precisions([size], make_settings(steps_coarse=0, steps_sos=4))
+    assert not compares_precisions([size], make_settings(steps_coarse=0, steps_sos=3))
+    assert not compares_precisions([size], make_settings(steps_coarse=100, steps_sos=0, coarsest_side=128))
+    assert not compares_precisions([size], make_settings(precision="float32"))
+    assert not compares_precisions([size], make_settings("paper"))
+    assert compares_precisions([(32, 32)], make_settings(precision="bfloat16"))
+
+
+def test_measured_precision_is_used_said_and_repeatable(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A job with a chosen precision has the bits of one in which it was requested."""
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
+    monkeypatch.setattr("sgsst_core.planning.choices._COMPARED_PIXELS", 0)
+    for speedup, chosen in ((1.9, "bfloat16"), (1.2, "float32")):
+        measured = Comparison(speedup, 1.4, Difference(0.125, 0.99))
+        monkeypatch.setattr(
+            "sgsst_core.stylizing.planner.compare_precisions",
+            lambda context, camera, names, own=measured: dict.fromkeys(names, own),
+        )
+        auto, asked = (
+            Stylizer.planned(ball(300), cameras(2), style(), make_settings(precision=name), weights=tiny_weights)
+            for name in ("auto", chosen)
+        )
+        assert auto.job.plan.precision == auto.job.network.precision == chosen
+        line = next(decision for decision in auto.job.plan.decisions if decision.item == "precision")
+        assert line.decision == f"features in {chosen}"
+        assert f"convolutions in bfloat16 are {speedup} times as fast as in float32" in line.reason
+        assert "a view's loss 1.4 times, with an error of 0.12" in line.reason
+        assert auto.run_step().loss == asked.run_step().loss
+        assert torch.equal(auto.sh_dc, asked.sh_dc)
+
+
+def test_short_job_is_not_measured(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "convolution_ratio", lambda *_: pytest.fail("measured"))
+    job = Stylizer.planned(ball(300), cameras(2), style(), make_settings(), weights=tiny_weights).job
+    line = next(decision for decision in job.plan.decisions if decision.item == "precision")
+    assert (line.decision, job.network.precision) == ("features in float32", "float32")
+    assert "too little time" in line.reason
 
 
 def test_tf32_on_a_cpu_gives_the_float32_job(tiny_weights: BackboneWeights) -> None:
