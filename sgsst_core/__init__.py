@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 # pages, so a step on a CPU touches a few thousand pages instead of millions. Linux provides huge pages if it can; other
 # systems ignore the variable.
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+# OpenMP (GCC's, which PyTorch brings) reads these when it starts. A thread that waits for others then spins for some
+# microseconds, about what waking it takes. The default is milliseconds, in which it keeps a busy processor from the
+# threads that it waits for.
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 # PyTorch reads this one when it starts CUDA. Views of many sizes would otherwise leave gaps between blocks of memory
 # that no later block fits into.
 if os.environ.keys().isdisjoint({"PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF"}):

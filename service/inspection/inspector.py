@@ -59,7 +59,8 @@ _LARGE_BYTES = 64 << 20
 #: allocation.
 _ENVIRONMENT = (
     *("HOME", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "PYTHONDONTWRITEBYTECODE", "PYTHONHOME", "PYTHONPATH"),
-    *("SGSST_CACHE", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "GOMP_SPINCOUNT", "MALLOC_ARENA_MAX", "THP_MEM_ALLOC_ENABLE"),
+    *("SGSST_CACHE", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "MALLOC_ARENA_MAX", "THP_MEM_ALLOC_ENABLE"),
+    *("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"),
 )
 #: Command of the inspecting process, run without a shell; tests replace it by one with compromised readers.
 COMMAND: tuple[str, ...] = (sys.executable, "-m", "service.inspection.process")
