@@ -1,56 +1,106 @@
-"""Seconds from the start of a process to its first pictures, as a job of the service writes them.
+"""Seconds to the first pictures of a job, from a cold start: of the command, and of the page in a real browser.
 
-python -m benchmarks.first_picture SCENE STYLE OUT [--cameras FILE] [--preset preview] [--seconds 30]
+python -m benchmarks.first_picture SCENE STYLE [--cameras FILE] [--command-within 90] [--page-within 600]
 
-Without --cameras, views are an orbit of 24. Previews are written to OUT before planning, and then after each
-step until `--seconds` have passed.
+The command is timed from the start of its process to its end. The page's times start with the click on Start, in a
+service that has run no job: until it shows the painting's colors, the first strokes (a preview after a tenth of the
+steps), and the result. Without --cameras, the views are an orbit.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
-import psutil
+import httpx2
 
-from sgsst_core import make_settings
-from worker.job import JobSpec, SceneRequest
-from worker.prepare import prepare
-from worker.previews import Previews
-from worker.styles import StyleFile
+from benchmarks.machine import write_result
+from tests.api.page.browser import Watched, chromium, open_browser
+from tests.api.service import Service
+
+#: Aims in seconds on two quiet cores; that of a result is its time budget and a tenth.
+_AIMS = {"colors": 10.0, "strokes": 60.0}
+#: Portion of the steps after which strokes are recognizable.
+_STROKES = 0.1
+_POLL_SECONDS = 0.2
+_SHOWN = "() => [...document.querySelectorAll('figure.preview img')].map((each) => each.src)"
+
+
+def time_command(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
+    """Return the seconds until the command has written its result, and its budget."""
+    views = ["--cameras", str(arguments.cameras)] if arguments.cameras else ["--orbit", "auto"]
+    line = [sys.executable, "-m", "api.cli", "stylize", str(arguments.scene), "--style", str(arguments.style), *views]
+    started = time.monotonic()
+    subprocess.run(
+        [*line, "--out", str(folder / "stylized.ply"), "--within", str(arguments.command_within)], check=True
+    )
+    return {"result": time.monotonic() - started, "budget": arguments.command_within}
+
+
+def time_page(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
+    """Return the seconds from the click on Start to each kind of picture, and the time budget."""
+    given = {"Scene": arguments.scene, "Style": arguments.style}
+    given |= {"Cameras": arguments.cameras} if arguments.cameras else {}
+    times: dict[str, float] = {}
+    with Service(folder / "data") as service, open_browser() as browser:
+        page: Any = Watched(browser, service.url, width=1280, height=800).page
+        page.goto(service.url)
+        page.locator(".presets input").first.wait_for()
+        for role, path in given.items():
+            page.get_by_label(role, exact=True).set_input_files(path)
+        orbit = page.get_by_label("Orbit the object")
+        if not arguments.cameras and not orbit.is_checked():
+            orbit.check()
+        page.locator("[data-name=within] input").fill(str(arguments.page_within / 60))
+        page.get_by_role("button", name="Start", exact=True).click()
+        started = time.monotonic()
+        page.wait_for_url(re.compile("#/jobs/"))
+        job = page.url.rpartition("/")[2]
+        while "result" not in times:
+            time.sleep(_POLL_SECONDS)
+            now, seen = time.monotonic() - started, page.evaluate(_SHOWN)
+            record = httpx2.get(f"{service.url}/v1/jobs/{job}").json()
+            if record["status"] in ("failed", "canceled"):
+                raise SystemExit(f"the job has failed: {record['error']}")
+            total = (record.get("progress") or {}).get("total") or 0
+            steps = [int(step) for src in seen for step in re.findall(r"step_(\d+)", src)]
+            if steps:
+                times.setdefault("colors", now)
+            if steps and max(steps) > _STROKES * total > 0:
+                times.setdefault("strokes", now)
+            if record["status"] == "succeeded":
+                times["result"] = now
+    return {**times, "budget": arguments.page_within}
 
 
 def main() -> None:
-    """Run a job until `--seconds` have passed, and print when each preview was written."""
-    started = psutil.Process().create_time()
+    """Print a table of seconds and aims, and write it to benchmarks/results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("style", type=Path)
-    parser.add_argument("out", type=Path)
     parser.add_argument("--cameras", type=Path)
-    parser.add_argument("--preset", default="preview")
-    parser.add_argument("--seconds", type=float, default=30)
+    parser.add_argument("--command-within", type=float, default=90)
+    parser.add_argument("--page-within", type=float, default=600)
     arguments = parser.parse_args()
-    source = SceneRequest(scene=arguments.scene, cameras=arguments.cameras, orbit=None if arguments.cameras else 24)
-    settings, styles = make_settings(arguments.preset), (StyleFile(arguments.style),)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    request = JobSpec(
-        source=source, styles=styles, out=arguments.out / "stylized.ply", settings=settings, backbone="vgg16"
-    )
-    preview = Previews(arguments.out / "previews", 0.0, print)
-    job = prepare(request, preview=preview)
-    from worker.execute import execute  # as jobs of the service do: after the first preview
-
-    execute(
-        job,
-        progress=lambda progress: None,
-        stop=lambda: time.time() - started > arguments.seconds,
-        warn=print,
-        preview=preview,
-    )
-    for path in sorted((arguments.out / "previews").iterdir()):
-        print(f"{path.name}: {path.stat().st_mtime - started:.1f} s after the process started")
+    if chromium() is None:
+        raise SystemExit("there is no Chromium: apt-get install chromium, or name one by SGSST_CHROMIUM")
+    figures: dict[str, dict[str, float]] = {}
+    for name, measure in (("command", time_command), ("page", time_page)):
+        with tempfile.TemporaryDirectory() as folder:
+            figures[name] = {each: round(seconds, 1) for each, seconds in measure(arguments, Path(folder)).items()}
+    print(f"{'':10}{'until':10}{'seconds':>9}{'aim':>9}")
+    for name, times in figures.items():
+        for what in ("colors", "strokes", "result"):
+            aim = _AIMS.get(what, 1.1 * times["budget"])
+            if what in times:
+                print(f"{name:10}{what:10}{times[what]:9.1f}{aim:9.1f}")
+    print(write_result(f"first_picture_{arguments.scene.stem}", figures))
 
 
 if __name__ == "__main__":

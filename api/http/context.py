@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -32,6 +33,7 @@ from service.files.blobs import Blobs
 from service.files.threads import FileThreads, OwnerLimit
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
+from service.scheduling.machine import Machine
 from service.settings import ServiceSettings, is_loopback
 from service.store import Store
 from service.store.quotas import NO_QUOTAS, Quotas
@@ -45,6 +47,8 @@ SESSION_COOKIE = "sgsst_session"
 _READING = ("GET", "HEAD", "OPTIONS")
 #: A Host header: an IPv6 address in brackets, or a name or IPv4 address, then optionally a port.
 _HOST = re.compile(r"(?:\[([^\]]*)\]|([^:/?#@\[\]\\]*))(?::[0-9]*)?")
+#: Time budgets in seconds that the page proposes, with a GPU and without one.
+_GPU_BUDGET, _CPU_BUDGET = 60, 600
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,11 @@ class Context:
     threads: FileThreads
     readers: OwnerLimit
     fetcher: Fetcher
+
+    @cached_property
+    def usual_budget(self) -> int:
+        """Time budget in seconds that the page proposes for jobs on this machine."""
+        return _GPU_BUDGET if Machine.find(self.settings).gpus else _CPU_BUDGET
 
 
 @dataclass(frozen=True)

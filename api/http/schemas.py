@@ -322,6 +322,21 @@ class UploadView(BaseModel):
     expires_at: Time
 
 
+class UpView(BaseModel):
+    """Up direction of an orbit."""
+
+    model_config = _with_example(
+        direction="-y", sure=False, candidates=["-y", "z"], reason="neither a ground nor a long axis was found"
+    )
+
+    direction: str = Field(description="Axis, such as `-y`, or three components.")
+    sure: bool = Field(description="Whether the scene determines it, or the parameter `up` gives it.")
+    candidates: list[str] = Field(
+        description="Values of the parameter `up` to choose from, the likeliest first; two if it is not sure."
+    )
+    reason: str
+
+
 class PlanView(BaseModel):
     """Plan of a job that was not queued."""
 
@@ -336,6 +351,7 @@ class PlanView(BaseModel):
         workers=1,
         estimated_seconds=12.4,
         total_seconds=21.9,
+        up=None,
         warnings=["region left: ignored, because it has no Gaussians: half-space=1,0,0,9"],
         memory_bytes=946495488,
         device_memory_bytes=None,
@@ -368,6 +384,7 @@ class PlanView(BaseModel):
         description="Estimated seconds of the whole job after it leaves the queue: start, reading, planning, steps, "
         "measurements and files; null if unknown. A job that stops early takes less.",
     )
+    up: UpView | None = Field(None, description="Up direction of an orbit; null with cameras.")
     warnings: list[str] = Field(
         default_factory=list, description="Decisions that need attention, such as views that see nothing."
     )
@@ -461,10 +478,11 @@ class SharedView(BaseModel):
 class SessionView(BaseModel):
     """Session state for the browser."""
 
-    model_config = _with_example(keys_needed=True, signed_in=True)
+    model_config = _with_example(keys_needed=True, signed_in=True, within=600)
 
     keys_needed: bool = Field(description="Whether an API key is required.")
     signed_in: bool = Field(description="Whether the cookie belongs to a valid session.")
+    within: int = Field(description="Time budget in seconds that suits this machine: 60 with a GPU, 600 without.")
 
 
 class Health(BaseModel):

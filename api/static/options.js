@@ -2,7 +2,7 @@
 /** Inputs for a job's parameters, generated from the API's OpenAPI document. */
 import { h, newId } from "./dom.js";
 import { strengthName } from "./strength.js";
-import { words } from "./words.js";
+import { seconds, words } from "./words.js";
 
 /**
  * @typedef {object} Control
@@ -48,12 +48,13 @@ export function optionControl(name, schema, { title = titleOf(name), hint = true
   input.id = id;
   input.setAttribute("aria-describedby", [help && `${id}h`, `${id}e`].filter(Boolean).join(" "));
   const element = h("div.option", { "data-name": name }, h("label", { htmlFor: id }, title), h("div.value", input, unit ? h("span.unit", unit) : null), help, error);
+  const factor = words.options.factors[name] ?? 1, parsed = (/** @type {string} */ text) => (typeof read(text) === "number" ? factor * read(text) : read(text));
   const wrong = (/** @type {string} */ text) => showWrong(input, error, text);
   input.addEventListener("input", () => wrong(""));
   return {
     name, title, help: `${told ?? ""} ${schema.description ?? ""}`, element, wrong, suggest,
-    value: () => read(input.value),
-    set: (value) => void (input.value = value === undefined || value === null ? "" : String(value)),
+    value: () => parsed(input.value),
+    set: (value) => void (input.value = value === undefined || value === null ? "" : String(factor === 1 ? value : value / factor)),
     follow: (preset) => suggest(schema["x-presets"]?.[preset] ?? fallback),
     problem: () => (input.validity?.badInput ? words.refusals.notNumber : problemOf(kinds, read(input.value))),
   };
@@ -92,6 +93,7 @@ export function problemOf(kinds, value) {
  */
 export function valueText(name, value) {
   if (name === "content_weight") return strengthName(value);
+  if (name === "within") return seconds(value);
   if (/background$/.test(name) && Array.isArray(value)) return value.map((part) => Math.round(255 * part)).join(", ");
   if (Array.isArray(value)) return value.map((each) => valueText("", each)).join(typeof value[0] === "object" ? "; " : ", ");
   if (value === true) return words.submit.on;

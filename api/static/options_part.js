@@ -23,6 +23,8 @@ export class OptionsPart {
     this.schema = null;
     /** @type {string | undefined} */
     this.preset = undefined;
+    /** Time budget in seconds that suits the service's machine. */
+    this.budget = 0;
     /** Elements with the estimated time of each preset. @type {Map<string, HTMLElement>} */
     this.times = new Map();
     this.presets = h("fieldset.presets", h("legend", say.preset));
@@ -45,6 +47,7 @@ export class OptionsPart {
   async load(signal, restore) {
     let schema;
     try {
+      ({ within: this.budget } = await get("v1/session", signal));
       const document = await get("openapi.json", signal), parameters = document.components.schemas.JobParameters;
       schema = parameters.properties;
       this.groups = parameters["x-groups"];

@@ -105,7 +105,7 @@ export class SubmitView {
       options.restore(draft.values, draft.preset);
       if (draft.orbiting) this.views.restore();
       this.views.show();
-    }
+    } else options.restore({ within: options.budget }, undefined);
     this.form.addEventListener("input", (/** @type {Event} */ event) => {
       this.saveDraft();
       if (!options.presets.contains(event.target)) options.forgetTimes();
@@ -268,7 +268,7 @@ export class SubmitView {
 
   /** Plan the job again, with a time budget. */
   hurry() {
-    this.options.restore({ within: 600 }, undefined);
+    this.options.restore({ within: this.options.budget }, undefined);
     this.act(true);
   }
 

@@ -160,7 +160,9 @@ export const words = {
       orbit: "auto: as many as the scene needs.", up: "auto: estimated from the scene.", elevation: "One ring at this height. Otherwise, as many rings as the scene needs.", radius: "From the scene's center.",
       sh_attenuation: "0 keeps highlights that move with the view, 1 removes them.", stroke_depth: "Strokes of the same size in the scene: larger ones nearby.", unseen: "neighbors: painted like what is around them. freeze: left as they are.",
     }),
-    units: /** @type {Record<string, string>} */ ({ content_weight: "", resolution: "", views: "", within: "seconds", style_scale: "×", refine: "×", sh_attenuation: "" }),
+    units: /** @type {Record<string, string>} */ ({ content_weight: "", resolution: "", views: "", within: "minutes", style_scale: "×", refine: "×", sh_attenuation: "" }),
+    /** Units of the service for one of `units`. */
+    factors: /** @type {Record<string, number>} */ ({ within: 60 }),
     defaults: /** @type {Record<string, string>} */ ({ content_weight: "strong", orbit: "auto", radius: "automatic" }),
   },
   uploads: {

@@ -172,8 +172,10 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
         memory, on_device = expected.peak_bytes, expected.device_bytes
         coarse = expected.seconds_coarse or expected.seconds
         seconds = expected.seconds * settings.steps_sos + coarse * job_plan.steps_coarse
+    up = inputs.orbit and inputs.orbit.up
     return {
         **findings,
+        "up": up and {"direction": up.name, "sure": up.sure, "candidates": up.candidates, "reason": up.reason},
         "plan": plan_json(job_plan),
         "estimated_seconds": seconds,
         "total_seconds": total,

@@ -38,6 +38,8 @@ _VISIBLE = 0.03
 _DIRECTIONS = 300
 #: Up in most captures, since COLMAP's y points down.
 USUAL_UP = (0.0, -1.0, 0.0)
+#: Up in programs that model scenes, such as Blender, and in most captures whose axes are not COLMAP's.
+_SECOND_UP = (0.0, 0.0, 1.0)
 #: Directions this close to a world axis are replaced by it, because captures are mostly aligned by hand.
 _SNAP = math.cos(math.radians(10))
 #: Thickness of a ground layer as a fraction of the subject's size, and its maximum distance from the subject's end, as
@@ -56,6 +58,8 @@ _STANDS = 1.6
 #: minimum ratio of the foot's area to that of the other end, and minimum fraction of the whole subject's area seen from
 #: above.
 _FOOT, _WIDER, _MIN_FOOT = 0.015, 1.3, 0.05
+#: Ratio of the areas of both ends from which on a foot is certain, even if the subject could lie on a side too.
+_MUCH_WIDER = 3.0
 #: Minimum foot area, as a fraction of the whole, of a subject that lies along its length, such as a car on its wheels.
 _LIES = 0.5
 
@@ -145,12 +149,13 @@ def _without_strays(points: Tensor, weights: Tensor) -> Tensor:
 
 def _pieces(points: Tensor, weights: Tensor) -> Tensor:
     """Return the mask [P] bool of points in pieces with enough weight; a piece is a connected set of grid cells."""
-    low = points.amin(0)
-    side = float((points.amax(0) - low).amax())
+    low, high = points.amin(0), points.amax(0)
+    side = float((high - low).amax())
     cells = min(_CELLS, max(4, round(len(points) ** (1 / 3))))  # keeps random points connected
     if not side > 0:
         return torch.ones(len(points), dtype=torch.bool)
-    cell = ((points - low) / side * cells).long().clamp_max(cells - 1)
+    # centered, so that a scene on its side has the same pieces
+    cell = (((points - (low + high) / 2) / side + 0.5) * cells).long().clamp(0, cells - 1)
     flat = ((cell[:, 0] * cells + cell[:, 1]) * cells + cell[:, 2]).numpy()
     held = np.bincount(flat, weights.numpy(), cells**3)
     touching = np.ones((3, 3, 3), dtype=bool)
@@ -196,12 +201,20 @@ class Up:
         reason: Display text, such as "a flat layer lies under all of it".
         sure: Whether the scene determines the direction; False if it relies on the usual convention.
         ground: Whether there is a ground under the subject, which hides it from below.
+        other: [3] float64, the second most likely direction if the scene does not determine it; None if it does.
     """
 
     direction: Tensor
     reason: str
     sure: bool = True
     ground: bool = False
+    other: Tensor | None = None
+
+    @property
+    def candidates(self) -> list[str]:
+        """World axes nearest to the direction and to the other one, such as ["-y", "z"]."""
+        directions = [self.direction] if self.other is None else [self.direction, self.other]
+        return [Up(_nearest_axis(each), "").name for each in directions]
 
     @property
     def name(self) -> str:
@@ -228,19 +241,24 @@ def find_up(subject: Subject) -> Up:
     spreads = (offsets @ axes).square().mul(subject.weights[:, None]).sum(0).sqrt()
     longer = float(spreads[2] / spreads[1].clamp_min(1e-300)) if float(spreads[2]) > 0 else 1.0
     if longer < _STANDS or subject.left_out > _WHOLE:
-        return Up(usual, "neither a ground nor a long axis was found, and most captures point this way", sure=False)
+        reason = "neither a ground nor a long axis was found, and most captures point this way"
+        return Up(usual, reason, sure=False, other=torch.tensor(_SECOND_UP, dtype=torch.float64))
     long = axes[:, 2]
     ends = [_foot(subject, long), _foot(subject, -long)]
     lying = abs(float(long @ usual)) < 0.5 and _foot(subject, usual) >= max(_LIES, _WIDER * max(ends))
-    if lying:
-        return Up(usual, f"the subject is {longer:.1f} times as long as wide, and rests lengthwise on a broad foot")
+    has_foot = max(ends) > max(_MIN_FOOT, _WIDER * min(ends))
+    if lying and not (has_foot and max(ends) > _MUCH_WIDER * min(ends)):
+        up = _snapped(long if ends[0] > ends[1] else -long)
+        text = f"the subject is {longer:.1f} times as long as wide, and rests lengthwise on a broad foot"
+        return Up(usual, text, sure=not has_foot, other=up if has_foot else None)
     stands = f"the subject is {longer:.1f} times as tall as wide"
-    if max(ends) > max(_MIN_FOOT, _WIDER * min(ends)):
+    if has_foot:
         up = long if ends[0] > ends[1] else -long
         broader = f"{max(ends) / min(ends):.1f} times as broad as" if max(ends) < 100 * min(ends) else "broader than"
         return Up(_snapped(up), f"{stands}, and its foot is {broader} the other end")
     up = long if _habit(long) > 0 else -long
-    return Up(_snapped(up), f"{stands}; both ends are alike, and most captures point this way", sure=False)
+    reason = f"{stands}; both ends are alike, and most captures point this way"
+    return Up(_snapped(up), reason, sure=False, other=usual if abs(float(up @ usual)) < _SNAP else _snapped(-up))
 
 
 def _habit(direction: Tensor) -> float:
@@ -252,10 +270,13 @@ def _habit(direction: Tensor) -> float:
 def _snapped(direction: Tensor) -> Tensor:
     """Return the nearest world axis if it is close, else the direction itself."""
     direction = direction / direction.norm()
-    largest = int(direction.abs().argmax())
-    if float(direction[largest].abs()) < _SNAP:
-        return direction
-    axis = torch.zeros(3, dtype=torch.float64)
+    axis = _nearest_axis(direction)
+    return axis if float(direction @ axis) >= _SNAP else direction
+
+
+def _nearest_axis(direction: Tensor) -> Tensor:
+    """Return the world axis [3] nearest to a direction [3]."""
+    largest, axis = int(direction.abs().argmax()), torch.zeros(3, dtype=torch.float64)
     axis[largest] = direction[largest].sign()
     return axis
 

@@ -115,14 +115,14 @@ class TimeChoice:
             chosen["learning_rate_end"] = settings.learning_rate_at(fraction)
         return settings.model_copy(update=chosen)
 
-    def decision(self, within: float | None) -> Decision:
-        """Return the choice as a decision of a plan, given the seconds of the budget."""
+    def decision(self, within: float | None, steps: int) -> Decision:
+        """Return the choice as a decision of a plan, given the seconds of the budget and the steps of the plan."""
         views = f"{len(self.views)} view{'s' if len(self.views) != 1 else ''}"
         reason = f"about {duration(self.seconds, ' ')} from here on"
         reason += f" of {duration(within, ' ')}" if within else ", as chosen before"
         more = f"; {self.more}" if self.more else ""
-        phases = f"{self.steps_coarse} and {self.steps_sos} steps"
-        return Decision("time budget", f"{self.resolution} px, {views}, {phases}", reason + more)
+        taken = f"{steps} step{'s' if steps != 1 else ''}"
+        return Decision("time budget", f"{self.resolution} px, {views}, {taken}", reason + more)
 
     def corrected(self, settings: Settings, seconds: float, once: float, left: float) -> TimeChoice:
         """Return the choice with the steps that fit, now that a step of the chosen views has been measured.

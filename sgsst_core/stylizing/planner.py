@@ -160,7 +160,7 @@ def plan_job(
         cost = launch_cost(job) if job is not None and choices.considers_graphs(draft, facts, settings) else None
         plan = collectives.broadcast(lambda: completed_plan(draft, facts, settings, pixels, trials, cost))
         plan = with_spare_memory(plan, facts, of_a_view)  # graphs, which the draft lacks, leave less
-        lines += [chosen.decision(asked.within)] if chosen else []
+        lines += [chosen.decision(asked.within, plan.steps_coarse + settings.steps_sos)] if chosen else []
         intersections = max(trials[plan.ranks].spare - (draft.spare - plan.spare), 0)
         plan = replace(plan, spare_intersections=intersections, refinement=refinement, time_choice=chosen)
         plan = replace(plan, decisions=(*lines, *plan.decisions))

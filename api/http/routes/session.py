@@ -62,7 +62,8 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     response.headers["Cache-Control"] = "no-store"
     cookie = request.cookies.get(SESSION_COOKIE)
     key = await asyncio.to_thread(context.store.sessions.find, cookie) if cookie else None
-    return SessionView(keys_needed=context.settings.keys_required, signed_in=key is not None)
+    within = await asyncio.to_thread(lambda: context.usual_budget)
+    return SessionView(keys_needed=context.settings.keys_required, signed_in=key is not None, within=within)
 
 
 @router.delete(

@@ -13,6 +13,7 @@ import pytest
 
 from api.http.limits import MOST_FAILURES, WITHIN_SECONDS, SignIns
 from service import problems
+from service.scheduling.machine import Machine
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.access import MOST_SESSIONS
@@ -43,6 +44,11 @@ def key(store: Store) -> str:
     return store.keys.create("alice")[1]
 
 
+def budget() -> int:
+    """Return the time budget that the page proposes on this machine."""
+    return 60 if Machine.find(ServiceSettings()).gpus else 600
+
+
 def sign_in(browser: httpx2.Client, key: str, **headers: str) -> httpx2.Response:
     return browser.post("/v1/session", json={"key": key}, headers=headers)
 
@@ -69,7 +75,7 @@ def test_key_is_exchanged_for_cookie(browser: httpx2.Client, store: Store) -> No
     row, key = store.keys.create("alice")
     job_id = job_of(store, row.id)
     refused(browser.get("/v1/jobs"), 401, "unauthorized")
-    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False}
+    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False, "within": budget()}
     answer = sign_in(browser, key)
     assert (answer.status_code, answer.content) == (204, b"")
     cookie = cookie_of(answer)
@@ -80,7 +86,7 @@ def test_key_is_exchanged_for_cookie(browser: httpx2.Client, store: Store) -> No
     assert not cookie["secure"], "this is http"
     assert int(cookie["max-age"]) == 7 * 86_400
     assert key not in cookie.value
-    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": True}
+    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": True, "within": budget()}
     assert [job["id"] for job in browser.get("/v1/jobs").json()["jobs"]] == [job_id]
 
 
@@ -130,7 +136,7 @@ def test_revoking_key_ends_its_sessions(browser: httpx2.Client, store: Store) ->
     assert browser.get("/v1/jobs").status_code == 200
     store.keys.revoke(row.id)
     refused(browser.get("/v1/jobs"), 401, "unauthorized")
-    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False}
+    assert browser.get("/v1/session").json() == {"keys_needed": True, "signed_in": False, "within": budget()}
 
 
 def test_api_processes_share_sessions(browser: httpx2.Client, service: Service, key: str) -> None:
@@ -381,7 +387,7 @@ def test_sessions_per_key_are_limited(tmp_path: Path) -> None:
 def test_invalid_cookie_is_ignored_without_keys(services: Services) -> None:
     with services().client() as browser:
         browser.cookies.set(COOKIE, "old")
-        assert browser.get("/v1/session").json() == {"keys_needed": False, "signed_in": False}
+        assert browser.get("/v1/session").json() == {"keys_needed": False, "signed_in": False, "within": budget()}
         assert browser.get("/v1/jobs").status_code == 200
         refused(browser.get("/v1/jobs", headers={"Origin": "https://evil.example"}), 403, "foreign-site")
 

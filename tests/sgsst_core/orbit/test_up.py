@@ -76,6 +76,7 @@ def test_up_is_conventional_without_evidence(scene: Scene) -> None:
     up = up_of(scene)
     assert up.name == "-y"
     assert not up.sure
+    assert up.candidates == ["-y", "z"]
     assert "most captures" in up.reason
 
 
@@ -94,3 +95,25 @@ def test_up_snaps_to_a_close_world_axis_only() -> None:
     slanted = up_of(moved(figure(), Rotation.from_euler("x", 30, degrees=True)))
     assert slanted.name.startswith("(")
     assert float(slanted.direction.norm()) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_stick_may_stand_or_lie_and_a_foot_is_certain(quarters: int) -> None:
+    rotation = Rotation.from_euler("z", 90 * quarters, degrees=True)
+    stick = up_of(moved(scene_of(box((-0.2, -1, -0.2), (0.2, 1, 0.2), 4000)), rotation, 1.0))
+    assert not stick.sure
+    assert stick.candidates == (["x", "-y"] if quarters % 2 else ["-y", "y"])
+    standing = up_of(moved(figure(), rotation, 1.0))
+    assert standing.candidates == [["-y", "x", "y", "-x"][quarters]]
+
+
+def test_pieces_are_the_same_in_a_mirror() -> None:
+    """Crumbs lie at many distances around a box, about a cell of the grid from each other."""
+    generator = torch.Generator().manual_seed(4)
+    crumbs = (torch.rand(60, 3, generator=generator) - 0.5) * torch.tensor([2.0, 1.3, 0.7]) * 1.6
+    points = torch.cat(
+        [box((-0.5, -0.4, -0.2), (0.5, 0.4, 0.2), 3000), *(crumbs + 0.002 * index for index in range(30))]
+    )
+    subject, mirrored = (find_subject(scene_of(each)) for each in (points, -points))
+    assert 0 < subject.left_out == pytest.approx(mirrored.left_out)
+    assert len(subject.points) == len(mirrored.points)
