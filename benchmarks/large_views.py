@@ -71,8 +71,8 @@ def _measure(arguments: argparse.Namespace) -> None:
     view = with_size(cameras[0], width, height)
     settings = make_settings(
         "standard",
-        steps_coarse=0,
         steps_sos=arguments.steps,
+        scale_sampling=1,
         early_stop=False,
         memory_limit=int(arguments.memory * 1e9),
         precision=arguments.precision,

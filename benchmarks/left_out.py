@@ -127,7 +127,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     scene = read_scene(Path(ply)).scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)
     cached = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
-    settings = make_settings("standard", steps_coarse=0, steps_sos=10_000, early_stop=False)
+    settings = make_settings("standard", steps_sos=10_000, scale_sampling=1, early_stop=False)
     stylizer = with_components(cached, scene, views, Style.of(load_image(arguments.style)), settings)
     for _ in range(arguments.rounds * len(stylizer.job.views.covered)):
         stylizer.run_step()

@@ -3,7 +3,7 @@
 python -m benchmarks.standard_preset SCENE.ply CAMERAS|orbit:N STYLE NAME [--only paper|standard|longer]
 
 The paper's schedule is shortened to `--steps-coarse` and `--steps-sos` steps, at the paper's learning rate; 10,000 each
-are the whole schedule. `longer` is the standard preset with 900 instead of 200 steps on all scales, without early stop.
+are the whole schedule. `longer` is the standard preset with 900 instead of 240 steps, without early stop.
 Without a GPU, times are CPU seconds, so that other programs on the machine do not matter; run the benchmark with one
 thread. With `--only`, the figures of the other schedules are read from the result file.
 """
@@ -51,6 +51,7 @@ def main() -> None:
         "early_stop": False,
         "training_background": "background",
         "warm_start": False,
+        "scale_sampling": 1,
     }
     results: dict[str, Any] = _stored(f"standard_{arguments.name}")
     longer = {"steps_sos": 900, "early_stop": False}

@@ -346,7 +346,8 @@ class Settings(BaseModel):
 
 #: `paper` is the published schedule. The other presets reach a given loss sooner, with larger, decaying steps. Such
 #: steps push many colors below 0, so these presets need `clamp_aware_gradient`. They start from the style's colors,
-#: which optimization alone reaches only slowly (docs/quality.md). Phase 1 pays off for large views.
+#: which optimization alone reaches only slowly (docs/quality.md). `standard` has no phase 1, because most of its steps
+#: evaluate the coarsest scale alone.
 _PRESETS: dict[PresetName, dict[str, Any]] = {
     "preview": {
         "steps_coarse": 50,
@@ -358,8 +359,9 @@ _PRESETS: dict[PresetName, dict[str, Any]] = {
         "max_resolution": 640,
     },
     "standard": {
-        "steps_coarse": 100,
-        "steps_sos": 200,
+        "steps_coarse": 0,
+        "steps_sos": 240,
+        "scale_sampling": 3,
         "learning_rate": 0.2,
         "learning_rate_end": 0.02,
         "clamp_aware_gradient": True,

@@ -67,7 +67,7 @@ def follow(sizes: Sizes, rasterizer: str | None) -> tuple[str, list[float]]:
     name, scene, cameras = inputs(side, small=sizes == QUICK)
     settings = make_settings(
         "standard", steps_coarse=steps // 2, steps_sos=steps - steps // 2, learning_rate=LEARNING_RATE,
-        early_stop=False, cached_weights="none", coarsest_side=side // 2,
+        scale_sampling=1, early_stop=False, cached_weights="none", coarsest_side=side // 2,
     )  # fmt: skip
     weights = small_weights() if sizes == QUICK else network_weights()
     style = texture(side, side, seed=3)

@@ -112,7 +112,7 @@ def _record_steps(sizes: Sizes, scene: Scene, precision: Precision, launches: La
     """Record the kernels of some steps after the first, and return their stylizer."""
     quick, (width, height) = sizes == QUICK, sizes.view
     settings = make_settings(
-        "standard", steps_coarse=0, steps_sos=10, early_stop=False, cached_weights="none",
+        "standard", steps_sos=10, scale_sampling=1, early_stop=False, cached_weights="none",
         coarsest_side=24 if quick else None, position_weights="on", precision=precision,
     )  # fmt: skip
     with launches.recorded():

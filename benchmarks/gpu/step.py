@@ -39,7 +39,7 @@ def _measure(
     forget_peak(device())
     quick = sizes == QUICK
     settings = make_settings(
-        "standard", steps_coarse=0, steps_sos=1000, early_stop=False, precision=precision,
+        "standard", steps_sos=1000, scale_sampling=1, early_stop=False, precision=precision,
         coarsest_side=24 if quick else None, cached_weights="none" if quick else None,
     )  # fmt: skip
     stylizer = Stylizer.planned(

@@ -123,6 +123,7 @@ def make(situation: Situation) -> Stylizer:
     values: dict[str, Any] = {
         "steps_coarse": 1,
         "steps_sos": STEPS,
+        "scale_sampling": 1,
         "learning_rate": LEARNING_RATE,
         "early_stop": False,
         "coarsest_side": 16,

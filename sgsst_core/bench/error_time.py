@@ -81,13 +81,13 @@ PAPER_RATE = {"learning_rate": 2.5e-3, "learning_rate_end": 2.5e-3, "clamp_aware
 VARIANTS = {
     variant.name: variant
     for variant in (
-        Variant("standard", "coarsest scale first, then all scales (SOS); the standard preset"),
+        Variant("standard", "all scales (SOS), the finer ones in some visits of a view; the standard preset"),
         Variant("preview", "the preview preset: views of at most 640 pixels", _of_preset("preview")),
         Variant("paper", "the paper preset: published schedule, rate and start", _of_preset("paper")),
         Variant("paper-rate", "the same with the paper's constant learning rate and clamp", PAPER_RATE),
-        Variant("no-phase-1", "all scales from the beginning", {"steps_coarse": 0}),
+        Variant("all-scales", "all scales in every step", {"scale_sampling": 1}),
         Variant("coarse-only", "the coarsest scale alone", {"steps_coarse": 300, "steps_sos": 0}),
-        Variant("one-scale", "the paper's loss at full size alone", {"scales": (1.0,), "steps_coarse": 0}),
+        Variant("one-scale", "the paper's loss at full size alone", {"scales": (1.0,)}),
         Variant("cold-start", "standard, from the scene's own colors", {"warm_start": False}),
         Variant(
             "fixed-background",

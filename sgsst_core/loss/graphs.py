@@ -182,7 +182,9 @@ class LossGraphs:
     def _capture(self, key: _Key, image: Tensor, style: StyleTargets, view: ViewTarget) -> _Graph:
         loss, device = self.loss, self.loss.network.device
         scales = [scale for scale, _ in key.tiles]
-        weighted = dict(zip(scales, key.weights, strict=True)) if key.weights else scales
+        weighted: Sequence[int] | Mapping[int, float] = scales
+        if key.weights:
+            weighted = dict(zip(scales, key.weights, strict=True))
         static_image, static_view = self._static_inputs(key, image, view)
         values = torch.empty((len(scales), len(TERMS)), dtype=torch.float64, device=device)
         dtype = torch.promote_types(loss.network.dtype, torch.float32)

@@ -66,7 +66,7 @@ class ScaleWeights:
             period: See `sampled`.
         """
         *finer, _ = self.chosen(count)
-        costs = [(4.0**-scale, period ** -(len(finer) - place)) for place, scale in enumerate(finer)]
+        costs = [(4.0**-scale, float(period) ** -(len(finer) - place)) for place, scale in enumerate(finer)]
         return sum(cost * fraction for cost, fraction in costs) / sum(cost for cost, _ in costs) if costs else 1.0
 
     def mean(self, losses: Mapping[int, float]) -> float:

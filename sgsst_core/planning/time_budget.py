@@ -54,8 +54,8 @@ class ViewCost:
     """Measured cost of views of one resolution.
 
     Attributes:
-        pixels: Pixels of a view on all scales, mean over the views.
-        seconds: Seconds of a step on all scales.
+        pixels: Pixels of a view that a step evaluates, on all its scales, mean over views and steps.
+        seconds: Seconds of a step of phase 2.
         first: Additional seconds of a view's first visit.
         survey: Seconds of the survey of a view.
         scales: Largest number of scales of a view.
@@ -215,11 +215,12 @@ class _Estimate:
 
 
 def pixels_of(cameras: Sequence[Camera], side: int, settings: Settings) -> tuple[float, int]:
-    """Return the pixels of a view on all scales with a longer side, mean over the cameras, and the most scales."""
+    """Return the pixels of a view that a step evaluates on average, given its longer side, and the most scales."""
     pixels, most = 0.0, 1
     for camera in (resized(each, min(side, each.side)) for each in cameras):
         scales = scale_count(camera.height, camera.width, settings.coarsest_side)
-        pixels += camera.width * camera.height * sum(0.25**scale for scale in range(scales))
+        parts = (0.25**scale / settings.scale_sampling ** (scales - 1 - scale) for scale in range(scales))
+        pixels += camera.width * camera.height * sum(parts)
         most = max(most, scales)
     return pixels / len(cameras), most
 

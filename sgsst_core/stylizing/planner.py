@@ -43,7 +43,7 @@ from sgsst_core.settings import PlannedPrecision, Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import StylizationJob, continued, prepare_job
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.prediction import completed_plan, ending_seconds, with_spare_memory
+from sgsst_core.stylizing.prediction import completed_plan, ending_seconds, sos_seconds, with_spare_memory
 from sgsst_core.stylizing.trial import Trial, launch_cost, run_trial
 from sgsst_core.timing import Timer
 
@@ -229,11 +229,14 @@ def _corrected(
         left: Seconds left of the budget.
     """
     coarse = settings.steps_coarse if draft.steps_coarse else 0
-    best = min(trials, key=lambda trial: coarse * trial.coarse.seconds + settings.steps_sos * trial.sos.seconds)
-    seconds = coarse * best.coarse.seconds + settings.steps_sos * best.sos.seconds
+
+    def seconds_of(trial: Trial) -> float:
+        return coarse * trial.coarse.seconds + settings.steps_sos * sos_seconds(trial, facts, settings)
+
+    best = min(trials, key=seconds_of)
     first = best.sos.first + (best.coarse.first if coarse else 0.0)
     once = min(chosen.steps_sos * settings.views_per_step, len(draft.covered)) * first
-    return chosen.corrected(settings, seconds, once + ending_seconds(facts.gaussians), left())
+    return chosen.corrected(settings, seconds_of(best), once + ending_seconds(facts.gaussians), left())
 
 
 def _try(

@@ -87,13 +87,13 @@ def completed_plan(
     coarse = plan.steps_coarse
     sos = settings.steps_sos or int(not coarse)  # phase 1 may have been the only one and be skipped
     seconds = {
-        ranks: (coarse * trial.coarse.seconds + sos * _sos_seconds(trial, facts, settings)) / (coarse + sos)
+        ranks: (coarse * trial.coarse.seconds + sos * sos_seconds(trial, facts, settings)) / (coarse + sos)
         for ranks, trial in trials.items()
     }
     ranks = choices.choose_ranks(seconds)
     trial = trials[ranks]
     plan = replace(plan, ranks=ranks, graphs=choices.uses_graphs(plan, facts, settings, cost))
-    one_rank = _sos_seconds(trials[1], facts, settings) if facts.machine.ranks > 1 and 1 in trials else None
+    one_rank = sos_seconds(trials[1], facts, settings) if facts.machine.ranks > 1 and 1 in trials else None
     prediction = replace(_predicted_steps(plan, facts, settings, trial, cost), seconds_one_rank=one_rank)
     if plan.measured:
         plan, prediction = _with_measurements(plan, prediction, facts, settings, trial)
@@ -107,7 +107,7 @@ def completed_plan(
     return replace(plan, decisions=tuple(lines))
 
 
-def _sos_seconds(trial: Trial, facts: Facts, settings: Settings) -> float:
+def sos_seconds(trial: Trial, facts: Facts, settings: Settings) -> float:
     """Return the seconds of a step of phase 2 on average, because steps may leave out scales."""
     count = max(scale_count(*size, settings.coarsest_side) for size in facts.sizes)
     left_out = 1 - ScaleWeights(settings.scales).sampled_cost(count, settings.scale_sampling)
@@ -122,7 +122,7 @@ def _predicted_steps(plan: Plan, facts: Facts, settings: Settings, trial: Trial,
     phases = [
         (steps, max(seconds - saved, 0.0), first * unvisited)
         for steps, seconds, first in (
-            (settings.steps_sos, _sos_seconds(trial, facts, settings), trial.sos.first),
+            (settings.steps_sos, sos_seconds(trial, facts, settings), trial.sos.first),
             (plan.steps_coarse, trial.coarse.seconds, trial.coarse.first),
         )
     ]

@@ -40,7 +40,7 @@ def test_variants_are_evaluated_at_equal_times(
     tiny_weights: BackboneWeights, vgg16_weights: object, tmp_path: Path
 ) -> None:
     """AlexNet's weights, which judge results, are installed together with VGG16's."""
-    names = ["standard", "coarse-only", "no-phase-1", "cold-start", "half-weights"]
+    names = ["standard", "coarse-only", "all-scales", "cold-start", "half-weights"]
     scene, views = wall(), cameras(2, 96, 72)
     curves = error_time(scene, views, style(), choose_variants(names), 1.0, weights=tiny_weights, coarsest_side=36)
     assert [curve.variant.name for curve in curves] == names

@@ -30,7 +30,7 @@ def test_more_time_never_brings_less() -> None:
         assert more_steps >= steps or more.resolution > less.resolution
         assert more.seconds <= 2.0 * 2.0**15
     assert choices[0].resolution == 96
-    assert (choices[-1].resolution, choices[-1].steps_sos, choices[-1].more) == (1280, 200, "")
+    assert (choices[-1].resolution, choices[-1].steps_sos, choices[-1].more) == (1280, 240, "")
 
 
 @pytest.mark.parametrize("seconds", [20, 60, 300, 1200])
@@ -42,11 +42,11 @@ def test_choice_fits_the_budget_and_nearly_uses_it(seconds: float) -> None:
 def test_resolution_falls_before_steps_do_and_then_again() -> None:
     whole, fewer, small = chosen(300), chosen(70), chosen(20)
     assert whole.resolution > 256
-    assert (whole.steps_coarse, whole.steps_sos) == (100, 200)
+    assert (whole.steps_coarse, whole.steps_sos) == (0, 240)
     assert fewer.resolution == 256
-    assert 0.5 * 300 - 2 <= fewer.steps_coarse + fewer.steps_sos < 300
+    assert 0.5 * 240 - 2 <= fewer.steps_coarse + fewer.steps_sos < 240
     assert small.resolution < 256
-    assert small.steps_sos >= 99 or small.resolution == 96
+    assert small.steps_sos >= 119 or small.resolution == 96
     assert whole.more.startswith("in 20 min 00 s: ")
 
 
@@ -77,9 +77,9 @@ def test_settings_take_the_choice_and_a_higher_last_learning_rate() -> None:
 def test_steps_are_corrected_by_what_they_really_take() -> None:
     choice, settings = TimeChoice(256, (0,), 50, 100, 9.0), make_settings(within=100, measure=0.0)
     slower = choice.corrected(settings, 160.0, 10.0, 99.0)
-    assert (slower.steps_coarse, slower.steps_sos) == (50, 100)
+    assert (slower.steps_coarse, slower.steps_sos) == (0, 120)
     faster = choice.corrected(settings, 40.0, 10.0, 99.0)
-    assert (faster.steps_coarse, faster.steps_sos) == (100, 200)
+    assert (faster.steps_coarse, faster.steps_sos) == (0, 240)
     hopeless = choice.corrected(settings, 1e6, 10.0, 5.0)
     assert (hopeless.steps_coarse, hopeless.steps_sos) == (0, 1)
 

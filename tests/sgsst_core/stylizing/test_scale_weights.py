@@ -21,7 +21,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def make(weights: BackboneWeights, steps_coarse: int = 2, **values: Any) -> Stylizer:
-    settings = make_settings(**({"steps_coarse": steps_coarse, "steps_sos": 3, "coarsest_side": 16} | values))
+    settings = make_settings(
+        **({"steps_coarse": steps_coarse, "steps_sos": 3, "coarsest_side": 16, "scale_sampling": 1} | values)
+    )
     return Stylizer.planned(wall(), cameras(), style(), settings, weights=weights)
 
 
@@ -106,11 +108,12 @@ def test_losses_of_scales_that_were_not_drawn_follow_the_coarsest(tiny_weights: 
     run(stylizer)
     ratios: dict[int, float] = {}
     for record in stylizer.history:
-        ratio = record.terms[0].total / record.terms[1].total if 0 in record.terms else None
-        if record.evaluated == (0, 1):
-            ratios[record.view] = ratio
-        elif record.view in ratios:
-            assert ratio == pytest.approx(ratios[record.view])
+        if 0 in record.terms:
+            ratio = record.terms[0].total / record.terms[1].total
+            if record.evaluated == (0, 1):
+                ratios[record.view] = ratio
+            assert ratio == pytest.approx(ratios.get(record.view, ratio))
+    assert len(ratios) == 3
 
 
 @pytest.mark.slow

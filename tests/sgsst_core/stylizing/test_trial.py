@@ -97,7 +97,9 @@ def facts(**changes: Any) -> Facts:
 
 
 def plan_of(known: Facts, trials: dict[int, Trial] | None = None, cost: Saving | None = None, **values: Any) -> Plan:
-    settings = make_settings(**{"steps_coarse": 40, "steps_sos": 40, "coarsest_side": 300, **values})
+    settings = make_settings(
+        **{"steps_coarse": 40, "steps_sos": 40, "coarsest_side": 300, "scale_sampling": 1, **values}
+    )
     draft = draft_plan(known, settings, measured=True)
     return completed_plan(draft, known, settings, NetworkPixels(1e6, 0.0, 1e6, 1), trials or {1: TRIAL}, cost)
 
