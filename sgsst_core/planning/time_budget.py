@@ -1,7 +1,6 @@
 """Time budget of a job: the resolution, the views and the steps that fit, given what small views cost.
 
-Resolution is lowered first, because strokes need their steps more than their pixels, then steps are left out, and only
-then the resolution is lowered further (benchmarks/results/README.md has the experiment).
+Resolution is lowered first, then steps are left out, and only then the resolution is lowered further.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import pytest
 from PIL import Image
 
@@ -98,6 +99,9 @@ def test_invalid_numbers_stop_the_start(visit: Visit, files: dict[str, Path]) ->
     watched = visit()
     page = watched.page
     choose(watched, files)
+    page.locator(".presets input").first.wait_for()
+    budget = httpx2.get(f"{watched.url}/v1/session").json()["within"]
+    assert page.locator("[data-name=within] input").input_value() == str(budget // 60)
     sent: list[str] = []
     page.on("request", lambda request: sent.append(request.url) if "/v1/" in request.url else None)
     wrong = {
@@ -108,7 +112,6 @@ def test_invalid_numbers_stop_the_start(visit: Visit, files: dict[str, Path]) ->
         "refine": ("0", "Must be at least 1."),
         "target_loss": ("1", "Must be less than 1."),
     }
-    page.locator(".presets input").first.wait_for()
     expand(watched)
     for name, (text, _) in wrong.items():
         page.locator(f"[data-name={name}] input:not([type=radio])").press_sequentially(text)
