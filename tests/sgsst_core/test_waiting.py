@@ -15,10 +15,10 @@ def spin_count(module: str) -> str:
     """Return the spin count that OpenMP reads in a process that imports a module, then PyTorch."""
     code = f"import {module}, torch"
     done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, check=True)
-    found = re.search(r"GOMP_SPINCOUNT = '(\d+)'", done.stderr)
-    if found is None:
+    count = re.search(r"GOMP_SPINCOUNT = '(\d+)'", done.stderr)
+    if count is None:
         pytest.skip("PyTorch uses another OpenMP here")
-    return found[1]
+    return count[1]
 
 
 @pytest.fixture(autouse=True)
