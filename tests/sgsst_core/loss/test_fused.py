@@ -203,7 +203,7 @@ def test_gradient_passes_the_relu_of_the_features(dtype: torch.dtype, channels: 
     matrix, mean, offset = (
         torch.randn(shape, generator=generator) for shape in ((channels, channels), channels, channels)
     )
-    style = StyleGradient(*(part.to(DEVICE) for part in (matrix + matrix.T, mean, offset)))
+    style = StyleGradient((matrix + matrix.T).to(DEVICE), mean.to(DEVICE), offset.to(DEVICE))
     before = torch.randn(x.shape, generator=generator).to(DEVICE, dtype)
     gradient, expected = before.clone(), before.clone()
     fused_add_style_gradient(gradient, x, style, a, relu=True)
