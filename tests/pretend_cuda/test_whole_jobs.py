@@ -146,10 +146,15 @@ def test_loop_reads_a_step_after_it_has_queued_the_next(tmp_path: Path) -> None:
         for _ in range(expected.job.total_steps):
             expected.run_step()
         seen, saved, reported = list[tuple[int, int]](), list[int](), list[int]()
+
+        def look() -> bool:
+            seen.append((stylizer.step, len(stylizer.history)))
+            return False
+
         callbacks = Callbacks(
             progress=lambda progress: reported.append(progress.step),
             progress_seconds=0,
-            stop=lambda: seen.append((stylizer.step, len(stylizer.history))) is not None,
+            stop=look,
             checkpoint=lambda s: saved.append(len(s.state().history)),
             checkpoint_seconds=math.inf,
         )

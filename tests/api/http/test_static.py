@@ -11,7 +11,8 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from api.http.static import DOCS_POLICY, FOLDER, POLICY, StaticFiles, static_files
+from api.http.static import DOCS_POLICY, POLICY, StaticFiles, static_files
+from api.static_files import FOLDER
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import FORMATS
 from sgsst_core.files.scene_file import read_scene
