@@ -23,7 +23,7 @@ GAUSSIAN_BYTES = 248
 _START_SECONDS, _STAGING_BYTES, _PLAN_SECONDS, _PLAN_STEPS = 12.0, 1e9, 6.0, 10
 #: Seconds per step: network forward and backward per pixel; rasterization per Gaussian; and a fixed time for kernel
 #: launches.
-_PIXEL_SECONDS = {"float32": 7e-8, "tf32": 1.6e-8, "bfloat16": 7e-9}
+_PIXEL_SECONDS = {"auto": 7e-9, "float32": 7e-8, "tf32": 1.6e-8, "bfloat16": 7e-9, "float16": 7e-9}
 _GAUSSIAN_SECONDS, _FIXED_SECONDS = 1e-9, 1e-3
 #: Network time of a step in phase 1, which optimizes only the coarsest scale, as a fraction of that in phase 2.
 _COARSE_FRACTION = 0.1

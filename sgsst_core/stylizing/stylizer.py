@@ -386,6 +386,7 @@ class Stylizer:
         lengths = [result.values.numel() for result in queued.results]
         _, *values = queued.values.split([1, *lengths])
         if is_too_large(magnitude):
+            self.step = queued.step - 1
             raise DivergedError(
                 f"Step {queued.step}: the color gradient has grown to {magnitude:.3g}, which cannot be "
                 f"optimized; the largest color coefficient is {float(self.sh_dc.detach().abs().max()):.3g}. Give a "

@@ -37,16 +37,11 @@ def run_job(
     job: Job, steps: int | None = None, checkpoint_seconds: float = 60.0, warnings: list[str] | None = None
 ) -> Result:
     """Run a job; if `steps` is given, interrupt it after that many steps."""
-    done = 0
-
-    def count(progress: Progress) -> None:
-        nonlocal done
-        done += progress.is_step and progress.views_to_check is None  # views of a quality check are no steps
-
+    first = job.stylizer.step
     return execute(
         job,
-        progress=count,
-        stop=lambda: steps is not None and done >= steps,
+        progress=lambda progress: None,
+        stop=lambda: steps is not None and job.stylizer.step - first >= steps,
         warn=(warnings if warnings is not None else []).append,
         checkpoint_seconds=checkpoint_seconds,
         run_id="run",
@@ -83,11 +78,12 @@ def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
 
 def test_job_that_ends_early_has_no_steps_left(request_: JobSpec) -> None:
     reports: list[Progress] = []
+    job = prepare(request_)
     ended = execute(
-        prepare(request_),
+        job,
         progress=reports.append,
         stop=lambda: False,
-        finish=lambda: reports[-1].step == 3,
+        finish=lambda: job.stylizer.step == 3,
         warn=print,
     )
     assert (ended.stopped, ended.steps) == ("on-request", 3)

@@ -150,6 +150,7 @@ def test_plan_lists_skipped_work(files: Files, capsys: pytest.CaptureFixture[str
     write_scene(files.ply, ball())
     out = files.out.with_name("plan.json")
     command = ["plan", str(files.ply), "--cameras", str(files.cameras), "--backbone", "vgg16", "--out", str(out)]
+    command += ["--steps-coarse", "2"]
     assert main([*command, "--style", str(files.ply)]) == 2
     assert not out.parent.exists()
     assert main([*command, "--style", str(files.style)]) == 0
@@ -887,6 +888,7 @@ _WRITING = [
     ["convert", "no.ply", "OUT", "s.sog"],
     ["convert", "no.ply", "OUT", "meta.json"],
     ["blend", "no.ply", "nor.ply", "--out", "s.ply"],
+    ["view", "no.ply", "--out", "s.html"],
     ["demo", "--out", "demo"],
     ["submit", "no.ply", "--style", "no.png", "--url", "http://127.0.0.1:1", "--out", "s.ply"],
     ["download", "no-job", "--url", "http://127.0.0.1:1", "--out", "s.ply"],

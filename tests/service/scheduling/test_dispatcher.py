@@ -118,6 +118,7 @@ def test_released_gpus_are_free_for_other_jobs(settings: ServiceSettings, store:
     for gpu in ("7", "5"):
         attempt._handle(Report(left_out=(gpu,)))
     assert attempt.grant == Grant(1, ("6",))
+    held.job.parameters = {"precision": "float32"}  # so that the job is large enough for two
     following = capacity.grant(held.job, [attempt.grant], 1)
     assert following is not None
     assert (following.ranks, following.gpus) == (2, ("5", "7"))

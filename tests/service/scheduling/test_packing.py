@@ -332,9 +332,10 @@ def job(scene: int, **parameters: Any) -> JobRow:
     [
         ({"preset": "preview"}, 1),
         ({"preset": "paper", "resolution": 5187}, 8),
-        ({"resolution": 5187}, 8),
+        ({"resolution": 5187}, 3),
+        ({"resolution": 5187, "precision": "float32"}, 8),
         ({"preset": "paper", "resolution": 5187, "max_resolution": 64, "steps_sos": 7}, 1),
-        ({"steps_sos": "many", "preset": "unknown", "resolution": "large", "bygone": 1}, 3),
+        ({"steps_sos": "many", "preset": "unknown", "resolution": "large", "bygone": 1}, 1),
     ],
 )
 def test_larger_jobs_get_more_gpus(parameters: dict[str, Any], ranks: int) -> None:

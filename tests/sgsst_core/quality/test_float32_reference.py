@@ -50,7 +50,7 @@ def test_float32_job_agrees_with_its_reference(tiny_weights: BackboneWeights) ->
 
 
 def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights) -> None:
-    stylizer = make(tiny_weights, cached_weights="half")
+    stylizer = make(tiny_weights, cached_weights="half", steps_sos=8)
     run(stylizer)
     assert approximations(stylizer) == ["half-precision blend weights"]
     error = Float32Reference(stylizer).gradient_error()

@@ -57,7 +57,8 @@ def memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Memory]:
 
 
 def planned(weights: BackboneWeights, **values: Any) -> Stylizer:
-    settings = make_settings(steps_coarse=0, steps_sos=3, coarsest_side=16, position_weights="off", **values)
+    values = {"coarsest_side": 16, "position_weights": "off", "scale_sampling": 1, **values}
+    settings = make_settings(steps_coarse=0, steps_sos=3, **values)
     return Stylizer.planned(
         wall(10, 8), cameras(1, WIDTH, HEIGHT), style(), settings, weights=weights, rasterizer="cpu"
     )

@@ -164,7 +164,8 @@ def test_one_rank_sends_nothing() -> None:
 
 
 def run_two_steps(collectives: Collectives) -> dict[str, Any]:
-    settings = make_settings("standard", steps_coarse=0, steps_sos=4, coarsest_side=40, rebalance=False)
+    own = {"coarsest_side": 40, "rebalance": False, "scale_sampling": 1}
+    settings = make_settings("standard", steps_coarse=0, steps_sos=4, **own)
     camera = cameras(1, WIDTH, HEIGHT)
     stylizer = Stylizer.planned(wall(), camera, style(), settings, weights=tiny_weights(), collectives=collectives)
     scales = len(stylizer.job.scales(0))
