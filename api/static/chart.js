@@ -14,7 +14,8 @@ const HEIGHT = 240, LEFT = 56, RIGHT = 12, TOP = 26, BOTTOM = 34;
  * @param {number} high
  */
 export function ticks(low, high) {
-  const decades = Math.log10(high / low), digits = decades < 1.2 ? [1, 2, 3, 5, 7] : decades < 4 ? [1, 2, 5] : [1];
+  const decades = Math.log10(high / low);
+  const digits = decades < 0.5 ? [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9] : decades < 1.2 ? [1, 2, 3, 5, 7] : decades < 4 ? [1, 2, 5] : [1];
   const found = [], every = Math.max(1, Math.ceil(decades / 8));
   for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power++) {
     if (power % every) continue;
@@ -132,6 +133,6 @@ export class LossChart {
  */
 function short(value) {
   if (value < 1e6 && value >= 1e-3) return rough(value);
-  const [digit, power] = value.toExponential(0).split("e");
+  const [digit, power] = Number(value.toPrecision(2)).toExponential().split("e");
   return `${digit}×10${[...String(Number(power))].map((char) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(char)]).join("")}`;
 }

@@ -178,7 +178,7 @@ def test_form_works_without_webgl(browser: Any, service: Service, files: dict[st
     page = watched.page
     page.goto(service.url)
     page.get_by_text("needs WebGL 2").wait_for()
-    assert page.locator(".stage").bounding_box()["height"] < 300
+    assert page.locator(".stage").bounding_box()["height"] < 450
     drop(watched, files)
     page.get_by_role("button", name="Remove scene.ply").wait_for()
     watched.check("WebGL")

@@ -66,7 +66,7 @@ def test_chart_ends_with_the_loss_of_the_result(visit: Visit, service: Service, 
     assert shown == pytest.approx(job["result"]["loss_after"], rel=0.01)
     losses = watched.page.locator(".plot text[text-anchor=end]:not(.axis)").all_text_contents()
     assert losses
-    assert all(re.fullmatch("[0-9.,]+|[1-9]×10[⁰¹²³⁴⁵⁶⁷⁸⁹]+", text) for text in losses), losses
+    assert all(re.fullmatch(r"[0-9.,]+|[1-9](\.[1-9])?×10[⁰¹²³⁴⁵⁶⁷⁸⁹]+", text) for text in losses), losses
     assert watched.page.locator(".plot text.axis").all_text_contents() == [
         "seconds of steps",
         "loss",
