@@ -281,7 +281,9 @@ def mean_gradient_by_hand(views: list[int]) -> Tensor:
 
 def test_gradients_of_views_in_a_step_are_averaged() -> None:
     scene = wall()
-    settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40, views_per_step=3, scale_sampling=1)
+    settings = make_settings(
+        "standard", steps_coarse=0, steps_sos=1, coarsest_side=40, views_per_step=3, scale_sampling=1
+    )
     stylizer = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
     order = Stylizer.planned(scene, cameras(5), style(), settings, weights=tiny_weights())
     views = [order._order.next_view() for _ in range(3)]
