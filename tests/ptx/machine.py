@@ -143,7 +143,7 @@ def compile_instruction(instruction: Instruction) -> Execute:
     type_ = opcode[-1]
     if name == "cvt" and opcode[-2] in ("f16x2", "bf16x2"):
         return _convert_pair(instruction)
-    if name == "setp" and type_ == "bf16x2":
+    if name == "setp" and type_ in ("f16x2", "bf16x2"):
         return _compare_pairs(instruction)
     if name == "cvt":
         function, types = conversion(opcode), [type_]
@@ -206,15 +206,21 @@ def _pack(instruction: Instruction) -> Execute:
 def _compare_pairs(instruction: Instruction) -> Execute:
     targets, *operands = instruction.operands
     compare = comparison((*instruction.opcode[:-1], "f32"))
+    wide = from_bfloat16 if instruction.opcode[-1] == "bf16x2" else _from_float16
     reads = [reader(operand, "u32") for operand in operands]
 
     def execute(state: State, mask: np.ndarray | None) -> None:
         pairs = [read(state) for read in reads]
         for target, shift in zip(targets.split("|"), (0, 16), strict=True):
-            halves = (from_bfloat16((pair >> np.uint32(shift)).astype(np.uint16)) for pair in pairs)
+            halves = (wide((pair >> np.uint32(shift)).astype(np.uint16)) for pair in pairs)
             write(state, target, compare(*halves), mask)
 
     return execute
+
+
+def _from_float16(bits: np.ndarray) -> np.ndarray:
+    """Return float16 values, given by their bits, as float32."""
+    return bits.view(np.float16).astype(np.float32)
 
 
 def _convert_pair(instruction: Instruction) -> Execute:
