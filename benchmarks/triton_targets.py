@@ -112,7 +112,8 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
     dtype = _DTYPES[form]
     block, step = POSITIONS[dtype.itemsize], statistics_terms.STEPS[dtype.itemsize]
     moments = {**matrix, "P": block, "PARTS": FLUSH[dtype.itemsize] // block}
-    gradient = {**matrix, "K": block_of_channels(channels, step), "P": statistics_terms.POSITIONS, "RELU": True}
+    gradient = {**matrix, "K": block_of_channels(channels, step), "P": statistics_terms.POSITIONS}
+    gradient |= {"RELU": True, "UNIT": 1.0}
     types = {"features": features, "gradient": features}
     if dtype == torch.bfloat16:
         moments, gradient, types = {**moments, "shift": None}, {**gradient, "mean": None}, {**types, "matrix": features}
@@ -147,7 +148,7 @@ def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
         ),
         f"compare{of}": Target(
             loss_kernels.compare,
-            {**_LOSS, "CHANNELS": channels, **block},
+            {**_LOSS, "CHANNELS": channels, **block, "UNIT": 1.0},
             4,
             {"mean": "*fp64", "offset": "*fp32"},
         ),

@@ -278,6 +278,8 @@ class Relay:
             self._pass_on_progress(status.progress)
         if status.saved is not None and status.saved != self.saved:
             self.saved, self.safe_at = status.saved, time.monotonic()
+            self.last_step = max(self.last_step, status.saved)  # not every step is reported
+            self.step = max(self.step, self.last_step)
 
     def _pass_on_progress(self, progress: Progress) -> None:
         if progress == self._progress:

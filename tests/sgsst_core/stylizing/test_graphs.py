@@ -52,7 +52,8 @@ def make(
 ) -> Stylizer:
     """Make a job with two views and two scales, and by default three steps per phase."""
     scene, views = ball(40) if scan else wall(10, 8), cameras(2, 48, 32)
-    settings = make_settings(**{"coarsest_side": 16, "steps_coarse": 3, "steps_sos": 3, **values})
+    own = {"coarsest_side": 16, "steps_coarse": 3, "steps_sos": 3, "scale_sampling": 1, **values}
+    settings = make_settings(**own)
     survey = survey_views(scene, views, make_rasterizer("cpu", scene))
     some = survey.total_blend_weights > 0
     plan = Plan(

@@ -286,7 +286,7 @@ def test_killed_driver_leaves_no_processes_or_files(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_ctrl_c_saves_and_printed_command_resumes(tmp_path: Path) -> None:
     request = small_request(tmp_path, STEPS)
-    arguments = command(request, "--within", "3")
+    arguments = command(request)
     process = start(arguments)
     os.killpg(process.pid, signal.SIGINT)  # like a terminal, also to Ray's processes
     _, error = process.communicate(timeout=120)
@@ -298,6 +298,6 @@ def test_ctrl_c_saves_and_printed_command_resumes(tmp_path: Path) -> None:
     process = start(resume_command[1:])
     shown, error = process.communicate(timeout=240)
     assert process.returncode == 0, error
-    assert "The time of --within was used up" in shown
+    assert "resuming" in shown
     report = json.loads(request.out.with_name("s.report.json").read_text())
     assert report["workers"]["requested"] == report["workers"]["used"] == 2
