@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import shutil
 import subprocess
@@ -42,7 +43,9 @@ def emulator() -> Path:
         if npm is None:
             pytest.skip("npm is missing: apt-get install npm")
         command = [npm, "install", "--silent", "--no-save", "--prefix", str(folder), IWER]
-        if subprocess.run(command, check=False, timeout=300).returncode or not script.exists():
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            subprocess.run(command, check=False, timeout=120)
+        if not script.exists():
             pytest.skip(f"npm could not install {IWER}")
     return script
 
@@ -98,7 +101,7 @@ def test_each_eye_sees_the_scene_from_its_place(worn: Worn) -> None:
 def test_button_shows_the_original_and_stick_blends(worn: Worn) -> None:
     assert area(worn.after("right.updateButtonValue('a-button', 1)"), 2).mean() > 0.01
     assert area(worn.after("right.updateButtonValue('a-button', 0)"), 0).mean() > 0.01
-    assert area(worn.after("right.updateAxes('thumbstick', 0, 1)", 40), 2).mean() > 0.01
+    assert area(worn.after("right.updateAxes('thumbstick', 0, 1)", 120), 2).mean() > 0.01
 
 
 def test_two_hands_change_the_size_of_the_scene(worn: Worn) -> None:
