@@ -1,5 +1,5 @@
 // @ts-check
-/** What a job's view shows of its scene: previews and colors so far while it runs, then its result. */
+/** 3D view of a job: previews and its colors so far while it runs, then its result. */
 import { artifactPath, get } from "./api.js";
 import { h, put } from "./dom.js";
 import { labels } from "./names.js";

@@ -43,7 +43,7 @@ export class SubmitView {
     this.unfinished = new UnfinishedNotice(() => Object.values(this.slots).flatMap(({ files }) => files));
     this.leaving = new AbortController();
     this.created = false;
-    /** What the service is asked to do. @type {false | "planning" | "starting"} */
+    /** Request that the service has not answered yet. @type {false | "planning" | "starting"} */
     this.busy = false;
     /** Scene that the masks of the regions belong to. @type {Chosen | undefined} */
     this.shown = undefined;

@@ -61,8 +61,8 @@ def pixel_gradients(
 ):
     """Compute the gradient of the pixels from that of the first convolution's output before its ReLU.
 
-    A pixel's gradient comes from three rows. Programs read one row each, so that all features are read once, and write
-    what it adds to the rows above, at and below it. Rows of zeros surround the image.
+    A pixel's gradient comes from three rows. Each program reads one row, so that all features are read once, and
+    writes its summands for the rows above, at and below it. Rows of zeros surround the image.
 
     Args:
         gradient: [height, width, CHANNELS], bfloat16 or float16.

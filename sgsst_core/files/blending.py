@@ -95,13 +95,13 @@ def check_same_shape(first: SceneFile, file: SceneFile) -> None:
     """Raise a SceneError if two scenes differ in more than color."""
     if len(file.scene) != len(first.scene):
         raise SceneError(
-            f"{file.path}: has {len(file.scene):,} Gaussians, but {first.path} has {len(first.scene):,}. Blend scenes "
+            f"{file.path}: has {len(file.scene):,} Gaussians, but {first.path} has {len(first.scene):,}. Give scenes "
             "with the same Gaussians; refining splits some."
         )
     for name, title in _SHAPE.items():
         if not torch.equal(getattr(file.scene, name), getattr(first.scene, name)):
             raise SceneError(
-                f"{file.path}: its Gaussians have other {title} than those of {first.path}. Blend a scene and its "
+                f"{file.path}: its Gaussians have other {title} than those of {first.path}. Give a scene and its "
                 "results, all in the same format."
             )
 

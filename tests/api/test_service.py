@@ -280,7 +280,7 @@ def test_retried_job_resumes_from_checkpoint(service: Service, files: dict[str, 
         seen = events(client, job_id)
         wait_until(service, client, job_id, "succeeded")
         second = [data["step"] for _, kind, data in seen if kind == "progress" and data["attempt"] == 2]
-        assert min(step for step in second if step) >= 10, "it began anew"
+        assert min(step for step in second if step) >= 10, "it started over"
         assert result(client, job_id) == expected
         assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 409
         assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
@@ -304,7 +304,7 @@ def test_stopped_job_is_continued(service: Service, files: dict[str, Path], expe
         steps = [
             data["step"] for _, kind, data in events(client, job_id) if kind == "progress" and data["attempt"] == 2
         ]
-        assert min(step for step in steps if step) >= stopped["steps"], "it began anew"
+        assert min(step for step in steps if step) >= stopped["steps"], "it started over"
         assert result(client, job_id) == expected
         assert client.get(derived).content != first
         assert client.post(f"/v1/jobs/{job_id}/retry").status_code == 409
