@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import posixpath
+import re
+from functools import cache
 from pathlib import Path
 
 from service.optional import installed_extras
@@ -11,6 +14,10 @@ from sgsst_core.files.formats import FORMATS, RESULT_FORMATS
 from sgsst_core.options import STRENGTHS
 
 FOLDER = Path(__file__).with_name("static")
+_IMPORT = re.compile(r'^import \{ (.*) \} from "(.*)";$', re.MULTILINE)
+_EXPORT = re.compile(r"^export (\{.*\};$)?", re.MULTILINE)
+#: Arguments with which the viewer starts its worker.
+_WORKER_START = 'new URL("./scene_worker.js", import.meta.url), { type: "module" }'
 
 
 def read_static(folder: Path = FOLDER) -> dict[str, bytes]:
@@ -48,3 +55,38 @@ def _filled_modules() -> dict[str, tuple[bytes, object]]:
         "strength.js": (b'"{{strengths}}"', STRENGTHS),
         "statuses.js": (b'"{{job_states}}"', states),
     }
+
+
+@cache
+def exported_viewer() -> dict[str, str]:
+    """Return the sources of a page that shows a scene without a server (`worker.exported_page`).
+
+    `document` is its HTML with placeholders, `style` its style sheet, `page` and `worker` are scripts.
+    """
+    files = read_static()
+    texts = {"document": files["exported.html"].decode(), "style": files["page.css"].decode()}
+    return {**texts, "page": _script(files, "exported.js"), "worker": _script(files, "viewer/scene_worker.js")}
+
+
+def _script(files: dict[str, bytes], entry: str) -> str:
+    """Return a module and all those that it imports as one script: browsers load no modules from a local file."""
+    codes: dict[str, str] = {}  # each module after those that it imports
+    imported: dict[str, set[str]] = {entry: set()}
+
+    def add(name: str) -> None:
+        def refer(statement: re.Match[str]) -> str:
+            other = posixpath.normpath(posixpath.join(posixpath.dirname(name), statement[2]))
+            if other not in codes:
+                add(other)
+            imported.setdefault(other, set()).update(part.split(" as ")[0] for part in statement[1].split(", "))
+            return f"const {{ {statement[1].replace(' as ', ': ')} }} = modules[{json.dumps(other)}];"
+
+        codes[name] = _EXPORT.sub("", _IMPORT.sub(refer, files[name].decode()))
+
+    add(entry)
+    parts = [
+        f"modules[{json.dumps(name)}] = (() => {{\n{code}\nreturn {{ {', '.join(sorted(imported[name]))} }};\n}})();"
+        for name, code in codes.items()
+    ]
+    script = "\n".join(['"use strict";', "const modules = {};", *parts])
+    return script.replace(_WORKER_START, "exported.worker")

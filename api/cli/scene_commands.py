@@ -248,8 +248,9 @@ def view(
     options: ViewOptions,
 ) -> None:
     """Write a scene as one HTML file, which shows it in 3D in a browser, without a server."""
-    from api.exported_page import write_page
+    from api.static_files import exported_viewer
     from sgsst_core.files.scene_file import read_scene
+    from worker.exported_page import write_page
 
     if out.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{out}: not the name of an HTML file. Give one, such as scene.html.")
@@ -260,7 +261,7 @@ def view(
 
     with spinner("Compressing the scene"):
         before = None if original is None else read(original)
-        write_page(out, read(scene), before, title or scene.name.partition(".")[0])
+        write_page(out, exported_viewer(), read(scene), before, title or scene.name.partition(".")[0])
     print_field("page", f"{out}, {out.stat().st_size / 1e6:.1f} MB: open it in a browser")
 
 

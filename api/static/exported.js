@@ -1,5 +1,5 @@
 // @ts-check
-/** The page of an exported scene. The same file holds its modules and its data; `api/exported_page.py` writes it. */
+/** The page of an exported scene. The same file holds its modules and its data; `worker/exported_page.py` writes it. */
 import { Blend } from "./blend.js";
 import { h } from "./dom.js";
 import { Stage } from "./stage.js";
@@ -10,12 +10,13 @@ import { words } from "./words.js";
  * @property {string} title
  * @property {number[]} up up direction of the scene
  * @property {number} fade fraction by which the stylized scene's harmonics are smaller
+ * @property {number[]} background color behind the scene, in 0..1
  * @property {File} scene scene as SOG: the original if there is one, else the stylized one
  * @property {Uint8Array | null} colors of the stylized scene: 256 values as halves, then 3 indices for each Gaussian; null
  *   without an original
  */
 
-const { title, up, fade, scene: file, colors } = /** @type {Exported} */ (/** @type {any} */ (globalThis).exported);
+const { title, up, fade, background, scene: file, colors } = /** @type {Exported} */ (/** @type {any} */ (globalThis).exported);
 const stage = new Stage();
 stage.up = up;
 stage.title = title;
@@ -25,7 +26,8 @@ document.body.append(h("header.top", h("span.brand", h("span.mark", { "aria-hidd
   h("main.shared", { id: "main", tabIndex: -1 }, h("div.result-stage", stage.element, blend.element)), h("div.away", { id: "said", "aria-live": "polite" }));
 
 const scene = stage.viewer?.open(file);
-if (scene) {
+if (stage.viewer && scene) {
+  stage.viewer.background = background;
   stage.show({ scene, colors: "own" });
   scene.ready.catch((error) => stage.message(error.message));
   if (colors) {

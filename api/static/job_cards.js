@@ -15,7 +15,7 @@ const say = words.job;
 export function downloadCard(id, bytes) {
   const link = h("a.button.primary", { download: "" }, icon("down"), h("span", say.download)), note = h("p.help");
   const chooser = h("select", { "aria-label": say.format, onchange: () => choose() },
-    resultFormats.map(({ name, title }, i) => h("option", { value: name }, i ? title : `${title} · ${size(bytes)}`)));
+    [...resultFormats, { name: "html", title: say.page }].map(({ name, title }, i) => h("option", { value: name }, i ? title : `${title} · ${size(bytes)}`)));
   const choose = () => {
     const path = artifactPath(id, "stylized.ply"), first = chooser.value === resultFormats[0].name;
     link.href = first ? path : `${path}?format=${encodeURIComponent(chooser.value)}`;

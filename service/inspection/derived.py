@@ -1,4 +1,4 @@
-"""Files derived from results on request, and stored beside them: compressed formats, blends and videos.
+"""Files derived from results on request, and stored beside them: compressed formats, blends, pages and videos.
 
 `service.inspection.process` creates them in a child process with resource limits, so that the API process
 never reads a scene.
@@ -52,10 +52,12 @@ _SECONDS_PER_BYTE = 600 / 1e9
 _HEADER_BYTES = 1 << 20
 #: Largest size of a blend relative to the result; a PLY with 8-bit values may become one with float32 values.
 _BLEND_SIZE = 4
+#: Largest size of a page relative to the result: geometry and two color sets, in base 85.
+_PAGE_SIZE = 2
 #: Maximum number of blends that are stored with a job.
 MOST_BLENDS = 20
-#: Name of the video among a job's artifacts.
-VIDEO = "video.mp4"
+#: Names of the HTML page that shows the result, and of the video, among a job's artifacts.
+PAGE, VIDEO = "stylized.html", "video.mp4"
 #: Limits per frame of a video: CPU seconds per byte of the result and per pixel, of which a fifth is needed, and bytes
 #: of the file per pixel, which H.264 does not reach even for noise. Videos take an eighth of them at most.
 _VIDEO_SECONDS_PER_BYTE, _VIDEO_SECONDS_PER_PIXEL, _VIDEO_BYTES_PER_PIXEL, _USUAL_BYTES = 4e-8, 1e-6, 1.5, 1 / 8
@@ -154,6 +156,24 @@ class DerivedFiles:
         """
         return await self._existing(job, blend.name) or await self._derived(
             job, blend.name, lambda: self._blend(job, blend, quotas)
+        )
+
+    async def page(self, job: JobRow, viewer: dict[str, str], quotas: Quotas) -> ArtifactRow:
+        """Return the HTML page that shows a job's result in 3D, beside its scene if both have the same Gaussians.
+
+        Args:
+            job: Job with a result.
+            viewer: Sources of the page; see `worker.exported_page`.
+            quotas: Quotas of the job's owner.
+
+        Raises:
+            NotFoundError: If the job has no result yet, or the result is gone.
+            INVALID_INPUT: If writing the page exceeds the limits.
+            QUOTA_EXCEEDED: If the page exceeds the owner's quota of stored bytes.
+            BUSY, NoSpaceError: If it cannot be written now.
+        """
+        return await self._existing(job, PAGE) or await self._derived(
+            job, PAGE, lambda: self._write_page(job, viewer, quotas)
         )
 
     async def video(self, job: JobRow, options: JobVideo, quotas: Quotas, show: Show = lambda now: None) -> ArtifactRow:
@@ -266,6 +286,26 @@ class DerivedFiles:
             findings_of(await process.ask(request))
             files = {blend.name: folder / request.output_file}
             await self._threads.run(job.owner, self._publish, job, result, files, quotas, size=most)
+
+    async def _write_page(self, job: JobRow, viewer: dict[str, str], quotas: Quotas) -> None:
+        """Write the page, store it, and make it visible."""
+        async with self._turn(self._files, job) as (process, folder, result):
+            scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
+            size = result.size + (scene["size"] if scene else 0)
+            most = _PAGE_SIZE * result.size + _HEADER_BYTES
+            await self._threads.run(job.owner, self._blobs.ensure_space, size + most)
+            request = self._request(
+                "page",
+                folder,
+                job,
+                await self._stage(folder, job, [result]),
+                seconds=_SECONDS_PER_BYTE * size,
+                memory=MEMORY_PER_BYTE * size,
+                output=(PAGE, most),
+                options={"result": RESULT, "viewer": viewer, "title": job.name},
+            )
+            findings_of(await process.ask(request))
+            await self._threads.run(job.owner, self._publish, job, result, {PAGE: folder / PAGE}, quotas, size=most)
 
     async def _render(self, job: JobRow, options: JobVideo, quotas: Quotas) -> None:
         """Render the video, store it and make it visible."""

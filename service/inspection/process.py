@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -39,12 +40,12 @@ from service.request import job_spec
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders
 from sgsst_core.decision import warnings_of
-from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, WeightsError
+from sgsst_core.errors import InvalidInputError, SceneError, SettingsError, SgsstError, WeightsError
 from sgsst_core.features import pooling_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.features.network_weights import list_network_weights
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.images import image_size
-from sgsst_core.files.scene_file import write_scene
+from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.progress import Progress
@@ -55,6 +56,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import versions
 from worker.capture import choose_axes
 from worker.derive import blend, convert
+from worker.exported_page import write_page
 from worker.inputs import Inputs, errors_of, read_inputs
 from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo
@@ -217,6 +219,22 @@ def _blend(request: WorkRequest, _send: _Send) -> dict[str, Any]:
     return {}
 
 
+def _page(request: WorkRequest, _send: _Send) -> dict[str, Any]:
+    """Write a result as an HTML page, beside the job's scene if that has the same Gaussians and harmonics."""
+    source, options = request.source, request.options
+    axes, _ = choose_axes(source, request.staged.photos)
+    original = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+    both = read_scene(Path(options["result"])), original
+    stylized, before = (file.rendered(source.render_mode, source.eps2d) for file in both)
+    background = request.parameters.settings().background
+    write = partial(write_page, request.output_file, options["viewer"], stylized, background=background, in_place=True)
+    try:
+        write(before, options["title"])
+    except SceneError:  # Gaussians were split, for example
+        write(None, options["title"])
+    return {}
+
+
 def _video(request: WorkRequest, send: _Send) -> dict[str, Any]:
     """Render a video of a result, and return the width, the height and the number of its frames."""
     try:
@@ -245,6 +263,7 @@ WORK: dict[str, tuple[Callable[[WorkRequest, _Send], dict[str, Any]], str]] = {
     "plan": (_plan, "Planning the job"),
     "compress": (_compress, "Compressing the result"),
     "blend": (_blend, "Blending the results"),
+    "page": (_page, "Writing the page"),
     "video": (_video, "Rendering the video"),
 }
 

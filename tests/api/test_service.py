@@ -231,6 +231,12 @@ def test_compressed_scene_and_results_in_other_formats(
         assert {"stylized.spz", "stylized.spz.json", "stylized.compressed.ply"} <= names
         assert client.get(where, params={"format": "ply"}).content == client.get(where).content
         assert client.get(where, params={"format": "splat"}).json()["code"] == "invalid-request"
+        page = client.get(where, params={"format": "html"})
+        suggested = f'attachment; filename="{scene.stem}_style-stylized.html"'
+        assert page.headers["content-disposition"].startswith(suggested)
+        assert page.headers["content-type"] == "text/html; charset=utf-8"
+        assert '<script type="text/plain" id="colors"></script>' not in page.text, "the scene's colors are there too"
+        assert client.get(f"/v1/jobs/{job_id}/artifacts/stylized.html").content == page.content
         other = client.get(f"/v1/jobs/{job_id}/artifacts/report.json", params={"format": "spz"})
         assert (other.status_code, other.json()["code"]) == (422, "invalid-request")
         assert list((service.data / "packing").iterdir()) == []

@@ -6,7 +6,7 @@ import asyncio
 import re
 from functools import partial
 from pathlib import PurePosixPath
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
@@ -18,11 +18,12 @@ from api.http.progress import VIDEO, answer_work
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import ArtifactList, ArtifactView, BlendRequest, artifact_view
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file, send_list
+from api.static_files import exported_viewer
 from service import problems
 from service.errors import LostFileError
 from service.files.artifacts import media_type
 from service.files.staging import RESULT
-from service.inspection.derived import Blend
+from service.inspection.derived import PAGE, Blend
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import EXTRA_FORMATS, ResultName, by_name, listed, result_name
 from sgsst_core.files.formats.ply import PLY
@@ -96,13 +97,14 @@ async def get_artifact(
     caller: CallerDep,
     conditions: ConditionsDep,
     format_: Annotated[
-        ResultName | None,
+        ResultName | Literal["html"] | None,
         Query(
             alias="format",
             description="Format of `stylized.ply`. The file is converted at the first request, which takes about ten "
             "seconds for a million Gaussians, and stored beside the PLY; "
             f"{listed([f'`{result_name(RESULT, each)}.json`' for each in EXTRA_FORMATS])} then has its loss as PSNR in "
-            "the job's views.",
+            "the job's views. `html` is a page that shows the result in 3D without a server, beside the scene if both "
+            "have the same Gaussians.",
             examples=["spz"],
         ),
     ] = None,
@@ -116,13 +118,13 @@ async def get_artifact(
     return await send_file(request, context.threads, file, conditions)
 
 
-async def _find_artifact(
-    context: Context, caller: Caller, job: JobRow, name: str, format_: ResultName | None
-) -> ArtifactRow:
+async def _find_artifact(context: Context, caller: Caller, job: JobRow, name: str, format_: str | None) -> ArtifactRow:
     """Return the database row of a published file, or of the result in another format."""
     if format_ is not None and format_ != PLY.name:
         if name != RESULT:
             raise problems.INVALID_REQUEST(f"Only {RESULT} has other formats. Omit 'format'.")
+        if format_ == "html":
+            return await context.derived.page(job, exported_viewer(), caller.quotas)
         return await context.derived.compressed(job, by_name(format_), caller.quotas)
     row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
     if row is None:
@@ -134,7 +136,8 @@ def artifact_file(context: Context, owner: str, row: ArtifactRow, name: str, kin
     """Return a stored result for sending it under a name, with a media type."""
     check, read = partial(check_artifact, context, row), partial(context.artifacts.objects.read, row.location)
     policy = _SANDBOX if kind.startswith("text/html") else None
-    return SentFile(owner, row.sha256, row.size, name, kind, check, read, policy, inline=kind.startswith(_INLINE))
+    inline = kind.startswith(_INLINE) and row.name != PAGE  # the policy would not let the page show anything
+    return SentFile(owner, row.sha256, row.size, name, kind, check, read, policy, inline=inline)
 
 
 def check_artifact(context: Context, row: ArtifactRow) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import av
 import httpx2
+import numpy as np
 import pytest
 
 from sgsst_core.files.formats import RESULT_FORMATS, read_scene_header
@@ -26,7 +27,7 @@ def finished(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
     return done(service, submit(service, {"scene": ply, "cameras": file, "style": style}, **STEPS))
 
 
-def test_result_is_downloaded_in_every_format(visit: Visit, finished: str) -> None:
+def test_result_is_downloaded_in_every_format(visit: Visit, finished: str, browser: Any, tmp_path: Path) -> None:
     watched = visit(f"/#/jobs/{finished}", width=1100, height=800)
     page = watched.page
     button = page.get_by_role("link", name="Download", exact=True)
@@ -36,19 +37,33 @@ def test_result_is_downloaded_in_every_format(visit: Visit, finished: str) -> No
     assert button.bounding_box()["y"] < chart.bounding_box()["y"]
     formats = page.get_by_label("Format")
     offered = formats.locator("option").evaluate_all("(options) => options.map((each) => each.value)")
-    assert offered == [each.name for each in RESULT_FORMATS]
+    assert offered == [*(each.name for each in RESULT_FORMATS), "html"]
     for each in RESULT_FORMATS[:3]:
         formats.select_option(each.name)
         with page.expect_download() as download:
             button.click()
         assert download.value.suggested_filename == f"scene_style-stylized{each.suffix}"
         assert read_scene_header(download.value.path()).format.title == each.title
+    formats.select_option("html")
+    with page.expect_download() as download:
+        button.click()
+    assert download.value.suggested_filename == "scene_style-stylized.html"
+    download.value.save_as(tmp_path / "page.html")
     watched.settled()
     fill_the_screen(watched)
     with page.expect_download() as download:
         page.get_by_role("button", name="Save image").click()
     assert download.value.suggested_filename == "scene_style-view_0.png"
     watched.check()
+    downloaded = Watched(browser, (tmp_path / "page.html").as_uri())  # as a user opens it from disk
+    downloaded.page.goto(downloaded.url)
+    assert downloaded.page.title()
+    downloaded.wipe("Home")
+    stylized = downloaded.pixels()
+    downloaded.wipe("End")
+    assert not np.array_equal(downloaded.pixels(), stylized), "the scene's own colors are there"
+    downloaded.check()
+    downloaded.context.close()
 
 
 def test_chart_ends_with_the_loss_of_the_result(visit: Visit, service: Service, finished: str) -> None:

@@ -1,7 +1,7 @@
 """One HTML file that shows a scene in 3D without a server or a network: viewer, geometry and one or two color sets.
 
-The file has the modules of `api/static` that the viewer imports, and the scene as SOG. Its second color set are the
-bytes and the codebook of another SOG of the same geometry, which has its Gaussians in the same order.
+The file has the viewer (`api.static_files.exported_viewer`), and the scene as SOG. Its second color set are the bytes
+and the codebook of another SOG of the same geometry, which has its Gaussians in the same order.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ import gzip
 import html
 import io
 import json
-import posixpath
 import re
 import zipfile
+from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,32 +23,39 @@ import numpy as np
 import torch
 from PIL import Image
 
-from api.static_files import read_static
 from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.blending import check_same_shape, common_rests
 from sgsst_core.files.formats.sog import META_NAME, SOG
+from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import SceneFile, encode_scene
 from sgsst_core.orbit.subject import find_subject, find_up
 from sgsst_core.scene.gaussians import Scene
 
-_PAGE, _ENTRY, _WORKER = "exported.html", "exported.js", "viewer/scene_worker.js"
-_IMPORT = re.compile(r'^import \{ (.*) \} from "(.*)";$', re.MULTILINE)
-_EXPORT = re.compile(r"^export (\{.*\};$)?", re.MULTILINE)
-#: Arguments with which the viewer starts its worker.
-_WORKER_START = 'new URL("./scene_worker.js", import.meta.url), { type: "module" }'
 #: Largest relative difference of spherical harmonics that are those of the original times a factor.
 _TOLERANCE = 1e-3
 
 
-def write_page(out: Path, stylized: SceneFile, original: SceneFile | None, title: str) -> None:
+def write_page(
+    out: Path,
+    viewer: Mapping[str, str],
+    stylized: SceneFile,
+    original: SceneFile | None,
+    title: str,
+    *,
+    background: Color = (0.0, 0.0, 0.0),
+    in_place: bool = False,
+) -> None:
     """Write a scene as an HTML file, atomically.
 
     Args:
         out: File to write.
+        viewer: Sources of the viewer; see `api.static_files.exported_viewer`.
         stylized: Scene to show.
         original: Scene of the same Gaussians to show beside it, with a wipe and a blend; None for none.
         title: Title of the page.
+        background: Color behind the scene, in 0..1.
+        in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
 
     Raises:
         SceneError: If the scenes differ in more than their colors and an SH attenuation.
@@ -55,17 +63,17 @@ def write_page(out: Path, stylized: SceneFile, original: SceneFile | None, title
     """
     shown = original or stylized
     fade = 0.0 if original is None else _fade(stylized, original)
-    data = {"page": gzip.compress(_script(_ENTRY).encode(), mtime=0)}
-    data |= {"worker": gzip.compress(_script(_WORKER).encode(), mtime=0), "scene": _sog(shown.scene, out)}
+    data = {name: gzip.compress(viewer[name].encode(), mtime=0) for name in ("page", "worker")}
+    data["scene"] = _sog(shown.scene, out)
     data["colors"] = b"" if original is None else gzip.compress(_indexed_colors(stylized.scene, out), mtime=0)
     up = find_up(find_subject(shown.scene)).direction.tolist()
     sizes = {name: len(content) for name, content in data.items()}
-    about = json.dumps({"title": title, "up": up, "fade": fade, "bytes": sizes}).replace("<", "\\u003c")
-    files = read_static()
-    values = {"title": html.escape(title), "style": files["page.css"].decode(), "about": about}
+    facts = {"title": title, "up": up, "fade": fade, "background": background, "bytes": sizes}
+    about = json.dumps(facts).replace("<", "\\u003c")
+    values = {"title": html.escape(title), "style": viewer["style"], "about": about}
     values |= {name: _base85(content) for name, content in data.items()}
-    page = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], files[_PAGE].decode())
-    with atomic_path(out) as temporary:
+    page = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], viewer["document"])
+    with nullcontext(out) if in_place else atomic_path(out) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
@@ -82,31 +90,6 @@ def _fade(stylized: SceneFile, original: SceneFile) -> float:
             "stylized, in the same format."
         )
     return 1 - factor
-
-
-def _script(entry: str) -> str:
-    """Return a module and all those that it imports as one script: browsers load no modules from a local file."""
-    files = read_static()
-    codes: dict[str, str] = {}  # each module after those that it imports
-    imported: dict[str, set[str]] = {entry: set()}
-
-    def add(name: str) -> None:
-        def refer(statement: re.Match[str]) -> str:
-            other = posixpath.normpath(posixpath.join(posixpath.dirname(name), statement[2]))
-            if other not in codes:
-                add(other)
-            imported.setdefault(other, set()).update(part.split(" as ")[0] for part in statement[1].split(", "))
-            return f"const {{ {statement[1].replace(' as ', ': ')} }} = modules[{json.dumps(other)}];"
-
-        codes[name] = _EXPORT.sub("", _IMPORT.sub(refer, files[name].decode()))
-
-    add(entry)
-    parts = [
-        f"modules[{json.dumps(name)}] = (() => {{\n{code}\nreturn {{ {', '.join(sorted(imported[name]))} }};\n}})();"
-        for name, code in codes.items()
-    ]
-    script = "\n".join(['"use strict";', "const modules = {};", *parts])
-    return script.replace(_WORKER_START, "exported.worker")
 
 
 def _sog(scene: Scene, out: Path) -> bytes:
