@@ -39,8 +39,10 @@ from sgsst_core.options import (
 
 PresetName = Literal["preview", "standard", "paper"]
 #: Precision of the feature network.
-PlannedPrecision = Literal["float32", "tf32", "bfloat16", "float16"]
-Precision = Literal["auto", "float32", "tf32", "bfloat16", "float16"]
+PlannedPrecision = Literal["float32", "winograd", "tf32", "bfloat16", "float16"]
+Precision = Literal["auto", "float32", "winograd", "tf32", "bfloat16", "float16"]
+#: Precisions whose errors are those of float32.
+WHOLE_FLOAT32: tuple[PlannedPrecision, ...] = ("float32", "winograd")
 PositionWeights = Literal["auto", "on", "off"]
 CachedWeights = Literal["auto", "float32", "half", "none"]
 FeatureScale = Literal["paper", "even"]
@@ -183,7 +185,8 @@ class Settings(BaseModel):
     )
     precision: Precision = Field(
         "auto",
-        description="Precision of the feature network; tf32: for convolutions only; tf32 and float16: on NVIDIA GPUs; "
+        description="Precision of the feature network; winograd: float32 with fewer multiplications, on CPUs; tf32: "
+        "for convolutions only; tf32 and float16: on NVIDIA GPUs; "
         "auto: what the plan measures to be much faster than float32 with a small gradient error, else float32.",
     )
     max_resolution: Resolution = None

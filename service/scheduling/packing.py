@@ -33,7 +33,7 @@ _MIN_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4
 #: Estimated seconds of a step on an H200: network per pixel of a view by precision, rasterization per Gaussian, and
 #: kernel launches. A step of phase 1, which optimizes only the coarsest scale, takes a tenth.
-_PIXEL_SECONDS = {"auto": 7e-9, "float32": 7e-8, "tf32": 1.6e-8, "bfloat16": 7e-9, "float16": 7e-9}
+_PIXEL_SECONDS = {"auto": 7e-9, "float32": 7e-8, "winograd": 7e-8, "tf32": 1.6e-8, "bfloat16": 7e-9, "float16": 7e-9}
 _GAUSSIAN_SECONDS, _FIXED_SECONDS, _COARSE_FRACTION = 1e-9, 1e-3, 0.1
 #: Default longer side of views, and ratio of height to width.
 _LONGER_SIDE, _ASPECT = 1600, 0.625

@@ -259,6 +259,7 @@ def _precision(device: torch.device) -> Diagnosis:
     has: dict[PlannedPrecision, bool] = {
         "tf32": has_tf32(device),
         "float16": has_float16(device),
+        "winograd": kind == "cpu",
         "bfloat16": has_bfloat16(device),
     }
     texts = [

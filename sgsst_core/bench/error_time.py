@@ -105,6 +105,7 @@ VARIANTS = {
             settings={"clamp_aware_gradient": False},
         ),
         Variant("float32", "standard with features in float32", {"precision": "float32"}),
+        Variant("winograd", "standard with convolutions by Winograd's algorithm", {"precision": "winograd"}),
         Variant("bfloat16", "standard with features in bfloat16", {"precision": "bfloat16"}),
         Variant("tf32", "standard with TF32 convolutions", {"precision": "tf32"}),
         Variant("half-weights", "standard with blend weights in half precision", {"cached_weights": "half"}),

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.features import first_layer
+from sgsst_core.features import first_layer, winograd
 from sgsst_core.features.network_sources import BLOCKS
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.pooling import max_pool, max_pool_backward, max_positions, relu_backward
@@ -71,6 +71,8 @@ class _Convolution:
     weight: Tensor  # [out, in, 3, 3]
     bias: Tensor  # [out]
     backward_weight: Tensor  # [in, out, 3, 3], transposed and flipped
+    transformed: Tensor | None = None  # weight and backward weight of Winograd's algorithm
+    backward_transformed: Tensor | None = None
     fused: bool = False  # cuDNN runs convolution, bias and ReLU in one launch
     tried: int = 0  # most pixels at which the fused convolution was compared with separate operations
 
@@ -178,6 +180,7 @@ class FeatureNetwork:
         dtype: torch.float32, torch.float64 (reference), torch.bfloat16 or torch.float16.
         tf32: Whether convolutions of a float32 network round their factors to the 10-bit mantissa of TF32. Only NVIDIA
             GPUs do this.
+        winograd: Whether a float32 network on a CPU convolves by Winograd's algorithm (`winograd.convolve`).
 
     Attributes:
         unit: Factor of the content layer's features relative to the units of a 0-255 input.
@@ -197,14 +200,15 @@ class FeatureNetwork:
         device: torch.device | str = "cpu",
         *,
         tf32: bool = False,
+        winograd: bool = False,
     ) -> None:
-        if tf32 and dtype != torch.float32:
-            raise ValueError(f"TF32 is a way to multiply float32, not {dtype}")
+        if (tf32 or winograd) and dtype != torch.float32:
+            raise ValueError(f"TF32 and Winograd's algorithm are ways to multiply float32, not {dtype}")
         self.name = weights.name
         self.layers = tuple(layers)
         self.dtype = dtype
         self.device = torch.device(device)
-        self.tf32 = tf32
+        self.tf32, self.winograd = tf32, winograd
         self.unit = weights.scales.get(CONTENT_LAYER, 1.0)
         self.pixel_weight = weights.scales.get(PIXELS, 1.0) ** 2
         # Map from pixels to the values that the first convolution reads. In bfloat16, each of the 256 gray levels would
@@ -231,14 +235,17 @@ class FeatureNetwork:
                 name = f"conv{block}_{index}"
                 weight, bias = weights.convolutions[name]
                 weight = weight.to(self.device, self.dtype)
-                steps.append(
-                    _Convolution(
-                        f"relu{block}_{index}",
-                        weight.contiguous(memory_format=torch.channels_last),
-                        (bias / self.feature_unit).to(self.device, self.dtype),
-                        weight.transpose(0, 1).flip(2, 3).contiguous(memory_format=torch.channels_last),
-                    )
+                backward_weight = weight.transpose(0, 1).flip(2, 3)
+                step = _Convolution(
+                    f"relu{block}_{index}",
+                    weight.contiguous(memory_format=torch.channels_last),
+                    (bias / self.feature_unit).to(self.device, self.dtype),
+                    backward_weight.contiguous(memory_format=torch.channels_last),
                 )
+                if self.winograd:
+                    step.transformed = winograd.transform_weight(weight)
+                    step.backward_transformed = winograd.transform_weight(backward_weight)
+                steps.append(step)
                 left.discard(f"relu{block}_{index}")
                 if not left:
                     return steps
@@ -256,8 +263,8 @@ class FeatureNetwork:
 
     @property
     def precision(self) -> str:
-        """Precision of convolutions: "tf32", or the name of `dtype`."""
-        return "tf32" if self.tf32 else str(self.dtype).removeprefix("torch.")
+        """Precision of convolutions: "tf32", "winograd", or the name of `dtype`."""
+        return "tf32" if self.tf32 else "winograd" if self.winograd else str(self.dtype).removeprefix("torch.")
 
     @property
     def rounding(self) -> float:
@@ -355,10 +362,14 @@ class FeatureNetwork:
             if result is not None:
                 return result
             step.fused = False
+        if step.transformed is not None and winograd.pays_off(*x.shape[2:]):
+            return winograd.convolve(x, step.transformed, step.bias)
         return F.conv2d(x, step.weight, step.bias, padding=1).relu_()
 
     def _convolve_back(self, gradient: Tensor, step: _Convolution) -> Tensor:
         """Return the gradient [1, in, h, w] of a convolution's input, given the gradient of its output before ReLU."""
+        if step.backward_transformed is not None and winograd.pays_off(*gradient.shape[2:]):
+            return winograd.convolve(gradient, step.backward_transformed)
         return F.conv2d(gradient, step.backward_weight, padding=1)
 
     @torch.no_grad()

@@ -32,17 +32,19 @@ _SCAN = 0.2
 _VIEW_DEPENDENT = 0.05
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
-#: Speedup of convolutions from which on a CPU uses bfloat16. Processors with the instructions reach 2.2 to 2.3, or much
-#: more with matrix units, and others stay below 1, so that runs on one machine choose alike. The speedup of a view's
-#: loss would depend on its size.
+#: Speedup of convolutions from which on a CPU uses a precision instead of a more accurate one, so that runs on one
+#: machine choose alike: Winograd's algorithm reaches 1.9 to 2.4. Processors with instructions for bfloat16 reach as
+#: much, or several times more with matrix units. The speedup of a view's loss would depend on its size.
 _MUCH_FASTER = 1.5
+#: GPU that computes in each precision.
+_GPU = "an NVIDIA GPU of compute capability 8.0 or higher"
 #: Fraction of the greatest speedup that a more accurate precision must reach on a GPU.
 _AS_FAST = 0.9
 #: Relative error of the pixel gradient up to which a precision is chosen. With errors of 0.3, the float32 loss falls as
 #: with float32 (docs/quality.md).
 _LARGEST_ERROR = 0.5
 #: Pixels through the network in all steps below which no precisions are compared: seconds on two cores.
-_COMPARED_PIXELS = 2_000_000
+_COMPARED_PIXELS = 1_000_000
 #: Minimum visits per view size for which a CUDA graph of the loss is considered at all.
 LEAST_GRAPH_VISITS = 20
 #: The same if the capture is first tried in a child process, whose start takes as long as so many visits save: 6 s.
@@ -111,20 +113,24 @@ def compares_precisions(sizes: Sequence[Size], settings: Settings) -> bool:
 def choose_precision(facts: Facts, settings: Settings) -> PlannedPrecision:
     """Choose the precision of the network: the requested one if its convolutions are faster than in float32.
 
-    With "auto", a CPU uses bfloat16 if it is much faster; a GPU uses the most accurate of the fastest precisions.
+    With "auto", a CPU uses a less accurate precision if it is much faster; a GPU uses the most accurate of the fastest
+    precisions.
     """
     measured = facts.precisions or {}
     if settings.precision != "auto":
         requested = measured.get(settings.precision) if settings.precision != "float32" else None
         return settings.precision if requested and requested.error else "float32"
-    on_cpu = facts.machine.device == "cpu"
     errors = {
         name: own.error.relative_error
         for name, own in measured.items()
-        if own.error
-        and own.error.relative_error <= _LARGEST_ERROR
-        and (own.convolution >= _MUCH_FASTER if on_cpu else own.speedup > 1)
+        if own.error and own.error.relative_error <= _LARGEST_ERROR and own.speedup > 1
     }
+    if facts.machine.device == "cpu":
+        chosen: PlannedPrecision = "float32"
+        for name in sorted(errors, key=lambda name: errors[name]):
+            before = 1.0 if chosen == "float32" else measured[chosen].convolution
+            chosen = name if measured[name].convolution >= _MUCH_FASTER * before else chosen
+        return chosen
     most = max((measured[name].speedup for name in errors), default=0.0)
     fastest = [name for name in errors if measured[name].speedup >= _AS_FAST * most]
     return min(fastest, key=lambda name: errors[name], default="float32")
@@ -475,7 +481,7 @@ def _about_precision(plan: Plan, facts: Facts, settings: Settings, parts: Mappin
     if requested == "float32":
         return
     compared = [
-        f"convolutions in {name} are {own.convolution:.2g} times as fast as in float32"
+        f"convolutions {_in(name)} are {own.convolution:.2g} times as fast as in float32"
         + (
             f", a view's loss {own.speedup:.2g} times, with an error of {own.error.relative_error:.2g}"
             if own.error
@@ -487,11 +493,12 @@ def _about_precision(plan: Plan, facts: Facts, settings: Settings, parts: Mappin
     if plan.precision != "float32":
         own = measured[plan.precision]
         assert own.error is not None
+        colors = "is measured during the run" if plan.is_approximated else "is that of rounding"
         known = (
             f"the first view's pixel gradient has a relative error of {own.error.relative_error:.2g} (cosine "
-            f"{own.error.cosine:.5f}); the error of the colors is measured during the run"
+            f"{own.error.cosine:.5f}); the error of the colors {colors}"
         )
-        what = "convolutions in TF32" if plan.precision == "tf32" else f"features in {plan.precision}"
+        what = f"{'convolutions' if plan.precision in ('tf32', 'winograd') else 'features'} {_in(plan.precision)}"
         saved = max(own.speedup - 1, 0.0) * sum(
             parts.get(name, 0.0) for name in ("vgg_forward", "vgg_backward", "statistics")
         )
@@ -499,8 +506,8 @@ def _about_precision(plan: Plan, facts: Facts, settings: Settings, parts: Mappin
         yield Decision("precision", what, f"{how}: {reason}", seconds=saved, error=known)
         return
     if requested != "auto":
-        needed = "an NVIDIA GPU" if requested != "bfloat16" else "a CPU, an AMD GPU, or an NVIDIA GPU"
-        missing = f"{requested} needs {needed} of compute capability 8.0 or higher"
+        needed = {"winograd": "a CPU", "bfloat16": f"a CPU, an AMD GPU, or {_GPU}"}.get(requested, _GPU)
+        missing = f"{requested} needs {needed}"
         reason = f"{requested} was requested, but {reason or missing}"
     elif facts.precisions is None:
         reason = "exact; the steps take too little time to compare others"
@@ -510,3 +517,8 @@ def _about_precision(plan: Plan, facts: Facts, settings: Settings, parts: Mappin
         least = f"{_MUCH_FASTER} times faster convolutions" if facts.machine.device == "cpu" else "a faster loss"
         reason = f"exact; {reason}, but {least} and an error of at most {_LARGEST_ERROR} are needed"
     yield Decision("precision", "features in float32", reason)
+
+
+def _in(precision: PlannedPrecision) -> str:
+    """Return how something is computed in a precision."""
+    return {"winograd": "by Winograd's algorithm", "tf32": "in TF32"}.get(precision, f"in {precision}")

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from sgsst_core.budget import default_memory_limit, memory_for
+from sgsst_core.features import winograd
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import computed_twice, scaled_region
 from sgsst_core.features.vgg import (
@@ -44,6 +46,7 @@ from sgsst_core.timing import Timer, wait_for
 
 DTYPES: dict[PlannedPrecision, torch.dtype] = {
     "float32": torch.float32,
+    "winograd": torch.float32,
     "tf32": torch.float32,
     "bfloat16": torch.bfloat16,
     "float16": torch.float16,
@@ -359,7 +362,8 @@ def make_network(
     """Create the feature network with layers up to the deepest one used."""
     layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0, settings=settings)
     use_whole_float32()
-    return FeatureNetwork(weights, layers, DTYPES[precision], device, tf32=precision == "tf32")
+    ways = {"tf32": precision == "tf32", "winograd": precision == "winograd"}
+    return FeatureNetwork(weights, layers, DTYPES[precision], device, **ways)
 
 
 def available_precisions(settings: Settings, device: Device, collectives: Collectives) -> list[PlannedPrecision]:
@@ -370,6 +374,7 @@ def available_precisions(settings: Settings, device: Device, collectives: Collec
     has: dict[PlannedPrecision, bool] = {
         "tf32": has_tf32(device),
         "float16": has_float16(device),
+        "winograd": device == "cpu",
         "bfloat16": has_bfloat16(device) if settings.precision != "auto" else has_bfloat16_instructions(device),
     }
     everywhere = collectives.all_gather(has)
@@ -404,13 +409,17 @@ def _convolution_seconds(precision: PlannedPrecision, device: Device) -> float:
     kernel = torch.ones((channels, channels, 3, 3), dtype=dtype, device=device)
     if device == "cuda":
         image, kernel = (tensor.contiguous(memory_format=torch.channels_last) for tensor in (image, kernel))
+    convolve: Callable[[Tensor], Tensor] = partial(torch.nn.functional.conv2d, weight=kernel, padding=1)
+    if precision == "winograd" and (transformed := winograd.transform_weight(kernel)) is not None:
+        convolve = partial(winograd.convolve, transformed=transformed)
+        convolve(image[:, :, :8, :8])  # compiles kernels
     seconds = []
     with convolutions(image.device, tf32=precision == "tf32"):
         for _ in range(1 + _MEASUREMENTS):
-            timer, started = Timer(device), time.thread_time()
+            timer, started = Timer(device), time.process_time()
             with timer("convolution"):
-                torch.nn.functional.conv2d(image, kernel, padding=1)
-            seconds.append(timer.read()["convolution"] if device == "cuda" else time.thread_time() - started)
+                convolve(image)
+            seconds.append(timer.read()["convolution"] if device == "cuda" else time.process_time() - started)
             if seconds[-1] > _SLOW:
                 break
     return min(seconds[1:] or seconds)

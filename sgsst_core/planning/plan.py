@@ -11,7 +11,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.refine.split import Refinement
-from sgsst_core.settings import CachedWeights, PlannedBackground, PlannedPrecision
+from sgsst_core.settings import WHOLE_FLOAT32, CachedWeights, PlannedBackground, PlannedPrecision
 
 Device = Literal["cpu", "cuda"]
 
@@ -116,7 +116,7 @@ class Plan:
     @property
     def is_approximated(self) -> bool:
         """Whether measurements compare the gradient of a step with the float32 reference."""
-        return self.precision != "float32" or self.cached_weights == "half"
+        return self.precision not in WHOLE_FLOAT32 or self.cached_weights == "half"
 
     def as_dict(self) -> dict[str, Any]:
         """Return decisions and prediction as JSON-serializable values."""

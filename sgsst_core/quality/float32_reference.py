@@ -19,7 +19,7 @@ from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.settings import StyleLossName
+from sgsst_core.settings import WHOLE_FLOAT32, StyleLossName
 from sgsst_core.stylizing.evaluation import Evaluation, ShowViews, evaluate, show_nothing
 from sgsst_core.stylizing.job import StyleTargetCache
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -30,7 +30,7 @@ from sgsst_core.stylizing.views import Views
 def approximations(stylizer: Stylizer) -> list[str]:
     """Return the names of a job's approximations whose gradient error exceeds rounding; empty if there are none."""
     names = []
-    if stylizer.job.network.precision != "float32":
+    if stylizer.job.plan.precision not in WHOLE_FLOAT32:
         names.append("TF32 convolutions" if stylizer.job.network.tf32 else f"{stylizer.job.network.precision} features")
     if stylizer.job.plan.cached_weights == "half":
         names.append("half-precision blend weights")

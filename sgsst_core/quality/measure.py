@@ -26,6 +26,7 @@ from sgsst_core.quality.lpips import LPIPS_NETWORK, Lpips, load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViews
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import WHOLE_FLOAT32
 from sgsst_core.stylizing.evaluation import Evaluation, ShowViews, show_nothing
 from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -244,7 +245,7 @@ class Measurements:
         source: StylizationJob | ExactLoss = stylizer.job
         if not has_statistics(stylizer.job.settings.style_loss):
             source = ExactLoss(stylizer, "sos")
-        elif stylizer.job.network.precision != "float32":
+        elif stylizer.job.plan.precision not in WHOLE_FLOAT32:
             source = self.exact
         first = stylizer.measured[0]["novel_views"] if stylizer.measured else None
         return NovelViews(

@@ -92,8 +92,9 @@ def test_precisions_are_compared_on_a_view(tiny_weights: BackboneWeights, monkey
             assert 0 < compared.error.relative_error < 1
 
 
-def test_convolutions_are_timed() -> None:
-    assert convolution_ratio("bfloat16", "cpu") > 0
+@pytest.mark.parametrize("precision", ["bfloat16", "winograd"])
+def test_convolutions_are_timed(precision: PlannedPrecision) -> None:
+    assert convolution_ratio(precision, "cpu") > 0
 
 
 @pytest.mark.parametrize(
@@ -108,7 +109,7 @@ def test_bfloat16_is_tried_unless_it_is_emulated(
         monkeypatch.delattr(torch.cpu, "get_capabilities")
     for requested, expected in (("auto", native), ("bfloat16", True), ("float32", False), ("tf32", False)):
         names = available_precisions(make_settings(precision=requested), "cpu", ALONE)
-        assert names == ["bfloat16"] * expected
+        assert names == ["winograd"] * (requested == "auto") + ["bfloat16"] * expected
 
 
 def test_one_thread_is_timed_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,7 +128,7 @@ def test_one_thread_is_timed_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_rank_must_have_the_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     class Others(type(ALONE)):  # type: ignore[misc]
         def all_gather(self, value: Any) -> list[Any]:
-            return [value, {"tf32": has_it, "float16": has_it, "bfloat16": True}]
+            return [value, {"tf32": has_it, "float16": has_it, "winograd": False, "bfloat16": True}]
 
     for name in ("has_tf32", "has_float16", "has_bfloat16_instructions"):
         monkeypatch.setattr(module, name, lambda device: True)
@@ -148,6 +149,10 @@ def test_every_rank_must_have_the_precision(monkeypatch: pytest.MonkeyPatch) -> 
         ("cpu", {"bfloat16": (1.4, 0.3)}, "float32"),
         ("cpu", {"bfloat16": (1.8, 0.1)}, "bfloat16"),
         ("cpu", {"bfloat16": (1.8, 0.9)}, "float32"),
+        ("cpu", {"winograd": (1.9, 0.001), "bfloat16": (0.1, None)}, "winograd"),
+        ("cpu", {"winograd": (1.9, 0.001), "bfloat16": (2.4, 0.1)}, "winograd"),
+        ("cpu", {"winograd": (1.9, 0.001), "bfloat16": (9.0, 0.1)}, "bfloat16"),
+        ("cpu", {"winograd": (1.4, 0.001), "bfloat16": (1.9, 0.1)}, "bfloat16"),
         ("cuda", {"tf32": (5.0, 0.05), "bfloat16": (9.0, 0.15)}, "bfloat16"),
         ("cuda", {"tf32": (8.5, 0.05), "bfloat16": (9.0, 0.15)}, "tf32"),
         ("cuda", {"tf32": (1.2, 0.05), "bfloat16": (9.0, 0.6)}, "tf32"),
@@ -177,8 +182,8 @@ def test_precision_is_chosen_by_speed_and_error(
 def test_precisions_are_compared_only_for_long_jobs() -> None:
     """Steps of phase 1 count as much as their pixels."""
     size = (545, 980)
-    assert compares_precisions([size], make_settings(steps_coarse=0, steps_sos=4))
-    assert not compares_precisions([size], make_settings(steps_coarse=0, steps_sos=3))
+    assert compares_precisions([size], make_settings(steps_coarse=0, steps_sos=2))
+    assert not compares_precisions([size], make_settings(steps_coarse=0, steps_sos=1))
     assert not compares_precisions([size], make_settings(steps_coarse=100, steps_sos=0, coarsest_side=128))
     assert not compares_precisions([size], make_settings(precision="float32"))
     assert not compares_precisions([size], make_settings("paper"))
@@ -191,11 +196,14 @@ def test_measured_precision_is_used_said_and_repeatable(
     """A job with a chosen precision has the bits of one in which it was requested."""
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
     monkeypatch.setattr("sgsst_core.planning.choices._COMPARED_PIXELS", 0)
-    for speedup, chosen in ((1.9, "bfloat16"), (1.2, "float32")):
-        measured = Comparison(speedup, 1.4, Difference(0.125, 0.99))
+    for speedup, chosen in ((4.0, "bfloat16"), (2.0, "winograd"), (1.2, "float32")):
+        measured = {
+            "winograd": Comparison(min(speedup, 1.9), 1.4, Difference(0.001, 1.0)),
+            "bfloat16": Comparison(speedup, 1.4, Difference(0.125, 0.99)),
+        }
         monkeypatch.setattr(
             "sgsst_core.stylizing.planner.compare_precisions",
-            lambda context, camera, names, own=measured: dict.fromkeys(names, own),
+            lambda context, camera, names, own=measured: {name: own[name] for name in names},
         )
         auto, asked = (
             Stylizer.planned(ball(300), cameras(2), style(), make_settings(precision=name), weights=tiny_weights)
@@ -203,8 +211,10 @@ def test_measured_precision_is_used_said_and_repeatable(
         )
         assert auto.job.plan.precision == auto.job.network.precision == chosen
         line = next(decision for decision in auto.job.plan.decisions if decision.item == "precision")
-        assert line.decision == f"features in {chosen}"
-        assert f"convolutions in bfloat16 are {speedup} times as fast as in float32" in line.reason
+        done = "convolutions by Winograd's algorithm" if chosen == "winograd" else f"features in {chosen}"
+        assert line.decision == done
+        assert auto.job.plan.is_approximated == (chosen == "bfloat16")
+        assert f"convolutions in bfloat16 are {speedup:.2g} times as fast as in float32" in line.reason
         assert "a view's loss 1.4 times, with an error of 0.12" in line.reason
         assert auto.run_step().loss == asked.run_step().loss
         assert torch.equal(auto.sh_dc, asked.sh_dc)
