@@ -30,14 +30,15 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.statistics import TILE, span_positions
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.scale_weights import EVEN
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.division import Size
-from sgsst_core.scene.pyramid import add_upscaled_, downscale
+from sgsst_core.scene.pyramid import add_upscaled_, downscale, scale_count
 from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings
 
-PRECISIONS = ("float32", "tf32", "bfloat16")
+PRECISIONS = ("float32", "tf32", "float16")
 #: Kernel launches of a step with a fully cached view of 980x545 in bfloat16, and those of its loss at three scales.
 LAUNCHES, LOSS_LAUNCHES = 485, 456
 #: Launches to compute a view's tile intersections: two multi-pass sorts, a multi-pass sum, kernels and copies.
@@ -73,8 +74,8 @@ class Device:
         return int(GPU_SHARE * self.memory)
 
 
-def _device(bfloat16: float, tf32: float, float32: float, float64: float, *rest: float) -> Device:
-    return Device({"bfloat16": bfloat16, "tf32": tf32, "float32": float32, "float64": float64}, *rest)
+def _device(float16: float, tf32: float, float32: float, float64: float, *rest: float) -> Device:
+    return Device({"float16": float16, "tf32": tf32, "float32": float32, "float64": float64}, *rest)
 
 
 DEVICES = {
@@ -91,7 +92,7 @@ class Shares:
 
     Attributes:
         convolution: Fraction of `Device.peaks` for convolutions, by precision.
-        matrix: Fraction of `Device.peaks` for Triton's products of features and matrices, in bfloat16 or float32.
+        matrix: Fraction of `Device.peaks` for Triton's products of features and matrices, in float16 or float32.
         moments: The same for products of features with each other.
         bandwidth: Fraction of the memory bandwidth.
         lanes: Fraction of the thread instructions per second for the rasterizer, whose loop has no memory accesses. A
@@ -112,7 +113,7 @@ class Shares:
 
     def rates(self, device: Device, precision: str) -> dict[str, float]:
         """Return the operations and bytes per second that `Work.seconds` expects."""
-        product = "bfloat16" if precision == "bfloat16" else "float32"
+        product = "float16" if precision == "float16" else "float32"
         return {
             "convolution": device.peaks[precision] * self.convolution[precision],
             "matrix": device.peaks[product] * self.matrix[product],
@@ -126,9 +127,9 @@ class Shares:
 def _shares(
     convolution: tuple[float, float, float], matrix: tuple[float, float], moments: tuple[float, float], *rest: float
 ) -> Shares:
-    """Return fractions for convolutions in float32, TF32 and bfloat16, and for products in float32 and bfloat16."""
-    kinds = ("float32", "bfloat16")
-    convolutions = dict(zip(("float32", "tf32", "bfloat16"), convolution, strict=True))
+    """Return fractions for convolutions in float32, TF32 and float16, and for products in float32 and float16."""
+    kinds = ("float32", "float16")
+    convolutions = dict(zip(("float32", "tf32", "float16"), convolution, strict=True))
     return Shares(convolutions, dict(zip(kinds, matrix, strict=True)), dict(zip(kinds, moments, strict=True)), *rest)
 
 
@@ -209,7 +210,7 @@ def shapes_of(name: str) -> BackboneWeights:
 
 def make_loss(device: Device, precision: str) -> SosLoss:
     """Return the loss of VGG19 with the memory budget of a job on the device."""
-    dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
+    dtype = torch.float16 if precision == "float16" else torch.float32
     network = FeatureNetwork(shapes_of("vgg19"), dtype=dtype, device="meta", tf32=precision == "tf32")
     return SosLoss(network, memory=memory_for("activations", device.memory_limit))
 
@@ -331,7 +332,7 @@ def statistics(channels: int, positions: int, size: int) -> Work:
 def style_gradient(channels: int, positions: int, size: int) -> Work:
     """Return the work of `statistics_terms_kernels.add_style_gradient`.
 
-    It reads the features, and reads and writes the gradient. Bfloat16 features are multiplied by two matrices.
+    It reads the features, and reads and writes the gradient. Float16 features are multiplied by two matrices.
     """
     products = 2 if size == 2 else 1
     return Work(2.0 * products * channels**2 * positions, 3.0 * channels * positions * size, "matrix")
@@ -457,7 +458,7 @@ def view_budget(job: Job, device: Device, loss: SosLoss) -> int:
     each = network.held_bytes_per_pixel() + network.working_bytes_per_pixel()
     once = min(int(job.size[0] * job.size[1] * each), budget)
     reference = 1 if network.precision == "float32" else 2
-    needed = min(once * reference, budget) if network.precision == "bfloat16" else once
+    needed = min(once * reference, budget) if network.precision == "float16" else once
     spare = max(budget - needed - once, 0)
     return memory_for("views", memory) - reference * measuring_memory(memory) + spare
 
@@ -509,10 +510,11 @@ def forecast(job: Job, device: Device, precision: str) -> dict[str, Any]:
             / 3600
             for name in SHARES
         }
-    standard = make_settings("standard")
+    standard, count = make_settings("standard"), scale_count(*job.size)
+    steps = standard.steps_sos * EVEN.sampled_cost(count, standard.scale_sampling)  # that cost as much on all scales
     forecasts["standard"] = {
-        name: standard.steps_coarse * forecasts["coarse"][name]["total"]
-        + standard.steps_sos * forecasts["sos"][name]["total"]
+        name: (standard.steps_coarse + standard.steps_sos - steps) * forecasts["coarse"][name]["total"]
+        + steps * forecasts["sos"][name]["total"]
         for name in SHARES
     }
     forecasts["cached"] = cached_fractions(job, device, make_loss(device, precision), coarse=False)

@@ -3,7 +3,7 @@
 python -m benchmarks.scaling [--shown 0.65]
 
 Nothing here is measured on several GPUs. The times of one GPU are those of `benchmarks.forecast` for an H100 in
-bfloat16, with all data of the views in memory. One GPU replays the loss as a CUDA graph; several launch the kernels of
+float16, with all data of the views in memory. One GPU replays the loss as a CUDA graph; several launch the kernels of
 their partition tiles one by one. Launches for exchanges are not counted. The other assumptions are the constants below;
 they are stored with the tables. `benchmarks.ranks` validates the same model on a CPU, by predicting the speedup of two
 ranks from one rank's seconds.
@@ -76,8 +76,8 @@ def work_of(job: Job, shown: float) -> IterationWork:
     """
     height, width = job.size
     device, shares = DEVICES["H100"], SHARES["likely"]
-    parts = step_parts(job, device, "bfloat16", everything_cached=True)
-    rates = shares.rates(device, "bfloat16")
+    parts = step_parts(job, device, "float16", everything_cached=True)
+    rates = shares.rates(device, "float16")
 
     def seconds(part: Part) -> float:
         return part.visits * sum(work.seconds(rates) for work in part.works)

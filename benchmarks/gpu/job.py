@@ -16,7 +16,7 @@ import safetensors.torch
 import torch
 from PIL import Image
 
-from benchmarks.gpu.part import QUICK, Findings, Sizes, device
+from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.gpu.step import ZOOM
 from sgsst_core.bench.synthetic import random_weights, surface_scene, texture, views
 from sgsst_core.features.weight_files import digest_of_bytes, weights_file
@@ -30,8 +30,7 @@ PROGRAM: tuple[str, ...] = (sys.executable, "-m", "api.cli")
 
 
 def run(sizes: Sizes, findings: Findings) -> None:
-    """Run all jobs with the preset `standard`; on a GPU in bfloat16."""
-    precision = "bfloat16" if device().type == "cuda" else "float32"
+    """Run all jobs as by default."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         _install_weights(folder)
@@ -41,8 +40,8 @@ def run(sizes: Sizes, findings: Findings) -> None:
             (folder / "cameras.json").write_text(json.dumps([_entry(camera) for camera in cameras]))
             image = (255 * texture(height, height, seed=3)).byte().numpy()
             Image.fromarray(image).save(folder / "style.png")
-            options = ["--precision", precision, *(["--steps-sos", "2"] if sizes == QUICK else [])]
-            name, figures = f"{count}x{width}x{height}/{precision}", _run(folder, options)
+            options = ["--steps-sos", "2"] if sizes == QUICK else []
+            name, figures = f"{count}x{width}x{height}", _run(folder, options)
             findings.add(name, {"gaussians": gaussians, **figures})
             if "steps" not in figures:
                 findings.broken.append(f"{name}: {figures['printed'][-500:]}")
@@ -93,5 +92,5 @@ def _run(folder: Path, options: list[str]) -> dict[str, Any]:
     content = json.loads(report.read_text())
     report.unlink()
     figures = {name: content[name] for name in ("seconds_total", "seconds_by_part", "memory")}
-    plan = {name: content["plan"][name] for name in ("prediction", "measured")}
+    plan = {name: content["plan"][name] for name in ("precision", "prediction", "measured")}
     return {"seconds": seconds, "steps": len(content["history"]), **figures, "plan": plan, "printed": printed[-3000:]}

@@ -88,13 +88,13 @@ class Launches:
 
 
 def run(sizes: Sizes, findings: Findings) -> None:
-    """Record the kernels of steps, on a GPU in bfloat16 too, then those of cached blend weights."""
+    """Record the kernels of steps, on a GPU in the default precision too, then those of cached blend weights."""
     launches, (width, height) = Launches(), sizes.view
     scene = surface_scene(sizes.gaussians[0], degree=3)
-    precisions: tuple[Precision, ...] = ("bfloat16", "float32") if device().type == "cuda" else ("float32",)
+    precisions: tuple[Precision, ...] = ("auto", "float32") if device().type == "cuda" else ("float32",)
     for precision in precisions:
         stylizer = _record_steps(sizes, scene, precision, launches)
-        place = "step" if precision == "float32" else f"step_{precision}"
+        place = "step" if precision == "float32" else f"step_{stylizer.job.plan.precision}"
         report(launches, place, findings, _STEPS)
         if device().type == "cuda":
             findings.add(f"{place}/all_launches", _all_launches(stylizer))
