@@ -54,8 +54,8 @@ TrainingBackground = Literal["auto", "background", "random", "palette"]
 #: Prefix of the description of a default that depends on the preset.
 BY_PRESET = "by preset"
 M = TypeVar("M", bound=BaseModel)
-#: Settings that a time budget chooses if they are not given.
-_BUDGETED = ("max_resolution", "steps_coarse", "steps_sos", "learning_rate_end")
+#: Settings that a time budget, or the plan of a job on several ranks, chooses if they are not given.
+_CHOSEN = ("max_resolution", "steps_coarse", "steps_sos", "learning_rate_end", "views_per_step")
 
 
 #: Upper limit of a view's longer side in pixels: well beyond the paper's 5187, and low enough that a typo does not
@@ -274,7 +274,7 @@ class Settings(BaseModel):
         "of views and the steps that fit, unless they are given.",
     )
     fixed: Annotated[tuple[str, ...], Option(instead="within")] = Field(
-        (), description="What a time budget leaves as it is: given settings, and `views`."
+        (), description="What a time budget and the plan leave as it is: given settings, and `views`."
     )
     memory_limit: Annotated[
         int | None,
@@ -324,7 +324,8 @@ class Settings(BaseModel):
         1,
         ge=1,
         le=10_000,
-        description="Average the gradients of V views in each step; groups of workers evaluate them in parallel.",
+        description="Average the gradients of V views in each step; groups of workers evaluate them in parallel. "
+        "Unless this or the steps are given, each of several workers may get a view of its own, in fewer steps.",
     )
     rebalance: bool = Field(
         True,
@@ -408,8 +409,7 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     chosen = {shown[name].field if name in shown else name: each for name, each in values.items() if each is not None}
     if "learning_rate" in chosen:  # an explicit learning rate is constant, unless its end is given too
         chosen.setdefault("learning_rate_end", chosen["learning_rate"])
-    if "within" in chosen:
-        chosen.setdefault("fixed", tuple(name for name in _BUDGETED if name in chosen))
+    chosen.setdefault("fixed", tuple(name for name in _CHOSEN if name in chosen))
     whole = _PRESETS[preset]
     settings = checked(Settings, {"preset": preset, **whole, **chosen})
     fraction = (settings.steps_coarse + settings.steps_sos) / (whole["steps_coarse"] + whole["steps_sos"])

@@ -138,13 +138,14 @@ def prepare(
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     plan = _usable_plan(known, collectives)
     if known and not plan and known.plan.device == common_device(collectives):
-        settings = settings.model_copy(update={"precision": known.plan.precision})  # a job has one precision
+        asked = asked.model_copy(update={"precision": known.plan.precision})  # a job has one precision
     planned_ranks = known.ranks if known and plan else collectives.size
     stylization = _planner(inputs, asked, weights, scene_file.scene, refinement, chosen)(
         plan=plan,
         photos=inputs.photo_loader(settings.background),
         collectives=collectives,
         survey=known.plan.survey if known else None,
+        groups=resumed.plan.groups if resumed else None,
         show=show_planning,
         timer=timer,
         left=None if known else left,

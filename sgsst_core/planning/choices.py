@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from sgsst_core.budget import memory_for
 from sgsst_core.decision import ANOTHER_LOSS, VIEWS, Decision
 from sgsst_core.loss.convergence import MIN_FALL, window_length
@@ -17,7 +19,7 @@ from sgsst_core.number_format import duration
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.context import LEAST_VISITS, Facts, NetworkPixels, Saving
 from sgsst_core.planning.measurement_choice import LOSS_VIEWS
-from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.plan import Plan, Shape
 from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import CachedWeights, PlannedBackground, PlannedPrecision, Settings
@@ -51,6 +53,11 @@ LEAST_GRAPH_VISITS = 20
 LEAST_TRIED_VISITS = 1000
 #: Minimum fraction of a step's time that additional ranks must save.
 LEAST_GAIN = 0.03
+#: Fraction of the steps' time that steps with a view for each rank must save in comparison with divided views.
+_LEAST_GROUP_GAIN = 0.1
+#: Number of steps with one view that a step with several is worth, by the loss left (benchmarks/results/README.md).
+#: More views were not measured.
+_WORTH = {1: 1.0, 2: 1.9, 4: 2.6, 8: 3.4}
 #: Bytes per optimized Gaussian: color, gradient and two moments, float32.
 OPTIMIZER_BYTES = 4 * 3 * 4
 
@@ -168,15 +175,51 @@ def uses_graphs(plan: Plan, facts: Facts, settings: Settings, cost: Saving | Non
         settings: Settings of the job.
         cost: Cost of launching a view's loss; None if it was not measured.
     """
-    if cost is None or cost.least_visits is None:
+    if cost is None or cost.least_visits is None or _divides_views(facts, settings):
         return False
     phases = bool(plan.steps_coarse) + bool(settings.steps_sos)
     return _visits_of_a_size(plan, facts, settings) >= phases * (FIRST_VISITS + cost.least_visits)
 
 
-def choose_ranks(seconds: Mapping[int, float]) -> int:
-    """Return the smallest number of ranks whose seconds per step are within `LEAST_GAIN` of the best."""
-    return min(ranks for ranks, own in seconds.items() if own <= min(seconds.values()) * (1 + LEAST_GAIN))
+def choose_ranks(seconds: Mapping[Shape, float]) -> Shape:
+    """Choose the number of ranks and of their groups.
+
+    Returns:
+        The smallest number of ranks whose seconds per step are within `LEAST_GAIN` of the best with as few groups as
+        possible, unless a view for each rank saves much more.
+    """
+    least = min(groups for _, groups in seconds)
+    few = {shape: own for shape, own in seconds.items() if shape[1] == least}
+    best = min(shape for shape, own in few.items() if own <= min(few.values()) * (1 + LEAST_GAIN))
+    most = (1 - _LEAST_GROUP_GAIN) * few[best] / worth(least)
+    more = (shape for shape, own in seconds.items() if shape[1] > least and own / worth(shape[1]) <= most)
+    return min(more, default=best)
+
+
+def worth(views: int) -> float:
+    """Return how many steps with one view leave as little of the loss as a step with several views."""
+    return float(np.interp(math.log2(views), [math.log2(known) for known in _WORTH], list(_WORTH.values())))
+
+
+def considers_groups(plan: Plan, facts: Facts, settings: Settings, seconds: Mapping[Shape, float]) -> bool:
+    """Return whether a view for each rank in every step may save time, given the seconds of steps on divided views.
+
+    Steps that were given, and those of the published schedule, remain as they are.
+    """
+    ranks = facts.machine.ranks
+    given = {"views_per_step", "steps_coarse", "steps_sos"} & {*settings.fixed}
+    if settings.preset == "paper" or given or settings.within or not settings.rebalance or ranks == 1:
+        return False
+    possible = len(plan.covered) >= 2 * ranks
+    return possible and choose_ranks({**seconds, (ranks, ranks): seconds[1, 1]}) == (ranks, ranks)
+
+
+def with_groups(settings: Settings, groups: int) -> Settings:
+    """Return the settings of a job whose plan has formed groups of ranks: one view for each in fewer steps."""
+    if groups == 1:
+        return settings
+    steps = {name: math.ceil(getattr(settings, name) / worth(groups)) for name in ("steps_coarse", "steps_sos")}
+    return settings.model_copy(update={**steps, "views_per_step": groups})
 
 
 def _visits(plan: Plan, settings: Settings) -> int:
@@ -248,7 +291,7 @@ def decisions(
     pixels: NetworkPixels,
     parts: Mapping[str, float],
     cost: Saving | None,
-    seconds: Mapping[int, float],
+    seconds: Mapping[Shape, float],
 ) -> Iterator[Decision]:
     """Yield the decisions of a plan, with their reasons.
 
@@ -259,7 +302,7 @@ def decisions(
         pixels: Pixels through the network.
         parts: Seconds of a step per view by activity; "cached weights" are the seconds that these save.
         cost: Cost of launching a view's loss; None if it was not measured.
-        seconds: Measured mean seconds of a step by number of ranks.
+        seconds: Measured mean seconds of a step by number of ranks and groups.
     """
     yield from _about_gaussians(plan, facts, settings)
     yield from _about_coverage(plan, facts, settings, pixels, parts)
@@ -455,24 +498,33 @@ def _about_schedule(plan: Plan, facts: Facts, settings: Settings) -> Iterator[De
         yield Decision("early stop", when, "later steps would gain little", error="the remaining decrease of the loss")
 
 
-def _about_ranks(plan: Plan, facts: Facts, seconds: Mapping[int, float]) -> Iterator[Decision]:
-    """Yield the decisions about ranks that share a GPU, and about the number of ranks."""
+def _about_ranks(plan: Plan, facts: Facts, seconds: Mapping[Shape, float]) -> Iterator[Decision]:
+    """Yield the decisions about ranks that share a GPU, and about the number of ranks and their groups."""
     available, chosen = facts.machine.ranks, plan.ranks
     if plan.device != "cpu" and facts.machine.sharing > 1:
         reason = f"{facts.machine.sharing} of them share a GPU, which NCCL does not support; give each a GPU of its own"
         yield Decision("communication", "ranks exchange data over the CPU (gloo)", reason)
     if available == 1:
         return
-    measured = "a step takes " + ", ".join(f"{duration(own, ' ')} on {ranks}" for ranks, own in seconds.items())
-    if 1 not in seconds:
+    measured = "a step takes " + ", ".join(
+        f"{duration(own, ' ')} on {ranks}" + (f" with {groups} views, worth {worth(groups):.1f} steps" * (groups > 1))
+        for (ranks, groups), own in seconds.items()
+    )
+    one = 1, min(groups for _, groups in seconds)
+    if one not in seconds:
         yield Decision("ranks", f"all {available} take part", f"requested; {measured}")
         return
+    speeds = {shape: seconds[one] / own * worth(shape[1]) / worth(one[1]) for shape, own in seconds.items()}
     who = f"all {available}" if chosen == available else f"{chosen} of {available}"
     if chosen < available:
-        other = seconds[1] / seconds[available]
-        reason = f"all of them would be {other:.2f} times as fast, because the others would only add communication"
-        measured = f"{reason}; {measured}"
-    yield Decision("ranks", f"{who} take part, {seconds[1] / seconds[chosen]:.2f} times as fast as one", measured)
+        every = f"all of them would be {speeds[available, one[1]]:.2f} times as fast"
+        measured = f"{every}, because the others would only add communication; {measured}"
+    faster = f"{speeds[chosen, plan.groups]:.2f} times as fast as one"
+    if plan.groups > 1:
+        each = f"{who} take part, each with a view of its own in fewer steps, {faster}"
+        yield Decision("ranks", each, measured, error="steps average the gradients of several views")
+        return
+    yield Decision("ranks", f"{who} take part, {faster}", measured)
 
 
 def _about_precision(plan: Plan, facts: Facts, settings: Settings, parts: Mapping[str, float]) -> Iterator[Decision]:

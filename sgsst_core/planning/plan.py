@@ -53,6 +53,10 @@ class Prediction:
     ending: float = 0.0
 
 
+#: Number of ranks, and of the groups that they form.
+Shape = tuple[int, int]
+
+
 @dataclass(frozen=True)
 class Plan:
     """Final decisions for a job.
@@ -80,6 +84,8 @@ class Plan:
             measuring is slower than predicted.
         loss_views: Number of views on which the loss is evaluated before and after.
         ranks: Number of ranks that take part.
+        groups: Number of groups of ranks that the plan has formed, each of which evaluates a view of its own in every
+            step (`choices.with_groups`); 1 if the settings decide.
         refinement: Refinement that produced the scene of the plan from the input scene; None if the input scene is not
             refined.
         time_choice: Choice of the time budget; None without one, or if everything was given.
@@ -108,6 +114,7 @@ class Plan:
     measuring: int = 0
     loss_views: int = 4
     ranks: int = 1
+    groups: int = 1
     refinement: Refinement | None = None
     time_choice: TimeChoice | None = None
     decisions: tuple[Decision, ...] = ()

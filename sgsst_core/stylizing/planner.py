@@ -28,7 +28,7 @@ from sgsst_core.planning.context import (
     make_network,
     weight_cost,
 )
-from sgsst_core.planning.plan import Device, Plan
+from sgsst_core.planning.plan import Device, Plan, Shape
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
 from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice, ViewCost, choosable, choose, pixels_of
 from sgsst_core.progress import Progress
@@ -43,7 +43,13 @@ from sgsst_core.settings import PlannedPrecision, Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import StylizationJob, continued, prepare_job
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.prediction import completed_plan, ending_seconds, sos_seconds, with_spare_memory
+from sgsst_core.stylizing.prediction import (
+    completed_plan,
+    ending_seconds,
+    sos_seconds,
+    step_seconds,
+    with_spare_memory,
+)
 from sgsst_core.stylizing.trial import Trial, launch_cost, run_trial
 from sgsst_core.timing import Timer
 
@@ -65,6 +71,7 @@ def plan_job(
     collectives: Collectives = ALONE,
     plan: Plan | None = None,
     survey: Survey | None = None,
+    groups: int | None = None,
     measured: bool = False,
     show: ShowPlanning | None = None,
     timer: Timer | None = None,
@@ -90,6 +97,7 @@ def plan_job(
         collectives: Ranks of the job.
         plan: Plan from an earlier run of the same job, which is used unchanged; None to make one.
         survey: Survey from an earlier plan of the same job; None to survey the views.
+        groups: `Plan.groups` of an earlier plan of the same job; None to choose them.
         measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
         show: Callback for the progress of the survey and the trial.
         timer: Timer that records the survey as "survey", other planning as "planning", and the preparation of a job
@@ -115,8 +123,8 @@ def plan_job(
 
     def prepared(plan: Plan, context: PlanningContext | None = None) -> StylizationJob:
         return prepare_job(
-            plan, scene, cameras, style, settings, weights=weights, photos=photos, collectives=collectives,
-            planning_context=context, regions=regions,
+            plan, scene, cameras, style, choices.with_groups(settings, plan.groups), weights=weights, photos=photos,
+            collectives=collectives, planning_context=context, regions=regions,
         )  # fmt: skip
 
     if plan is not None:
@@ -150,22 +158,25 @@ def plan_job(
         if regions is not None:
             lines += region_decisions(regions, survey.total_blend_weights, [fitted[index] for index in draft.covered])
         lines += _about_styles(style, regions, settings)
-        counts = _rank_counts(facts.machine.ranks, settings)
-        job, trials = _try(lambda ranks: prepared(replace(draft, ranks=ranks), context), counts, collectives, show)
+
+        def shaped(shape: Shape) -> StylizationJob:
+            return prepared(replace(draft, ranks=shape[0], groups=shape[1]), context)
+
+        job, trials = _try_shapes(shaped, draft, facts, settings, groups, collectives, show)
         if chosen and left:
             correct = partial(_corrected, chosen, draft, asked, trials.values(), facts, left)
             chosen = collectives.broadcast(correct)
             settings = chosen.applied(asked)
             draft = replace(draft, steps_coarse=settings.steps_coarse if draft.steps_coarse else 0)
-        cost = launch_cost(job) if job is not None and choices.considers_graphs(draft, facts, settings) else None
+        cost = launch_cost(job) if job and choices.considers_graphs(draft, facts, job.settings) else None
         plan = collectives.broadcast(lambda: completed_plan(draft, facts, settings, pixels, trials, cost))
         plan = with_spare_memory(plan, facts, of_a_view)  # graphs, which the draft lacks, leave less
         lines += [chosen.decision(asked.within, plan.steps_coarse + settings.steps_sos)] if chosen else []
-        intersections = max(trials[plan.ranks].spare - (draft.spare - plan.spare), 0)
+        intersections = max(trials[plan.ranks, plan.groups].spare - (draft.spare - plan.spare), 0)
         plan = replace(plan, spare_intersections=intersections, refinement=refinement, time_choice=chosen)
         plan = replace(plan, decisions=(*lines, *plan.decisions))
-        if job is not None and plan.ranks == job.collectives.size:
-            return continued(job, plan, settings)
+        if job and (plan.ranks, plan.groups) == (job.collectives.size, job.plan.groups):
+            return continued(job, plan, choices.with_groups(settings, plan.groups))
         job = None  # frees its memory
         return prepared(plan, context)
 
@@ -239,33 +250,43 @@ def _corrected(
     return chosen.corrected(settings, seconds_of(best), once + ending_seconds(facts.gaussians), left())
 
 
-def _try(
-    prepared: Callable[[int], StylizationJob],
-    counts: Sequence[int],
+def _try_shapes(
+    prepared: Callable[[Shape], StylizationJob],
+    draft: Plan,
+    facts: Facts,
+    settings: Settings,
+    groups: int | None,
     collectives: Collectives,
     show: ShowPlanning | None,
-) -> tuple[StylizationJob | None, dict[int, Trial]]:
-    """Make a trial of a job with each of some numbers of ranks.
+) -> tuple[StylizationJob | None, dict[Shape, Trial]]:
+    """Make a trial of a job with some numbers of ranks that divide each view, and with a view for each if that may pay.
+
+    Args:
+        groups: Groups of the job if they were chosen before.
 
     Returns:
-        The last job, or None if this rank does not take part in it; and the trials by number of ranks.
+        The last job, or None if this rank does not take part in it; and the trials by number of ranks and groups.
     """
-    trials: dict[int, Trial] = {}
-    for ranks in counts:
+    trials: dict[Shape, Trial] = {}
+    ranks, shapes = facts.machine.ranks, [(count, groups or 1) for count in _rank_counts(facts.machine.ranks, settings)]
+
+    def show_views(visited: int, views: int) -> None:
+        if show:
+            show(Progress(stage="probing", step=len(trials) * views + visited, total=len(shapes) * views))
+
+    for shape in shapes:
         job = own = None  # frees the memory of the last one
-
-        def show_views(visited: int, views: int) -> None:
-            if show:
-                show(Progress(stage="probing", step=len(trials) * views + visited, total=len(counts) * views))
-
         try:
-            job = prepared(ranks)
+            job = prepared(shape)
             own = run_trial(job, show_views)
         except RankLeftOut:
             pass
         of_first = collectives.all_gather(own)[0]
         assert of_first is not None  # the first rank takes part in every trial
-        trials[ranks] = of_first
+        trials[shape] = of_first
+        if shape == (ranks, 1) and not groups:
+            seconds = step_seconds(draft, facts, settings, trials)
+            shapes += [(ranks, ranks)] * choices.considers_groups(draft, facts, settings, seconds)
     return job, trials
 
 

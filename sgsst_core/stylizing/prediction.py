@@ -21,7 +21,7 @@ from sgsst_core.planning.measurement_choice import (
     choose_loss_views,
     novel_view_seconds,
 )
-from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.planning.plan import Plan, Prediction, Shape
 from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.trial import Trial
@@ -71,7 +71,7 @@ def completed_plan(
     facts: Facts,
     settings: Settings,
     pixels: NetworkPixels,
-    trials: Mapping[int, Trial],
+    trials: Mapping[Shape, Trial],
     cost: Saving | None,
 ) -> Plan:
     """Choose ranks, graphs and measurements from the trials of a plan, predict its cost, and list its decisions.
@@ -81,19 +81,17 @@ def completed_plan(
         facts: Facts about the job.
         settings: Settings of the job.
         pixels: Pixels through the network.
-        trials: Trials by number of ranks.
+        trials: Trials by number of ranks and groups.
         cost: Cost of launching a view's loss; None if it was not measured.
     """
-    coarse = plan.steps_coarse
-    sos = settings.steps_sos or int(not coarse)  # phase 1 may have been the only one and be skipped
-    seconds = {
-        ranks: (coarse * trial.coarse.seconds + sos * sos_seconds(trial, facts, settings)) / (coarse + sos)
-        for ranks, trial in trials.items()
-    }
-    ranks = choices.choose_ranks(seconds)
-    trial = trials[ranks]
-    plan = replace(plan, ranks=ranks, graphs=choices.uses_graphs(plan, facts, settings, cost))
-    one_rank = sos_seconds(trials[1], facts, settings) if facts.machine.ranks > 1 and 1 in trials else None
+    seconds = step_seconds(plan, facts, settings, trials)
+    shape = choices.choose_ranks(seconds)
+    trial, settings = trials[shape], choices.with_groups(settings, shape[1])
+    coarse = settings.steps_coarse if plan.steps_coarse else 0
+    plan = replace(plan, ranks=shape[0], groups=shape[1], steps_coarse=coarse)
+    plan = replace(plan, graphs=choices.uses_graphs(plan, facts, settings, cost))
+    alone = next((sos_seconds(own, facts, settings) / each[1] for each, own in trials.items() if each[0] == 1), None)
+    one_rank = shape[1] * alone if alone and facts.machine.ranks > 1 else None
     prediction = replace(_predicted_steps(plan, facts, settings, trial, cost), seconds_one_rank=one_rank)
     if plan.measured:
         plan, prediction = _with_measurements(plan, prediction, facts, settings, trial)
@@ -105,6 +103,16 @@ def completed_plan(
     lines += [_about_measuring(plan, settings)] if plan.measured else []
     lines += _about_time(plan, facts, settings)
     return replace(plan, decisions=tuple(lines))
+
+
+def step_seconds(plan: Plan, facts: Facts, settings: Settings, trials: Mapping[Shape, Trial]) -> dict[Shape, float]:
+    """Return the mean seconds of a step by number of ranks and groups."""
+    coarse = plan.steps_coarse
+    sos = settings.steps_sos or int(not coarse)  # phase 1 may have been the only one and be skipped
+    return {
+        shape: (coarse * trial.coarse.seconds + sos * sos_seconds(trial, facts, settings)) / (coarse + sos)
+        for shape, trial in trials.items()
+    }
 
 
 def sos_seconds(trial: Trial, facts: Facts, settings: Settings) -> float:

@@ -11,10 +11,10 @@ import torch
 from sgsst_core.decision import Decision
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.planning.choices import OPTIMIZER_BYTES, draft_plan
+from sgsst_core.planning.choices import OPTIMIZER_BYTES, considers_groups, draft_plan, with_groups, worth
 from sgsst_core.planning.context import Facts, Hardware, NetworkPixels, Saving, WeightCost
 from sgsst_core.planning.measurement_choice import allowed_seconds
-from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.planning.plan import Plan, Prediction, Shape
 from sgsst_core.planning.survey import Survey
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
@@ -96,12 +96,12 @@ def facts(**changes: Any) -> Facts:
     return replace(known, **changes)
 
 
-def plan_of(known: Facts, trials: dict[int, Trial] | None = None, cost: Saving | None = None, **values: Any) -> Plan:
+def plan_of(known: Facts, trials: dict[Shape, Trial] | None = None, cost: Saving | None = None, **values: Any) -> Plan:
     settings = make_settings(
         **{"steps_coarse": 40, "steps_sos": 40, "coarsest_side": 300, "scale_sampling": 1, **values}
     )
     draft = draft_plan(known, settings, measured=True)
-    return completed_plan(draft, known, settings, NetworkPixels(1e6, 0.0, 1e6, 1), trials or {1: TRIAL}, cost)
+    return completed_plan(draft, known, settings, NetworkPixels(1e6, 0.0, 1e6, 1), trials or {(1, 1): TRIAL}, cost)
 
 
 def line(plan: Plan, item: str) -> Decision | None:
@@ -162,7 +162,7 @@ def test_blend_weights_are_cached_as_memory_and_visits_allow() -> None:
     [({1: 2.0, 2: 1.2, 4: 1.0}, 4), ({1: 2.0, 2: 1.02, 4: 1.0}, 2), ({1: 1.0, 2: 1.1, 4: 3.0}, 1), ({4: 3.0}, 4)],
 )
 def test_smallest_number_of_ranks_near_the_fastest_is_used(seconds: dict[int, float], chosen: int) -> None:
-    trials = {ranks: replace(TRIAL, sos=replace(TRIAL.sos, seconds=own)) for ranks, own in seconds.items()}
+    trials = {(ranks, 1): replace(TRIAL, sos=replace(TRIAL.sos, seconds=own)) for ranks, own in seconds.items()}
     plan = plan_of(facts(machine=Hardware("cpu", GIGABYTE, 4, 4)), trials, steps_coarse=0)
     assert plan.ranks == chosen
     assert expected(plan).seconds == seconds[chosen]
@@ -172,9 +172,55 @@ def test_smallest_number_of_ranks_near_the_fastest_is_used(seconds: dict[int, fl
     assert f"on {chosen}" in text
 
 
+def test_each_rank_gets_a_view_of_its_own_if_that_saves_much_time() -> None:
+    two = facts(machine=Hardware("cpu", GIGABYTE, 2, 2))
+
+    def plan_with(together: float) -> Plan:
+        seconds: dict[Shape, float] = {(1, 1): 2.0, (2, 1): 1.8, (2, 2): together}
+        trials = {shape: replace(TRIAL, sos=replace(TRIAL.sos, seconds=own)) for shape, own in seconds.items()}
+        return plan_of(two, trials, steps_coarse=0, steps_sos=190, measure=0)
+
+    assert worth(2) == 1.9
+    divided, grouped = plan_with(3.2), plan_with(3.0)
+    assert (divided.ranks, divided.groups, grouped.ranks, grouped.groups) == (2, 1, 2, 2)
+    assert "with 2 views, worth 1.9 steps" in text_of(divided, "ranks")
+    assert text_of(grouped, "ranks").startswith(
+        "all 2 take part, each with a view of its own in fewer steps, 1.27 times as fast as one"
+    )
+    settings = make_settings(steps_sos=190)
+    assert with_groups(settings, 1) is settings
+    assert with_groups(settings, 2).steps_sos == 100
+    assert expected(grouped).seconds_one_rank == 4.0
+    assert expected(divided).job - expected(grouped).job == pytest.approx(190 * 1.8 - 100 * 3.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "considered"),
+    [
+        ({}, True),
+        ({"views_per_step": 1}, False),
+        ({"steps_sos": 240}, False),
+        ({"within": 60.0}, False),
+        ({"rebalance": False}, False),
+        ({"preset": "paper"}, False),
+    ],
+)
+def test_given_views_and_steps_remain(values: dict[str, Any], considered: bool) -> None:
+    settings = make_settings(**{"preset": "standard", **values})
+
+    def considers(ranks: int, divided: float) -> bool:
+        known = facts(machine=Hardware("cpu", GIGABYTE, ranks, ranks))
+        seconds: dict[Shape, float] = {(1, 1): 2.0, (ranks, 1): divided}
+        return considers_groups(draft_plan(known, settings, measured=True), known, settings, seconds)
+
+    assert considers(2, 1.9) is considered
+    assert not considers(2, 1.0)  # divided views are as fast
+    assert not considers(4, 1.9)  # there are four views only
+
+
 def test_job_without_steps_uses_one_rank() -> None:
     for machine in (Hardware("cpu", GIGABYTE, 4, 4), Hardware("cpu", GIGABYTE)):
-        plan = plan_of(facts(machine=machine), {1: TRIAL, machine.ranks: TRIAL}, steps_coarse=0, steps_sos=0)
+        plan = plan_of(facts(machine=machine), {(1, 1): TRIAL, (machine.ranks, 1): TRIAL}, steps_coarse=0, steps_sos=0)
         assert plan.ranks == 1
         assert expected(plan).job == expected(plan).measuring
 
@@ -182,7 +228,7 @@ def test_job_without_steps_uses_one_rank() -> None:
 def test_graphs_are_used_if_they_save_time() -> None:
     gpu = facts(machine=Hardware("cuda", 10 * GIGABYTE))
     for cost, used in ((Saving(1.0, 0.5, 1.0), True), (Saving(1.0, 0.99), False), (None, False)):
-        plan = plan_of(gpu, {1: replace(TRIAL, device=GIGABYTE)}, cost)
+        plan = plan_of(gpu, {(1, 1): replace(TRIAL, device=GIGABYTE)}, cost)
         assert plan.graphs is used
         assert text_of(plan, "launches").startswith("kernel by kernel") is not used
         assert expected(plan).seconds == TRIAL.sos.seconds - (0.5 if used else 0.0)
@@ -221,7 +267,7 @@ def test_planned_measuring_stays_within_the_allowed_time() -> None:
 
 
 def test_target_loss_fixes_the_loss_views_regardless_of_timings() -> None:
-    slow = {1: replace(TRIAL, sos=StepCost(100.0, 200.0, {"vgg_forward": 50.0}))}
+    slow = {(1, 1): replace(TRIAL, sos=StepCost(100.0, 200.0, {"vgg_forward": 50.0}))}
     assert plan_of(facts(), slow, steps_sos=4).loss_views == 1
     assert plan_of(facts(), slow, steps_sos=4, target_loss=0.1).loss_views == 4
 
@@ -230,4 +276,4 @@ def test_peak_memory_includes_the_data_of_other_views() -> None:
     peak = expected(plan_of(facts(), unseen="freeze")).peak_bytes
     assert peak > TRIAL.process + TRIAL.growth
     more = replace(TRIAL, growth=2 * GIGABYTE)
-    assert expected(plan_of(facts(), {1: more}, unseen="freeze")).peak_bytes == peak + GIGABYTE
+    assert expected(plan_of(facts(), {(1, 1): more}, unseen="freeze")).peak_bytes == peak + GIGABYTE

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import time
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.planning import choices
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
@@ -304,6 +306,33 @@ def test_views_that_groups_cannot_share_evenly_are_tried() -> None:
     (groups, loss), other = on_ranks(2, planned_views, 3, 2, timeout=20.0)
     assert groups == 2
     assert other == (groups, loss)
+
+
+def planned_in_groups(collectives: Collectives) -> dict[str, Any]:
+    """Plan a job whose steps are not given, with a threshold that makes the choice independent of times."""
+    inputs = wall(), cameras(4), Style.of(style())
+    settings = make_settings(coarsest_side=24, measure=0)
+    with mock.patch.object(choices, "_LEAST_GROUP_GAIN", -100.0):
+        job = plan_job(*inputs, settings, weights=tiny_weights(), collectives=collectives)
+    settings = settings.model_copy(update={"rebalance": False})
+    resumed = plan_job(*inputs, settings, weights=tiny_weights(), collectives=collectives, groups=job.plan.groups)
+    stylizer = Stylizer(job)
+    losses = [stylizer.run_step().loss for _ in range(2)]
+    shape = job.plan.groups, job.team.groups, job.settings.views_per_step, job.total_steps
+    again = resumed.plan.groups, resumed.settings.views_per_step, resumed.total_steps
+    return {"shape": shape, "resumed": again, "losses": losses, "colors": stylizer.stylized()}
+
+
+def test_plan_gives_each_rank_a_view_of_its_own() -> None:
+    first, second = on_ranks(2, planned_in_groups)
+    assert first["shape"] == second["shape"] == (2, 2, 2, 127)
+    assert first["resumed"] == (2, 2, 127)
+    assert first["losses"] == second["losses"]
+    assert torch.equal(first["colors"], second["colors"])
+    values: dict[str, Any] = {"steps_coarse": 0, "steps_sos": 127, "coarsest_side": 24, "views_per_step": 2}
+    settings = make_settings(**values, learning_rate=0.2, learning_rate_end=0.02)
+    alone = Stylizer.planned(wall(), cameras(4), style(), settings, weights=tiny_weights())
+    assert [alone.run_step().loss for _ in range(2)] == pytest.approx(first["losses"], rel=1e-4)
 
 
 def run_with_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
