@@ -92,5 +92,6 @@ def _run(folder: Path, options: list[str]) -> dict[str, Any]:
     content = json.loads(report.read_text())
     report.unlink()
     figures = {name: content[name] for name in ("seconds_total", "seconds_by_part", "memory")}
-    plan = {name: content["plan"][name] for name in ("precision", "prediction", "measured")}
+    plan = {name: content["plan"][name] for name in ("prediction", "measured")}
+    plan["precision"] = next(each["decision"] for each in content["plan"]["decisions"] if each["item"] == "precision")
     return {"seconds": seconds, "steps": len(content["history"]), **figures, "plan": plan, "printed": printed[-3000:]}

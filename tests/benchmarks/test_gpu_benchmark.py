@@ -68,6 +68,7 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     assert sum(whole["seconds_by_part"].values()) == pytest.approx(whole["seconds_total"], abs=0.02)
     assert whole["seconds_total"] < whole["seconds"] + 0.02, "the process ends after its last report"
     assert whole["plan"]["prediction"]["seconds"] > 0
+    assert whole["plan"]["precision"] == "features in float32"
     rates = findings["convolutions"]["conv1_1"]["bfloat16"]["forward"]
     assert set(rates) == {"channels_last", "planes"}
     assert min(rates.values()) > 0
