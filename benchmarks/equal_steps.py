@@ -5,11 +5,15 @@ python -m benchmarks.equal_steps SCENE CAMERAS|orbit:N STYLE NAME 'ROW={"content
 Each row is a JSON object of settings that override the standard preset, in float32 unless it says otherwise. The
 additional setting `factor` scales VGG16's features: a number scales all layers (1 = unchanged), an object individual
 layers ({"relu1_1": 16, "relu2_1": 8}). A layer without a factor takes that of the previous layer. The additional
-setting `rounded` emulates a GPU: a float32 network rounds as in "tf32" or "float16". Results are added to
-benchmarks/results/equal_steps.json, under NAME. With several seeds, figures are means, and "spread" is the largest
-difference between two seeds. "loss" is the float32 loss of the job's own views, relative to the unstylized scene.
-"sliced" is the sliced Wasserstein distance between the colors of pixels and style, in 8-bit levels; no loss term and no
-color initialization optimizes it.
+setting `rounded` emulates a GPU: a float32 network rounds as in "tf32" or "float16". With the additional setting
+`as_long_as`, which names a row before, the steps of both phases are multiplied by one factor, with which they take as
+many CPU seconds as the steps of that row.
+
+Results are added to benchmarks/results/equal_steps.json, under NAME. With several seeds, figures are means, and
+"spread" is the largest difference between two seeds. "loss" is the float32 loss of the job's own views, relative to the
+unstylized scene. "seconds" are the CPU seconds of the steps, "counted" their number times the median of those that
+evaluate the same scales. "sliced" is the sliced Wasserstein distance between the colors of pixels and style, in 8-bit
+levels; no loss term and no color initialization optimizes it.
 
 With --region SPEC, the cameras are those that show the region. The additional setting `region_content_weight` is its
 own content weight, and "region_content" is "content" over its pixels alone, on black.
@@ -20,8 +24,10 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections import defaultdict
 from contextlib import nullcontext
 from pathlib import Path
+from statistics import median
 from typing import Any
 from unittest import mock
 
@@ -59,6 +65,8 @@ COLUMNS = (
     "region_content",
     "background_sensitivity",
     "seconds",
+    "counted",
+    "steps",
 )
 #: Number of color directions of the sliced distance, and number of quantiles along each.
 DIRECTIONS, QUANTILES = 64, 1024
@@ -96,13 +104,17 @@ def main() -> None:
     judge, exact = _judge(scene, cameras, style, base)
     wanted = quantiles(style, torch.ones(style.shape[:2]))
     rows = {name: json.loads(text or "{}") for name, _, text in (row.partition("=") for row in arguments.rows)}
+    paces: dict[tuple[str, int], Pace] = {}
 
     def run(row: str, seed: int) -> tuple[torch.Tensor, dict[str, float]]:
         values = base | rows[row] | {"seed": seed}
         own = values.pop("region_content_weight", None)
         regions = region.regions(own) if region and own is not None else None
-        colors, seconds = _run(scene, cameras, style, values, regions)
-        return colors, {"loss": loss(colors) / start, **_judged(judge, colors, wanted, region), "seconds": seconds}
+        if (other := values.pop("as_long_as", None)) is not None:
+            values |= steps_as_long_as(paces[other, seed], values["steps_coarse"], values["steps_sos"])
+        colors, paces[row, seed] = _run(scene, cameras, style, values, regions)
+        figures = {"loss": loss(colors) / start, **_judged(judge, colors, wanted, region)}
+        return colors, figures | seconds_of(paces[row, seed])
 
     def loss(colors: torch.Tensor) -> float:
         terms = exact.evaluate(exact.views.covered, colors)
@@ -188,19 +200,38 @@ def quantiles(image: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     return ordered.gather(0, indices.clamp_max(len(ordered) - 1))
 
 
+#: CPU seconds of the steps of a run, by the scales that they evaluate.
+Pace = dict[tuple[int, ...], list[float]]
+
+
+def seconds_of(pace: Pace) -> dict[str, float]:
+    """Return the figures of a run's steps: their seconds, the same as counted, and their number."""
+    seconds, steps = sum(map(sum, pace.values())), sum(map(len, pace.values()))
+    return {"seconds": seconds, "counted": sum(len(own) * median(own) for own in pace.values()), "steps": steps}
+
+
+def steps_as_long_as(pace: Pace, steps_coarse: int, steps_sos: int) -> dict[str, int]:
+    """Return the steps of both phases, in their proportion, that take as long as a run if each evaluates all scales."""
+    coarse, every = (median(pace[scales]) for scales in (min(pace, key=len), max(pace, key=len)))
+    factor = seconds_of(pace)["counted"] / (steps_coarse * coarse + steps_sos * every)
+    return {"steps_coarse": round(factor * steps_coarse), "steps_sos": round(factor * steps_sos)}
+
+
 def _run(
     scene: Scene, cameras: list[Camera], style: torch.Tensor, values: dict[str, Any], regions: Regions | None
-) -> tuple[torch.Tensor, float]:
-    """Run a job, and return its colors [N, 3] and the CPU seconds of its steps."""
+) -> tuple[torch.Tensor, Pace]:
+    """Run a job, and return its colors [N, 3] and its pace."""
     weights = _weights(values.pop("factor", None))
     network = ROUNDED.get(values.pop("rounded", None))
     settings = make_settings("standard", **{"precision": "float32", **values})
     with mock.patch("sgsst_core.planning.context.FeatureNetwork", network) if network else nullcontext():
         stylizer = Stylizer.planned(scene, cameras, style, settings, weights=weights, regions=regions)
-    before = time.process_time()
+    pace: Pace = defaultdict(list)
     for _ in range(stylizer.job.total_steps):
-        stylizer.run_step()
-    return stylizer.stylized(), time.process_time() - before
+        before = time.process_time()
+        evaluated = stylizer.run_step().evaluated
+        pace[evaluated].append(time.process_time() - before)
+    return stylizer.stylized(), pace
 
 
 def _weights(factor: float | dict[str, float] | None) -> BackboneWeights:
