@@ -1,0 +1,242 @@
+"""Add-on of Blender that stylizes the Gaussian splat of the active object on a service of sgsst.
+
+A splat is a mesh without faces whose vertices have the properties of a 3DGS PLY as attributes, as Blender's importer of
+PLY files makes it with `Vertex Attributes`.
+"""
+# No postponed annotations: Blender reads the properties of its classes from them.
+
+import tempfile
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import bpy
+import numpy as np
+from bpy.props import EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+
+from .sgsst_rest import BackgroundJob, Service
+from .splat_ply import COLORS, REQUIRED, read_colors, write_splat
+
+#: Factor of the first spherical harmonic.
+_SH_C0 = 0.28209479177387814
+#: Name of the color attribute with the result.
+_STYLIZED = "stylized"
+_LOCAL = ("127.0.0.1", "::1", "localhost")
+
+
+def splat_columns(mesh: Any) -> dict[str, Any]:
+    """Return the splat of a mesh as arrays by the property of a PLY.
+
+    Raises:
+        ValueError: If the mesh is no splat.
+    """
+    missing = [name for name in REQUIRED if name not in mesh.attributes]
+    if missing:
+        raise ValueError(
+            f"The active object has no attribute {missing[0]}, so it is no Gaussian splat. Import one by File > Import "
+            "> Stanford PLY, with Vertex Attributes turned on."
+        )
+    positions = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", positions)
+    columns = dict(zip("xyz", positions.reshape(-1, 3).T, strict=True))
+    for each in mesh.attributes:
+        if each.name in REQUIRED or each.name.startswith("f_rest_"):
+            columns[each.name] = np.empty(len(mesh.vertices), np.float32)
+            each.data.foreach_get("value", columns[each.name])
+    return columns
+
+
+def show_result(source: Any, path: Path, kind: str) -> Any:
+    """Add a stylized PLY to the scene as a second object, or as a color attribute of its source; return the object.
+
+    The second object is a copy, so it has the transform, materials and modifiers of its source.
+    """
+    colors = read_colors(path)
+    if len(colors) != len(source.data.vertices):  # Gaussians that cannot be drawn were dropped
+        bpy.ops.wm.ply_import(filepath=str(path), import_attributes=True)
+        target = bpy.context.object
+        target.matrix_world = source.matrix_world
+    elif kind == "ATTRIBUTE":
+        target = source
+    else:
+        target = source.copy()
+        target.data = source.data.copy()
+        for collection in source.users_collection:
+            collection.objects.link(target)
+    mesh = target.data
+    if target is not source:
+        target.name = f"{source.name} stylized"
+        for index, name in enumerate(COLORS):
+            mesh.attributes[name].data.foreach_set("value", np.ascontiguousarray(colors[:, index]))
+    shown = mesh.color_attributes.get(_STYLIZED) or mesh.color_attributes.new(_STYLIZED, "BYTE_COLOR", "POINT")
+    rgba = np.ones((len(colors), 4), np.float32)
+    rgba[:, :3] = np.clip(0.5 + _SH_C0 * colors, 0, 1)
+    shown.data.foreach_set("color_srgb", rgba.ravel())
+    mesh.color_attributes.active_color = shown
+    mesh.update()
+    return target
+
+
+class Current:
+    """Job of this Blender; `tick` follows it in Blender's own thread."""
+
+    job: BackgroundJob | None = None
+    source_name = ""
+    folder: tempfile.TemporaryDirectory[str] | None = None
+    message = ""
+
+    @classmethod
+    def start(cls, source: Any, settings: Any, service: Service) -> None:
+        """Send an object's splat; raises like `splat_columns`, and ValueError without a style image."""
+        style = Path(bpy.path.abspath(settings.style))
+        if not style.is_file():
+            raise ValueError(f"There is no style image {settings.style!r}. Choose an image file.")
+        cls.folder = tempfile.TemporaryDirectory()
+        scene, out = (Path(cls.folder.name) / name for name in ("splat.ply", "stylized.ply"))
+        write_splat(scene, splat_columns(source.data))
+        options = {"preset": settings.preset, "orbit": settings.views or "auto", "up": settings.up}
+        if settings.minutes:
+            options["within"] = 60 * settings.minutes
+        cls.job = BackgroundJob(service, (scene, style, out), **options)
+        cls.source_name, cls.message = source.name, ""
+        cls.job.start()
+        bpy.app.timers.register(cls.tick, first_interval=0.5)
+
+    @classmethod
+    def tick(cls) -> float | None:
+        """Show the progress or the result; return the seconds until the next call, None if the job has ended."""
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                area.tag_redraw()
+        assert cls.job is not None
+        assert cls.folder is not None
+        if cls.job.is_alive():
+            return 0.5
+        source = bpy.data.objects.get(cls.source_name)
+        if cls.job.error or source is None:
+            cls.message = cls.job.error or f"The object {cls.source_name} is gone. Its result was not added."
+        else:
+            kind = bpy.context.scene.sgsst.result
+            cls.message = f"Painted {show_result(source, Path(cls.folder.name) / 'stylized.ply', kind).name}."
+        cls.folder.cleanup()
+        cls.job = None
+        return None
+
+
+class SgsstPreferences(bpy.types.AddonPreferences):
+    """Address and key of the service."""
+
+    bl_idname = __package__
+
+    service: StringProperty(name="Service", default="http://127.0.0.1:8000")  # type: ignore[valid-type]
+    key: StringProperty(name="API key", subtype="PASSWORD")  # type: ignore[valid-type]
+
+    def draw(self, context: Any) -> None:  # noqa: ARG002 (Blender passes it)
+        """Draw the preferences."""
+        self.layout.prop(self, "service")
+        self.layout.prop(self, "key")
+
+
+class SgsstSettings(bpy.types.PropertyGroup):
+    """Settings of the next job."""
+
+    style: StringProperty(name="Style", subtype="FILE_PATH")  # type: ignore[valid-type]
+    preset: EnumProperty(  # type: ignore[valid-type]
+        name="Preset",
+        items=[(name, name.capitalize(), "") for name in ("preview", "standard", "paper")],
+        default="standard",
+    )
+    minutes: FloatProperty(  # type: ignore[valid-type]
+        name="Minutes", description="Time budget; 0 for no limit", default=10, min=0, max=1440
+    )
+    views: IntProperty(  # type: ignore[valid-type]
+        name="Views", description="Views around the splat; 0 for automatic", default=0, min=0, max=200
+    )
+    up: EnumProperty(  # type: ignore[valid-type]
+        name="Up",
+        description="Up axis of the splat before the object's rotation",
+        items=[(name, name, "") for name in ("auto", "z", "-y", "y", "-z", "x", "-x")],
+    )
+    result: EnumProperty(  # type: ignore[valid-type]
+        name="Result", items=[("OBJECT", "Second object", ""), ("ATTRIBUTE", "Color attribute", "")]
+    )
+
+
+class SgsstStylize(bpy.types.Operator):
+    """Stylize the splat of the active object."""
+
+    bl_idname = "sgsst.stylize"
+    bl_label = "Stylize"
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Return whether a mesh is active and no job runs."""
+        return Current.job is None and context.object is not None and context.object.type == "MESH"
+
+    def execute(self, context: Any) -> set[str]:
+        """Start the job, which runs in the background."""
+        preferences = context.preferences.addons[__package__].preferences
+        service = Service(preferences.service, preferences.key)
+        try:
+            if not bpy.app.online_access and urlsplit(service.url).hostname not in _LOCAL:
+                raise ValueError("Allow Online Access in Preferences > System, or use a service on this machine.")
+            Current.start(context.object, context.scene.sgsst, service)
+        except (ValueError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class SgsstCancel(bpy.types.Operator):
+    """Cancel the running job."""
+
+    bl_idname = "sgsst.cancel"
+    bl_label = "Cancel"
+
+    def execute(self, context: Any) -> set[str]:  # noqa: ARG002 (Blender passes it)
+        """Ask the job to end."""
+        if Current.job is not None:
+            Current.job.canceled.set()
+        return {"FINISHED"}
+
+
+class SgsstPanel(bpy.types.Panel):
+    """Tab in the sidebar of the 3D view."""
+
+    bl_idname = "VIEW3D_PT_sgsst"
+    bl_label = "SGSST"
+    bl_category = "SGSST"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+
+    def draw(self, context: Any) -> None:
+        """Draw settings, progress and message."""
+        column = self.layout.column()
+        for name in ("style", "preset", "minutes", "views", "up", "result"):
+            column.prop(context.scene.sgsst, name)
+        if Current.job is None:
+            column.operator(SgsstStylize.bl_idname)
+        else:
+            column.progress(factor=Current.job.fraction, text=Current.job.text)
+            column.operator(SgsstCancel.bl_idname)
+        if Current.message:
+            column.label(text=Current.message)
+
+
+_CLASSES = (SgsstPreferences, SgsstSettings, SgsstStylize, SgsstCancel, SgsstPanel)
+
+
+def register() -> None:
+    """Register the classes."""
+    for each in _CLASSES:
+        bpy.utils.register_class(each)
+    bpy.types.Scene.sgsst = PointerProperty(type=SgsstSettings)
+
+
+def unregister() -> None:
+    """Cancel a running job, and unregister the classes."""
+    if Current.job is not None:
+        Current.job.canceled.set()
+    del bpy.types.Scene.sgsst
+    for each in reversed(_CLASSES):
+        bpy.utils.unregister_class(each)

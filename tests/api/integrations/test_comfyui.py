@@ -1,0 +1,186 @@
+"""Tests of the ComfyUI nodes: in a real ComfyUI if there is one, else with a stand-in of its published interface."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import inspect
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import threading
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import httpx2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from api.integrations.build import build
+from sgsst_core.files.scene_file import read_scene
+from tests.api.integrations import comfy_stand_in
+from tests.api.service import ROOT, Service, wait_for
+from tests.ports import free_port
+from tests.small_scenes import wall
+
+pytestmark = pytest.mark.slow
+WORKFLOW = ROOT / "api" / "integrations" / "comfyui" / "example_workflows" / "stylize_splat.json"
+#: Command that starts ComfyUI 0.22 or later, such as "venv/bin/python ComfyUI/main.py".
+COMFYUI = os.environ.get("SGSST_COMFYUI")
+
+
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
+    """Load the built package with the stand-in."""
+    folder = tmp_path_factory.mktemp("custom_nodes")
+    with zipfile.ZipFile(build("comfyui", folder)) as archive:
+        archive.extractall(folder)
+    (folder / "sgsst").rename(folder / "sgsst_comfyui")
+    stand_ins = comfy_stand_in.modules()
+    sys.path.insert(0, str(folder))
+    yield importlib.import_module("sgsst_comfyui.nodes")
+    sys.path.remove(str(folder))
+    for name in [*stand_ins, *(name for name in sys.modules if name.startswith("sgsst_comfyui"))]:
+        del sys.modules[name]
+
+
+@pytest.fixture(autouse=True)
+def url(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SGSST_URL", service.url)
+
+
+@pytest.fixture(scope="module")
+def image(files: tuple[Path, Path, Path]) -> torch.Tensor:
+    with Image.open(files[2]) as style:
+        return torch.from_numpy(np.asarray(style.convert("RGB"), dtype=np.float32) / 255)[None]
+
+
+def settings(**changed: Any) -> dict[str, Any]:
+    return {"preset": "preview", "minutes": 0.0, "views": 4, "up": "-y", **changed}
+
+
+def test_schemas_fit_nodes_and_workflow(nodes: ModuleType) -> None:
+    extension = asyncio.run(importlib.import_module("sgsst_comfyui").comfy_entrypoint())
+    schemas = {}
+    for kind in asyncio.run(extension.get_node_list()):
+        schema = kind.define_schema()
+        schemas[schema.node_id] = schema
+        assert list(inspect.signature(kind.execute).parameters) == [each.id for each in schema.inputs]
+        for each in schema.inputs:
+            if each.io_type == "COMBO":
+                assert each.default in each.options
+    workflow = json.loads(WORKFLOW.read_text())
+    used = [node for node in workflow["nodes"] if node["type"] in schemas]
+    assert {node["type"] for node in used} == {"SgsstStylize", "SgsstBlend"}
+    for node in used:
+        schema = schemas[node["type"]]
+        assert {each["name"] for each in node["inputs"]} == {each.id for each in schema.inputs}
+        assert [each["type"] for each in node["outputs"]] == [each.io_type for each in schema.outputs]
+
+
+def test_stylize_blend_and_render(nodes: ModuleType, service: Service, image: torch.Tensor, tmp_path: Path) -> None:
+    splat = comfy_stand_in.splat_of(wall(sh_degree=1))
+    count = splat.positions.shape[1]
+    for name in ("positions", "scales", "rotations", "opacities", "sh"):  # padding, as in a batch that was split
+        part = getattr(splat, name)
+        setattr(splat, name, torch.cat([part, torch.zeros_like(part[:, :5])], dim=1))
+    splat.counts = torch.tensor([count])
+    stylized, preview, job = nodes.Stylize.execute(splat, image, **settings()).args
+    bar = comfy_stand_in.ProgressBar.last
+    assert (bar.values[-1], bar.values) == (bar.total, sorted(bar.values))
+    assert bar.previews
+    assert (preview.dtype, preview.shape[0], preview.shape[-1]) == (torch.float32, 1, 3)
+    assert 0 <= preview.min() < preview.max() <= 1
+    (tmp_path / "result.ply").write_bytes(httpx2.get(f"{service.url}/v1/jobs/{job}/artifacts/stylized.ply").content)
+    expected = read_scene(tmp_path / "result.ply").scene.sh_dc
+    assert torch.equal(stylized.sh[0, :, 0], expected)
+    assert torch.equal(stylized.positions, splat.positions[:, :count])
+    blend = nodes.Blend.execute(splat, stylized, 0.25)[0]
+    torch.testing.assert_close(blend.sh, 0.75 * splat.sh[:, :count] + 0.25 * stylized.sh)
+    images = nodes.RenderViews.execute(job, frames=3, resolution=96, compare=False)[0]
+    assert (images.shape[0], max(images.shape[1:3]), images.shape[3]) == (3, 96, 3)
+    assert images.std() > 0.01
+
+
+def test_interruption_cancels_the_job(nodes: ModuleType, service: Service, image: torch.Tensor) -> None:
+    comfy_stand_in.Interruption.wanted = True
+    with pytest.raises(comfy_stand_in.InterruptProcessingException):
+        nodes.Stylize.execute(comfy_stand_in.splat_of(wall()), image, **settings())
+    with service.client() as client:
+        newest = client.get("/v1/jobs").json()["jobs"][0]
+        wait_for(lambda: client.get(newest["links"]["self"]).json()["status"] == "canceled", "the job to be canceled")
+
+
+def test_what_cannot_be_done_is_said(nodes: ModuleType, image: torch.Tensor) -> None:
+    one = comfy_stand_in.splat_of(wall())
+    two = comfy_stand_in.splat_of(wall())
+    two.positions = torch.cat([two.positions, two.positions])
+    with pytest.raises(ValueError, match="batch of 2 splats"):
+        nodes.Stylize.execute(two, image, **settings())
+    with pytest.raises(ValueError, match="versions of the same splat"):
+        nodes.Blend.execute(one, comfy_stand_in.splat_of(wall(sh_degree=1)), 0.5)
+    with pytest.raises(RuntimeError, match="sgsst serve"):
+        nodes.Stylize.execute(one, image, **settings(), service="http://127.0.0.1:9")
+
+
+def prompt(workflow: dict[str, Any]) -> dict[str, Any]:
+    """Return a saved workflow in the form that ComfyUI runs."""
+    sources = {link[0]: [str(link[1]), link[2]] for link in workflow["links"]}
+    nodes = {}
+    for node in workflow["nodes"]:
+        values = iter(node.get("widgets_values", ()))
+        given: dict[str, Any] = {}
+        for each in node["inputs"]:
+            value = next(values, None) if "widget" in each else None
+            given[each["name"]] = sources[each["link"]] if each["link"] is not None else value
+        nodes[str(node["id"])] = {
+            "class_type": node["type"],
+            "inputs": {name: value for name, value in given.items() if value is not None},
+        }
+    return nodes
+
+
+@pytest.mark.skipif(COMFYUI is None, reason="There is no ComfyUI: name the command that starts one in SGSST_COMFYUI")
+def test_workflow_in_comfyui(service: Service, files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    for name in ("custom_nodes", "input", "output", "models", "user", "temp"):
+        (tmp_path / name).mkdir()
+    with zipfile.ZipFile(build("comfyui", tmp_path)) as archive:
+        archive.extractall(tmp_path / "custom_nodes")
+    shutil.copy(files[0], tmp_path / "input" / "scene.ply")
+    shutil.copy(files[2], tmp_path / "input" / "style.png")
+    nodes = prompt(json.loads(WORKFLOW.read_text()))
+    by_type = {node["class_type"]: node["inputs"] for node in nodes.values()}
+    by_type["Load3DAdvanced"]["viewport_state"] = {"camera_info": {}}  # the page sets it
+    by_type["SgsstStylize"] |= settings()
+    port = free_port()
+    url = f"http://127.0.0.1:{port}"
+    command = [*shlex.split(COMFYUI or ""), "--cpu", "--disable-api-nodes", "--port", str(port)]
+    command += ["--base-directory", str(tmp_path), "--database-url", "sqlite:///:memory:"]
+    environment = {**os.environ, "SGSST_URL": service.url}
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as comfy:
+        said: list[str] = []
+        assert comfy.stdout
+        threading.Thread(target=said.extend, args=(comfy.stdout,), daemon=True).start()
+        try:
+            wait_for(lambda: any("To see the GUI" in line for line in said) or comfy.poll(), "ComfyUI to start")
+            queued = httpx2.post(f"{url}/prompt", json={"prompt": nodes})
+            assert queued.status_code == 200, queued.text
+            number = queued.json()["prompt_id"]
+            finished = wait_for(lambda: httpx2.get(f"{url}/history/{number}").json(), "the workflow to end")[number]
+            assert finished["status"]["status_str"] == "success", finished["status"]
+        finally:
+            comfy.terminate()
+    (result,) = (tmp_path / "output").rglob("*.ply")
+    original, blend = (read_scene(path).scene for path in (files[0], result))
+    assert torch.allclose(original.means, blend.means)
+    assert not torch.allclose(original.sh_dc, blend.sh_dc, atol=0.1)
