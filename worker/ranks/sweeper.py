@@ -1,18 +1,20 @@
 """Watchdog process that deletes the folder of a local Ray instance if its owner is killed.
 
 The owner is the process that starts the watchdog. The watchdog reads from a pipe: if the pipe closes without a message,
-the owner was killed. It imports the standard library only, so that it starts quickly and needs little memory.
+the owner was killed. It imports little, so that it starts quickly and needs little memory.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+import psutil
 
 #: Message of an owner that has deleted the folder itself.
 DONE = b"done"
@@ -23,7 +25,7 @@ _PATIENCE, _LIMIT = 1.0, 20.0
 def beside(folder: Path) -> subprocess.Popen[bytes]:
     """Start a sweeper that sweeps a folder if this process is killed; `dismiss` ends it."""
     return subprocess.Popen(
-        [sys.executable, "-I", "-S", __file__, str(folder)],
+        [sys.executable, "-I", __file__, str(folder)],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -48,34 +50,24 @@ def sweep(folder: Path) -> None:
             break
         if time.monotonic() - started > _PATIENCE:
             for process in users:
-                try:
-                    os.kill(process, signal.SIGKILL)
-                except OSError:  # the process has ended meanwhile
-                    continue
+                with contextlib.suppress(psutil.Error):  # the process has ended meanwhile
+                    process.kill()
         time.sleep(0.1)
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _users(folder: Path) -> list[int]:
+def _users(folder: Path) -> list[psutil.Process]:
     """Return the other processes of this user that use a folder."""
-    processes = Path("/proc")
-    if not processes.is_dir():  # not Linux
-        return []
-    return [
-        int(entry.name)
-        for entry in processes.iterdir()
-        if entry.name.isdigit() and int(entry.name) != os.getpid() and _uses(entry, str(folder))
-    ]
+    return [process for process in psutil.process_iter() if process.pid != os.getpid() and _uses(process, str(folder))]
 
 
-def _uses(process: Path, folder: str) -> bool:
+def _uses(process: psutil.Process, folder: str) -> bool:
     try:
-        if process.joinpath("stat").read_text().rpartition(")")[2].split()[0] == "Z":
-            return False
-        if folder.encode() in process.joinpath("cmdline").read_bytes():
-            return "sweeper.py" not in process.joinpath("cmdline").read_text(errors="replace")
-        return any(str(link.readlink()).startswith(folder + "/") for link in process.joinpath("fd").iterdir())
-    except OSError:  # the process has ended meanwhile, or belongs to another user
+        command = " ".join(process.cmdline())
+        if folder in command:
+            return "sweeper.py" not in command
+        return any(file.path.startswith(folder + os.sep) for file in process.open_files())
+    except (psutil.Error, OSError):  # the process has ended meanwhile, or belongs to another user
         return False
 
 

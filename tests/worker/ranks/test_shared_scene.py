@@ -5,9 +5,12 @@ from __future__ import annotations
 import gc
 import hashlib
 import os
+import socket
+import sys
 from pathlib import Path
 from unittest.mock import patch
 
+import psutil
 import pytest
 import torch
 from torch import Tensor
@@ -24,6 +27,7 @@ from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
 from tests.worker.ranks.spawn import on_ranks
+from worker.processes import home
 from worker.ranks import shared_scene
 from worker.ranks.shared_scene import read_shared_scene
 
@@ -72,6 +76,27 @@ def test_one_rank_reads_and_shares_the_scene(tmp_path: Path, drop: bool) -> None
     assert [rank[2] for rank in results] == [int(drop)] * 3
     assert all(rank[3] >= 1 for rank in results), "not mapped"
     assert [rank[4] for rank in results] == [0, 0, 0], "left behind"
+
+
+def read_as_on_macos(collectives: Collectives, path: Path) -> tuple[str, bool, tuple[str, ...]]:
+    """Return the digest of a scene, whether this rank has read its file, and its home, as a system without memfd."""
+    memory_file = os.memfd_create
+    try:
+        del os.memfd_create
+        with patch.object(sys, "platform", "darwin"):
+            file, reader = read_shared_scene(path, collectives)
+            return digest(file.scene), reader, home()
+    finally:
+        os.memfd_create = memory_file
+
+
+@linux
+def test_every_rank_reads_the_scene_where_memory_files_are_missing(tmp_path: Path) -> None:
+    write_scene(tmp_path / "scene.ply", wall(sh_degree=1))
+    results = on_ranks(2, read_as_on_macos, tmp_path / "scene.ply")
+    assert [rank[0] for rank in results] == [digest(read_scene(tmp_path / "scene.ply").scene)] * 2
+    assert [rank[1] for rank in results] == [True, False]
+    assert [rank[2] for rank in results] == [(socket.gethostname(), psutil.Process().username())] * 2
 
 
 @linux
