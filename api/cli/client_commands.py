@@ -85,7 +85,7 @@ def submit(
         check_is_not_input(out, Path(inputs.scene))
     styles, masks, settings = _styles_masks_and_parameters(inputs, options, parameters)
     files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": masks}
-    with _client(url, key) as client:
+    with open_client(url, key) as client:
         if dry_run:
             with _sending_and_planning() as (progress, planning):
                 plan = client.plan(inputs.scene, styles, **files, progress=progress, planning=planning, **settings)
@@ -100,7 +100,7 @@ def submit(
             return
         if not as_json:
             error_console.print(job.id)
-        _conclude(client, _follow(client, job.id, as_json), out, as_json)
+        conclude(client, follow(client, job.id, as_json), out, as_json)
 
 
 def _styles_masks_and_parameters(
@@ -146,14 +146,14 @@ def _regions_to_send(
 
 def status(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
     """Show the status of a job."""
-    with _client(url, key) as client:
+    with open_client(url, key) as client:
         _print_job(client.job(job), as_json)
 
 
 def watch(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
     """Show the progress of a job until it ends; exit with 5 if it does not succeed."""
-    with _client(url, key) as client:
-        ended = _follow(client, job, as_json)
+    with open_client(url, key) as client:
+        ended = follow(client, job, as_json)
     if not as_json:
         out_console.print(_job_text(ended))
     if ended.status != "succeeded":
@@ -187,7 +187,7 @@ def download(
     elif out is not None:
         check_file(out)
         _check_format(out, _stored_name(name, format))
-    with _client(url, key) as client:
+    with open_client(url, key) as client:
         digests = {entry["name"]: entry["sha256"] for entry in client.artifacts(job)}
         names = list(digests) if name == "all" else [name]
         if name == "all":
@@ -248,7 +248,7 @@ def _command_of(action: Transition) -> Callable[..., None]:
     """Return the command that requests an action on a job."""
 
     def command(job: JobArgument, as_json: JsonOption = False, url: UrlOption = None, key: KeyOption = None) -> None:
-        with _client(url, key) as client:
+        with open_client(url, key) as client:
             _print_job(client.act(job, action), as_json)
 
     command.__name__, command.__doc__ = action.value, ACTIONS[action].help
@@ -257,7 +257,7 @@ def _command_of(action: Transition) -> Callable[..., None]:
 
 def delete(job: JobArgument, url: UrlOption = None, key: KeyOption = None) -> None:
     """Delete a finished job and its results."""
-    with _client(url, key) as client:
+    with open_client(url, key) as client:
         client.delete(job)
 
 
@@ -269,7 +269,7 @@ def jobs(
     key: KeyOption = None,
 ) -> None:
     """List jobs, newest first."""
-    with _client(url, key) as client:
+    with open_client(url, key) as client:
         page = list(client.jobs(status=status or (), limit=limit))
     if as_json:
         out_console.print(json.dumps([job.data for job in page]))
@@ -308,7 +308,8 @@ COMMANDS: tuple[Callable[..., None], ...] = (
 # --- shared --------------------------------------------------------------------------------------------------------
 
 
-def _client(url: str | None, key: str | None) -> Client:
+def open_client(url: str | None, key: str | None) -> Client:
+    """Return a client that prints its retries."""
     import stamina.instrumentation
 
     from api.client import Client
@@ -366,7 +367,7 @@ def _text_columns() -> tuple[ProgressColumn, ...]:
     return TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[text]}", markup=False)
 
 
-def _follow(client: Client, job_id: str, as_json: bool) -> Job:
+def follow(client: Client, job_id: str, as_json: bool) -> Job:
     """Show events until the job has ended; Ctrl-C ends the command, not the job."""
     try:
         return _show_events(client, job_id, as_json)
@@ -397,7 +398,8 @@ def _show_events(client: Client, job_id: str, as_json: bool) -> Job:
     return client.job(job_id)
 
 
-def _conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
+def conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
+    """Download the result of a job that has ended; exit with 5 if it did not succeed."""
     if job.status != "succeeded":
         error_console.print(_job_text(job))
         raise typer.Exit(JOB_FAILED)

@@ -16,6 +16,7 @@ import psutil
 import typer
 
 from api.cli import client_commands, operator_commands
+from api.cli.batch_commands import batch
 from api.cli.bench_commands import bench_app
 from api.cli.console import (
     BAD_INPUT,
@@ -81,6 +82,7 @@ app = typer.Typer(
 )
 _COMMANDS: tuple[Callable[..., Any], ...] = (
     stylize,
+    batch,
     plan,
     check,
     render,

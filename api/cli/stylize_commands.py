@@ -61,7 +61,7 @@ def stylize(
 
     invocation: Invocation = context.obj
     run_options = WorkerOptions(run.rank_timeout, run.checkpoint_seconds, started=invocation.started)
-    _stylize(request, invocation.arguments, options.workers, run_options)
+    run_job(request, _resuming(invocation.arguments), options.workers, run_options)
 
 
 def demo(
@@ -89,26 +89,30 @@ def demo(
     options |= {"--steps-sos": DEMO_STEPS, "--within": DEMO_SECONDS}
     arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
     print_field("command", shlex.join(["sgsst", *arguments]))
-    _stylize(request, arguments)
+    run_job(request, _resuming(arguments))
 
 
-def _stylize(
+def _resuming(arguments: Sequence[str]) -> str:
+    """Return the command that resumes the job of some arguments."""
+    return shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
+
+
+def run_job(
     request: JobSpec,
-    arguments: Sequence[str],
+    command: str,
     workers: int | None = None,
     options: WorkerOptions | None = None,
 ) -> None:
     """Stylize a scene and print the plan and the results.
 
     Args:
-        arguments: Arguments of this command; the command to resume the job is built from them.
+        command: Command that resumes the job, for messages.
     """
     from worker.outputs import check_request
     from worker.ranks.rank import WorkerOptions
     from worker.run import Listener, stylize
 
     outputs, stop, notify = check_request(request), StopFlag(), error_console.print
-    command = shlex.join(["sgsst", *arguments, *([] if "--resume" in arguments else ["--resume"])])
     with ExitStack() as stack:
         if workers is not None:  # the processes of ranks are ended in order even before the first step
             stack.enter_context(stop.on_signal(_announce_stop))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from pathlib import Path
 
 import torch
@@ -72,12 +73,9 @@ def write_views(
     Raises:
         OutputError: If the file cannot be written.
     """
-    part = sampled(scene, _VIEW_GAUSSIANS)
-    rasterizer = make_rasterizer("cpu", part, background=background, near=near)
-    images = []
-    for camera in spread(cameras, _MAX_VIEWS):
-        small = resized(camera, min(camera.side, _VIEW_SIDE))
-        images.append((camera.name, _to_image(rasterizer.render(scene_colors(part, small), small))))
+    shown = spread(cameras, _MAX_VIEWS)
+    renders = small_renders(scene, shown, _VIEW_SIDE, background=background, near=near)
+    images = [(camera.name, _to_image(render)) for camera, render in zip(shown, renders, strict=True)]
     width = max(image.width for _, image in images) + _GAP
     height = max(image.height for _, image in images) + _LINE
     columns = min(len(images), max(1, round(math.sqrt(_SHEET_SHAPE * len(images) * height / width))))
@@ -85,6 +83,39 @@ def write_views(
     for index, (name, image) in enumerate(images):
         row, column = divmod(index, columns)
         cells.append((_GAP + column * width, _LINE + row * height, image, name))
+    _save(path, cells)
+
+
+def small_renders(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    side: int,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    near: float = NEAR,
+) -> Iterator[Tensor]:
+    """Yield renders [H, W, 3] of a scene, or of a sample of a large one, with at most `side` pixels per side."""
+    part = sampled(scene, _VIEW_GAUSSIANS)
+    rasterizer = make_rasterizer("cpu", part, background=background, near=near)
+    for camera in cameras:
+        small = resized(camera, min(camera.side, side))
+        yield rasterizer.render(scene_colors(part, small), small)
+
+
+def write_grid(path: Path, rows: Sequence[Sequence[tuple[str, Tensor] | None]]) -> None:
+    """Write a JPEG with rows of images [H, W, 3] in columns, each with its name above; None leaves a place empty.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    grid = [[cell and (cell[0], _fitted(_to_image(cell[1]))) for cell in row] for row in rows]
+    widths = [max((cell[1].width for cell in column if cell), default=0) for column in zip(*grid, strict=True)]
+    lefts = [_GAP, *(_GAP + end for end in accumulate(width + _GAP for width in widths))]
+    cells: list[_Cell] = []
+    top = _LINE
+    for row in grid:
+        cells += [(left, top, cell[1], cell[0]) for left, cell in zip(lefts, row, strict=False) if cell]
+        top += max((cell[1].height for cell in row if cell), default=0) + _LINE
     _save(path, cells)
 
 

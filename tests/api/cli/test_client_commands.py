@@ -14,6 +14,7 @@ from typing import Any
 
 import httpx2
 import pytest
+from PIL import Image
 
 from api.cli.main import main
 from api.client import Client
@@ -140,6 +141,28 @@ def test_interrupted_watch_says_that_the_job_continues(
         assert "The job continues on the service." in rest
         assert "Cancel: sgsst cancel job_" in rest
     assert httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["status"] == "queued"
+
+
+def test_interrupted_batch_waits_for_its_jobs_again(
+    files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], service: Service
+) -> None:
+    out = tmp_path / "results"
+    arguments = ["batch", *files, "--out", str(out), "--url", service.url]
+    command = [sys.executable, "-m", "api.cli", *arguments]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, env=service.environment, cwd=ROOT, text=True) as process:
+        assert process.stderr is not None
+        assert "queued" in process.stderr.readline()  # the job is followed
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    record = json.loads((out / "batch.json").read_text())
+    assert record["scene_style"]["complete"] is False
+    finish(service, record["scene_style"]["job"], Path(files[0]).read_bytes(), tmp_path)
+    assert main(arguments) == 0
+    assert (out / "scene_style.ply").read_bytes() == Path(files[0]).read_bytes()
+    assert Image.open(out / "batch.jpg").width > 100
+    capsys.readouterr()
+    assert main([*arguments[:-1], "http://127.0.0.1:1"]) == 0, "nothing is requested"
+    assert "complete" in capsys.readouterr().out
 
 
 def test_download_replaces_no_file_of_another_job(

@@ -1,0 +1,81 @@
+"""Tests of batches on this machine: what is made, what is repeated, and what fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from api.cli.main import main
+from tests.api.service import ROOT
+from tests.small_scenes import wall, write_files
+
+pytestmark = [pytest.mark.usefixtures("one_thread", "tiny_installed"), pytest.mark.slow]
+
+
+@pytest.fixture
+def arguments(tmp_path: Path) -> list[str]:
+    """Return the arguments of a batch of two scenes of the same name, each with cameras beside it, and two styles."""
+    scenes = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        scenes.append(write_files(tmp_path / name, wall())[0])
+    styles = [tmp_path / "one" / "style.png", tmp_path / "red.png"]
+    Image.new("RGB", (40, 40), (200, 40, 40)).save(styles[1])
+    options = [text for style in styles for text in ("--style", str(style))]
+    return ["batch", *map(str, scenes), *options, "--out", str(tmp_path / "out"), "--backbone", "vgg16"]
+
+
+def times(out: Path) -> dict[str, int]:
+    """Return the time of each result."""
+    return {path.stem: path.stat().st_mtime_ns for path in out.glob("*.ply")}
+
+
+def test_only_what_is_missing_or_changed_is_made(arguments: list[str], tmp_path: Path) -> None:
+    out, red = tmp_path / "out", tmp_path / "red.png"
+    image = red.read_bytes()
+    red.write_bytes(b"no image")
+    batch = [*arguments, "--steps-sos", "2"]
+    assert main(batch) == 1
+    first = times(out)
+    assert first.keys() == {"scene_style", "2_scene_style"}
+    red.write_bytes(image)
+    assert main(batch) == 0
+    second = times(out)
+    assert second.keys() == {*first, "scene_red", "2_scene_red"}
+    assert all(second[name] == first[name] for name in first)
+    with Image.open(out / "batch.jpg") as sheet:
+        assert sheet.width > sheet.height, "three columns, of which the first is that of the scenes, and two rows"
+    assert main(batch) == 0
+    assert times(out) == second
+    Image.new("RGB", (40, 40), (40, 200, 40)).save(red)
+    (out / "scene_style.ply").unlink()
+    assert main(batch) == 0
+    assert {name for name, time in times(out).items() if time == second.get(name)} == {"2_scene_style"}
+
+
+def test_interrupted_result_is_resumed(arguments: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    batch = [*arguments, "--steps-sos", "150", "--learning-rate", "0.1"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "api.cli", *batch]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("schedule"):
+                break
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=600)
+    assert process.returncode == 130
+    assert not times(tmp_path / "out")
+    assert (tmp_path / "out" / "scene_style.checkpoint.safetensors").exists()
+    capfd.readouterr()
+    assert main(batch) == 0
+    assert capfd.readouterr().out.count("resuming") == 1
+    assert len(times(tmp_path / "out")) == 4
+    assert all(entry["complete"] for entry in json.loads((tmp_path / "out" / "batch.json").read_text()).values())
