@@ -41,4 +41,5 @@ def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
         regions=_regions(staged, parameters),
         colors=True,
         style_background=parameters.style_background,
+        pad_sh=parameters.pad_sh,
     )

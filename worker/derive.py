@@ -15,10 +15,12 @@ from sgsst_core.decision import Decision
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.blending import blend_scenes, encode_blend
-from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.formats import format_of_name, read_scene_header, scene_path
+from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.sog import META_NAME
+from sgsst_core.files.formats.streamed_sog import INDEX_NAME, STREAMED_SOG
 from sgsst_core.files.library import load_scene
-from sgsst_core.files.scene_file import encode_scene, read_scene, write_sog_folder
+from sgsst_core.files.scene_file import encode_scene, read_scene, write_levels, write_sog_folder
 from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
 from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
 from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
@@ -56,6 +58,8 @@ def convert(
     compare: bool,
     images: Path | None = None,
     settings: Settings | None = None,
+    levels_of: Path | None = None,
+    pad_sh: bool = False,
     in_place: bool = False,
 ) -> Converted:
     """Write a scene in the format that the name of a file determines. Colors and order may change by its rounding.
@@ -63,24 +67,37 @@ def convert(
     Args:
         source: Scene or checkpoint of a trainer, and cameras for the comparison; without cameras, views are those of an
             orbit.
-        out: File to write: a scene, the meta.json of an unpacked SOG, or a USD file, which cannot be compared.
+        out: File to write: a scene, the meta.json of an unpacked SOG, the lod-meta.json or archive of a streamed SOG,
+            or a USD file, which cannot be compared.
         compare: Whether to read the file back and compare renders.
         images: Folder of photos, for cameras whose file states no sizes.
         settings: Settings of a job, whose views and background the renders have; None for those of the cameras, on
             black.
+        levels_of: Streamed SOG that the scene is the finest level of, with other colors; None for the scene itself.
+        pad_sh: Whether a PLY has spherical harmonics of degree 3 in any case.
         in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
 
     Raises:
         InvalidInputError: If scene, cameras or output cannot be used.
     """
     is_usd = out.suffix.lower() in USD_SUFFIXES
+    streamed = out.name == INDEX_NAME or format_of_name(out.name) is STREAMED_SOG
     if is_usd:
         check_usd(out)
         if compare:
             raise OutputError(f"{out}: USD can only be written, so it cannot be compared. Omit --compare.")
-    elif out.name != META_NAME:
+    elif streamed and not levels_of and read_scene_header(source.scene).format is not STREAMED_SOG:
+        raise OutputError(
+            f"{out}: needs the levels of a streamed SOG. Give the one that the scene is from: --levels-of."
+        )
+    elif levels_of and not streamed:
+        raise OutputError(f"{out}: has no levels of detail. Name a {INDEX_NAME} or a .zip, or omit --levels-of.")
+    elif out.name != META_NAME and not streamed:
         result_format(out)
-    check_is_not_input(out, source.scene)
+    if pad_sh and format_of_name(out.name) is not PLY:
+        raise OutputError(f"{out}: only a PLY can be padded. Name a .ply, or omit --pad-sh.")
+    for path in filter(None, (source.scene, levels_of)):
+        check_is_not_input(out, scene_path(path))
     if compare and source.cameras is None and source.orbit is None:
         source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
     axes, decisions = choose_axes(source, images)
@@ -94,13 +111,16 @@ def convert(
         capture = (capture.fitted(settings) if settings else capture).checked(scene, source.near)
         cameras, decisions = capture.cameras, [*decisions, *capture.decisions]
     out.parent.mkdir(parents=True, exist_ok=True)
-    if out.name == META_NAME:
+    size = None
+    if streamed:
+        size = write_levels(out, scene, levels_of or source.scene)
+    elif out.name == META_NAME:
         size = write_sog_folder(out.parent, scene)
     elif is_usd:
         write_usd(out, scene)
     else:
         with _written(out, in_place=in_place) as stream:
-            encode_scene(stream, scene, result_format(out), out)
+            encode_scene(stream, scene, result_format(out), out, pad_sh=pad_sh)
     stated = CLASSIC if is_usd else read_scene_header(out).tag.rendering
     if stated != scene.rendering:
         reason = f"its format cannot state {scene.rendering.text}"
@@ -109,7 +129,7 @@ def convert(
     if compare:
         background = settings.background if settings else (0.0, 0.0, 0.0)
         loss = measure_compression(out, scene, cameras, background=background, near=source.near)
-        loss = replace(loss, size=size) if out.name == META_NAME else loss
+        loss = replace(loss, size=size or loss.size)
     return Converted(describe_scene(file), tuple(decisions), loss)
 
 

@@ -11,7 +11,8 @@ import torch
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import remove_leftovers, write_json
-from sgsst_core.files.scene_file import write_scene
+from sgsst_core.files.formats.streamed_sog import STREAMED_SOG
+from sgsst_core.files.scene_file import write_levels, write_scene
 from sgsst_core.files.stylized_ply import write_colors, write_stylized
 from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.progress import Progress
@@ -174,9 +175,11 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
     stylizer, outputs = job.stylizer, job.outputs
     first = stylizer.job.collectives.rank == 0
     _count_remaining(job, "other")
-    attenuation = stylizer.job.settings.sh_attenuation
+    attenuation, pad_sh = stylizer.job.settings.sh_attenuation, job.request.pad_sh
     stylizer.job.collectives.broadcast(
-        lambda: write_stylized(job.scene_file, outputs.ply, stylizer.stylized(), sh_attenuation=attenuation)
+        lambda: write_stylized(
+            job.scene_file, outputs.ply, stylizer.stylized(), sh_attenuation=attenuation, pad_sh=pad_sh
+        )
     )
     compressed = stylizer.job.collectives.broadcast(lambda: _write_compressed(job))
     if first and stopped not in CONTINUABLE:
@@ -219,7 +222,10 @@ def _write_compressed(job: Job) -> CompressionLoss | None:
     if path is None or format is None:
         return None
     scene = replace(stylizer.job.scene, sh_dc=stylizer.stylized().detach().to("cpu", torch.float32))
-    write_scene(path, scene, format)
+    if format is STREAMED_SOG:
+        write_levels(path, scene, job.scene_file.path)
+    else:
+        write_scene(path, scene, format)
     settings = stylizer.job.settings
     return measure_compression(
         path, scene, stylizer.job.views.cameras, background=settings.background, near=settings.near

@@ -53,6 +53,7 @@ class JobSpec(BaseModel):
         regions: Regions with their own style or frozen colors, from `region_requests`.
         colors: Whether to also write a file of the stylized colors alone, if nothing else of the scene changes.
         style_background: sRGB color behind transparent parts of style images, in 0..1.
+        pad_sh: Whether the PLY has spherical harmonics of degree 3 in any case; see `write_stylized`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -67,6 +68,7 @@ class JobSpec(BaseModel):
     regions: tuple[RegionRequest, ...] = ()
     colors: bool = False
     style_background: Color = (1.0, 1.0, 1.0)
+    pad_sh: bool = False
 
 
 class Result(BaseModel):

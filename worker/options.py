@@ -112,6 +112,11 @@ class StylizeOptions(_Chosen):
         Option(unit="RGB, 0 to 1", metavar="COLOR", default="white", parse=parse_color, syntax=COLOR_SYNTAX),
     ] = Field((1.0, 1.0, 1.0), description="Color behind transparent parts of style images.")
     backbone: Backbone = Field("auto", description="Feature network; auto: VGG19 if it is installed, else VGG16.")
+    pad_sh: bool = Field(
+        False,
+        description="Write a PLY of 248 bytes per Gaussian, as plugins for Unity need it: the usual properties alone, "
+        "with spherical harmonics of degree 3, whose missing bands are 0.",
+    )
     workers: Annotated[
         int | None, Option(unit="ranks", metavar="N", default="this process only; in a service, chosen by the service")
     ] = Field(

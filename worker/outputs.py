@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import ensure_writable_folder
-from sgsst_core.files.formats import RESULT_SUFFIXES, format_of_name
+from sgsst_core.files.formats import RESULT_SUFFIXES, format_of_name, read_scene_header
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.formats.streamed_sog import STREAMED_SOG
 from worker.job import JobSpec, check_choice, check_steps
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ class Outputs:
         Raises:
             OutputError: If the name does not end in a suffix of a format that can be written.
         """
-        format = result_format(out)
+        format = STREAMED_SOG if format_of_name(out.name) is STREAMED_SOG else result_format(out)
         if format is PLY:
             return Outputs(out)
         return Outputs(out.with_name(out.name[: -len(format.suffix)] + PLY.suffix), out)
@@ -157,4 +158,22 @@ def check_request(request: JobSpec) -> Outputs:
         if path is not None:
             remark = "" if path == out else f" (the PLY beside {out.name})"
             check_is_not_input(path, request.source.scene, remark=remark)
+    if outputs.compressed_format is STREAMED_SOG:
+        _check_levels(request)
     return outputs
+
+
+def _check_levels(request: JobSpec) -> None:
+    """Check that a job can write a streamed SOG: it takes all but colors from that of its scene.
+
+    Raises:
+        OutputError: If the scene is no streamed SOG, or the job changes more than its colors.
+    """
+    scene, out, settings = request.source.scene, request.out, request.settings
+    if read_scene_header(scene).format is not STREAMED_SOG:
+        raise OutputError(f"{out}: is written only if the scene is a streamed SOG. Name a {RESULT_SUFFIXES}.")
+    if settings.growth > 1 or settings.sh_attenuation or request.source.drop_invalid:
+        raise OutputError(
+            f"{out}: a streamed SOG differs from that of the scene only in its colors. Omit --refine, --sh-attenuation "
+            f"and --drop-invalid, or name a {RESULT_SUFFIXES}."
+        )

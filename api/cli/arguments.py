@@ -169,4 +169,5 @@ class JobInputs:
             settings=options.settings(),
             regions=region_requests(self.regions),
             style_background=options.style_background,
+            pad_sh=options.pad_sh,
         )

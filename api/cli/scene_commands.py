@@ -188,13 +188,15 @@ def _frame_bar() -> Iterator[Callable[[int, int], None]]:
 
 
 @with_options(ViewOptions, only=("near", "drop_invalid", "spz_axes", "render_mode", "eps2d"))
+@with_options(StylizeOptions, "chosen", only=("pad_sh",))
 def convert(
     scene: SceneArgument,
     out: Annotated[
         Path,
         typer.Argument(
             metavar="OUT",
-            help=f"Scene to write: {RESULT_SUFFIXES}; meta.json for an unpacked SOG, .usdc for OpenUSD.",
+            help=f"Scene to write: {RESULT_SUFFIXES}; meta.json for an unpacked SOG, lod-meta.json or .zip for a "
+            "streamed SOG, .usdc for OpenUSD.",
             callback=file_to_write,
             show_default=False,
         ),
@@ -210,14 +212,24 @@ def convert(
             help="Cameras that --compare renders, and that decide the axes of an SPZ. [default: an orbit]",
         ),
     ] = None,
+    levels_of: Annotated[
+        Path | None,
+        typer.Option(
+            parser=local_path,
+            metavar="PATH",
+            help="Streamed SOG that SCENE was made from: its coarser levels take the nearest changes of color.",
+        ),
+    ] = None,
     *,
     options: ViewOptions,
+    chosen: StylizeOptions,
 ) -> None:
     """Convert a scene to another format, which the name of OUT determines."""
     from worker.derive import convert as convert_scene
     from worker.job import SceneRequest
 
-    converted = convert_scene(SceneRequest.of(scene, cameras, options), out, compare=compare)
+    source = SceneRequest.of(scene, cameras, options)
+    converted = convert_scene(source, out, compare=compare, levels_of=levels_of, pad_sh=chosen.pad_sh)
     for line in converted.decisions:
         print_field(line.item, f"{line.decision}: {line.reason}")
     if converted.loss is not None:

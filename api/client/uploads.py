@@ -5,14 +5,18 @@ from __future__ import annotations
 import base64
 import hashlib
 import secrets
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from api.client.answers import ApiError, RequestError
-from api.client.inputs import JobFiles, input_files
+from api.client.inputs import InputFile, JobFiles, input_files
 from api.client.transport import Progress, Transport, in_thread, json_text
+from sgsst_core.files.formats import scene_path
+from sgsst_core.files.formats.streamed_sog import INDEX_NAME, pack
 
 #: Maximum bytes of a part; larger files are uploaded in parts.
 PART_BYTES = 16 << 20
@@ -86,7 +90,24 @@ async def _send_files(
 ) -> list[tuple[str, Any]]:
     """Upload the large files, and return the form fields of the request, which contain the small files and the URLs."""
     given = json_text({name: value for name, value in parameters.items() if value is not None})
-    inputs = await in_thread(input_files, files)
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = await in_thread(input_files, replace(files, scene=await in_thread(_packed, files.scene, Path(folder))))
+        fields = await _sent(transport, inputs, progress)
+    return [*fields, ("parameters", (None, given))]
+
+
+def _packed(scene: Path | str, folder: Path) -> Path | str:
+    """Return the scene, in an archive in `folder` if it is an unpacked streamed SOG."""
+    index = scene_path(scene) if isinstance(scene, Path) else None
+    if index is None or index.name != INDEX_NAME or not index.is_file():
+        return scene
+    archive = folder / f"{index.absolute().parent.name or 'scene'}.zip"
+    pack(index, archive)
+    return archive
+
+
+async def _sent(transport: Transport, inputs: Sequence[InputFile], progress: Progress) -> list[tuple[str, Any]]:
+    """Upload the large files, and return the form fields of all."""
     total = sum(file.size for file in inputs if file.size > PART_BYTES)
     done = 0
     fields: list[tuple[str, Any]] = []
@@ -100,7 +121,6 @@ async def _send_files(
         else:
             content = await in_thread(file.source.read_bytes)
             fields.append((file.role, (file.name, content, "application/octet-stream")))
-    fields.append(("parameters", (None, given)))
     return fields
 
 

@@ -97,10 +97,6 @@ SCENES = (
     ),
     Kind("an HTML page, such as an error message. Download the scene again.", _is_html),
     Kind(
-        f"a streamed SOG, whose levels of detail are in other files. {converted('lod-meta.json')}",
-        _begins(b"{", holding=b'"lodlevels"'),
-    ),
-    Kind(
         "a tileset of 3D Tiles, whose data are in other files. Give the scene that it was made of.",
         _begins(b"{", holding=b'"geometricerror"'),
     ),
@@ -274,8 +270,6 @@ def refuse_scene_folder(folder: Path) -> NoReturn:
         raise SceneError(
             f"{folder}: is a run of gsplat without a PLY. Make one: `sgsst convert {checkpoint} scene.ply`."
         )
-    if (folder / "lod-meta.json").is_file():
-        raise SceneError(f"{folder}: is a streamed SOG. {converted(str(folder / 'lod-meta.json'))}")
     raise SceneError(f"{folder}: is a folder. Give the file of a scene.")
 
 

@@ -10,6 +10,7 @@ import re
 import warnings
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,12 +23,21 @@ from torch import Tensor
 
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.formats import read_scene_header
-from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader
+from sgsst_core.files.formats import read_scene_header, scene_path
+from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader, write_ply
 from sgsst_core.files.formats.ply_header import FILTER_3D, PlyHeader, element_offsets, surplus
-from sgsst_core.files.formats.scene_format import UNTAGGED, Arrays, RenderTag, SceneFormat, SceneHeader, blocks
+from sgsst_core.files.formats.scene_format import (
+    COEFFICIENTS,
+    UNTAGGED,
+    Arrays,
+    RenderTag,
+    SceneFormat,
+    SceneHeader,
+    blocks,
+)
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
+from sgsst_core.files.formats.streamed_sog import INDEX_NAME, StreamedHeader, write_recolored
 from sgsst_core.files.formats.units import check_units
 from sgsst_core.files.scene_columns import FLAT, SceneColumns, about_rounded_positions
 from sgsst_core.refine.split import Refinement, piece_counts
@@ -135,6 +145,7 @@ def read_scene(
         SceneError: If the file cannot be read, is truncated, is not a 3DGS scene, has a wrong header, no Gaussians or
             invalid values, or has changed while it was read.
     """
+    path = scene_path(path)
     header = read_scene_header(path)
     if isinstance(header, SpzHeader):
         header = replace(header, axes=spz_axes)
@@ -209,6 +220,47 @@ def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY) -> None:
         encode_scene(output, scene, format, path)
 
 
+def write_levels(target: Path, scene: Scene, original: Path) -> int:
+    """Write a streamed SOG with the colors of a scene that is its finest level with other colors.
+
+    Coarser levels take the changes of their nearest Gaussians; see `write_recolored`. Return the bytes of all files.
+
+    Args:
+        target: `INDEX_NAME` in a folder, or an archive.
+        original: Streamed SOG that the scene is from.
+
+    Raises:
+        SceneError: If `original` is no streamed SOG, or cannot be read.
+        OutputError: If the scene has other Gaussians than it, or a file cannot be written.
+    """
+    original, size = scene_path(original), 0
+    header = read_scene_header(original)
+    if not isinstance(header, StreamedHeader):
+        raise SceneError(f"{original}: is no streamed SOG. Give the {INDEX_NAME} or the archive of one.")
+
+    def put(name: str, data: bytes) -> None:
+        nonlocal size
+        size += len(data)
+        if archive is not None:
+            archive.writestr(zipfile.ZipInfo(name), data)
+            return
+        file = target.parent / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(file) as temporary:
+            temporary.write_bytes(data)
+
+    arrays = arrays_of(scene)
+    with ExitStack() as stack:
+        archive = None
+        if target.name != INDEX_NAME:
+            archive = stack.enter_context(zipfile.ZipFile(stack.enter_context(atomic_path(target)), "w"))
+        try:
+            write_recolored(original, header, arrays["means"], arrays["sh_dc"], put)
+        except OutputError as error:
+            raise OutputError(f"{target}: {error}") from error
+    return size
+
+
 def write_sog_folder(folder: Path, scene: Scene) -> int:
     """Write a scene as an unpacked SOG, whose meta.json comes last. Return the bytes of its files.
 
@@ -224,13 +276,14 @@ def write_sog_folder(folder: Path, scene: Scene) -> int:
         return sum(entry.file_size for entry in archive.infolist())
 
 
-def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Path) -> None:
+def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Path, *, pad_sh: bool = False) -> None:
     """Write a scene to a stream.
 
     Formats other than PLY omit SH bands that are 0 in all Gaussians, and may change the order of the Gaussians.
 
     Args:
         format: One of `RESULT_FORMATS`.
+        pad_sh: Whether a PLY has the coefficients of degree 3, with zeros for missing ones; ignored for other formats.
 
     Raises:
         OutputError: If the format cannot represent the scene.
@@ -239,7 +292,10 @@ def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Pa
     if format is not PLY:
         scene = scene.without_zero_bands()
     try:
-        format.write(output, arrays_of(scene), scene.rendering)
+        if format is PLY:
+            write_ply(output, arrays_of(scene), scene.rendering, COEFFICIENTS[3] if pad_sh else 0)
+        else:
+            format.write(output, arrays_of(scene), scene.rendering)
     except OutputError as error:
         raise OutputError(f"{target}: {error}") from error
 

@@ -54,7 +54,9 @@ class _Changes(NamedTuple):
         return values * np.float32(self.factor) if self.factor else np.zeros_like(values)
 
 
-def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0) -> None:
+def write_stylized(
+    source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenuation: float = 0.0, pad_sh: bool = False
+) -> None:
     """Write the PLY of a scene with new f_dc_0..2, atomically. All other bytes stay as in the source file.
 
     plyfile would change them: it moves `obj_info` behind comments, writes other line ends, names of types and numbers
@@ -68,13 +70,14 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
     - Each piece of a split Gaussian has a row with its own position, scale and opacity, and the count is adjusted.
     - If the requested render mode differs from the file's, it is written to comments of the header.
 
-    A scene in another format is written as a PLY by `encode_scene`.
+    A scene in another format is written as a PLY by `encode_scene`, and so is one with `pad_sh`.
 
     Args:
         source: File from `read_scene`.
         target: File to write; may be the source itself.
         sh_dc: Finite coefficients, [N, 3] with N = len(source.scene).
         sh_attenuation: SH attenuation of f_rest_*, 0 to 1; see `Scene.attenuated`.
+        pad_sh: Whether to write the usual properties alone, with SH coefficients of degree 3; see `encode_scene`.
 
     Raises:
         SceneError: If the source file has changed since it was read, or cannot store attenuated coefficients.
@@ -88,11 +91,17 @@ def write_stylized(source: SceneFile, target: Path, sh_dc: Tensor, *, sh_attenua
         False
     """
     with atomic_path(target) as temporary, temporary.open("wb") as output:
-        encode_stylized(output, source, sh_dc, target, sh_attenuation=sh_attenuation)
+        encode_stylized(output, source, sh_dc, target, sh_attenuation=sh_attenuation, pad_sh=pad_sh)
 
 
 def encode_stylized(
-    output: BinaryIO, source: SceneFile, sh_dc: Tensor, target: Path, *, sh_attenuation: float = 0.0
+    output: BinaryIO,
+    source: SceneFile,
+    sh_dc: Tensor,
+    target: Path,
+    *,
+    sh_attenuation: float = 0.0,
+    pad_sh: bool = False,
 ) -> None:
     """Write the PLY of a scene with new colors to a stream; see `write_stylized`. `target` is named in messages."""
     if sh_dc.shape != source.scene.sh_dc.shape or not bool(torch.isfinite(sh_dc).all()):
@@ -100,8 +109,9 @@ def encode_stylized(
     if file_stamp(source.path) != source.stamp:
         raise changed(source.path)
     colors = sh_dc.detach().to("cpu", torch.float32)
-    if source.header is None:
-        encode_scene(output, replace(source.scene.attenuated(sh_attenuation), sh_dc=colors), PLY, target)
+    if source.header is None or pad_sh:
+        scene = replace(source.scene.attenuated(sh_attenuation), sh_dc=colors)
+        encode_scene(output, scene, PLY, target, pad_sh=pad_sh)
         return
     check_sh_attenuation(source, sh_attenuation)
     factor = attenuation_factor(sh_attenuation)

@@ -1,6 +1,7 @@
 // @ts-check
 /**
- * Reader of PlayCanvas' SOG, a ZIP archive of WebP images, as `sgsst_core/files/formats/sog.py` describes it.
+ * Reader of PlayCanvas' SOG, a ZIP archive of WebP images, as `sgsst_core/files/formats/sog.py` describes it, and of
+ * the finest level of a streamed SOG in an archive, as in `streamed_sog.py` there.
  *
  * Pixel i of each image belongs to Gaussian i. Images are decoded by the browser and read back from a texture, because
  * a canvas would round the colors of transparent pixels.
@@ -19,27 +20,89 @@ const COEFFICIENTS = /** @type {Record<number, number>} */ ({ 192: 3, 512: 8, 96
 /** Alpha of the rotations' image for w as the largest component; x, y and z follow. */
 const FIRST_TAG = 252;
 const MAX_PALETTE_PIXELS = 65536 * 15;
+const META = "meta.json", INDEX = "lod-meta.json";
+
+/**
+ * @typedef {object} Part SOG scene, alone or as a part of a streamed one
+ * @property {number} count number of Gaussians
+ * @property {number} coefficients SH coefficients per color channel above degree 0
+ * @property {import("./render_tag.js").Rendering} rendering
+ * @property {(begin: number, into: Float32Array, o: number, width: number, some: number, stride: number) => Promise<void>} fill
+ *   writes the rows of `some` Gaussians to `into` from `o` on; `stride` is the number of coefficients in a row
+ */
 
 /**
  * @param {ByteReader} reader
  * @returns {Promise<SceneFile>}
  */
 export async function sog(reader) {
-  const files = await unzipped(await reader.all()), meta = files.get("meta.json");
-  if (!meta) throw new SceneError(words.scene.notScene);
+  const files = await unzipped(await reader.all());
+  const [index] = [...files.keys()].filter((name) => `/${name}`.endsWith(`/${INDEX}`)).sort((a, b) => a.length - b.length);
+  if (index === undefined && !files.has(META)) throw new SceneError(words.scene.notScene);
   try {
-    return await sogScene(files, JSON.parse(new TextDecoder().decode(await meta())));
+    return joined(index === undefined ? [await sogPart(files)] : await finestParts(files, index));
   } catch (error) {
     throw error instanceof SceneError ? error : new SceneError(words.scene.unreadable); // values are missing or wrong
   }
 }
 
 /**
+ * Return the parts of the finest level of a streamed SOG, and its environment.
+ *
  * @param {import("./zip.js").Files} files
- * @param {any} meta
- * @returns {Promise<SceneFile>}
+ * @param {string} name path of its index
  */
-async function sogScene(files, meta) {
+async function finestParts(files, name) {
+  const above = name.slice(0, -INDEX.length), { filenames, environment, tree } = await json(files, name);
+  const used = /** @type {Map<number, Set<number>>} */ (new Map());
+  const visit = (/** @type {any} */ node) => {
+    for (const [level, { file }] of Object.entries(node.lods ?? {})) used.set(Number(level), (used.get(Number(level)) ?? new Set()).add(file));
+    (node.children ?? []).forEach(visit);
+  };
+  visit(tree);
+  const numbers = [...used.get(Math.min(...used.keys())) ?? []].sort((a, b) => a - b), parts = [];
+  for (const each of [...numbers.map((number) => filenames[number]), ...environment ? [environment] : []]) {
+    const folder = above + each.slice(0, -META.length), inside = [...files].filter(([path]) => path.startsWith(folder));
+    parts.push(await sogPart(new Map(inside.map(([path, load]) => [path.slice(folder.length), load]))));
+  }
+  return parts;
+}
+
+/**
+ * @param {import("./zip.js").Files} files
+ * @param {string} name
+ * @returns {Promise<any>}
+ */
+async function json(files, name) {
+  const load = files.get(name);
+  if (!load) throw new SceneError(words.scene.unreadable);
+  return JSON.parse(new TextDecoder().decode(await load()));
+}
+
+/**
+ * Return a scene of the Gaussians of some parts.
+ *
+ * @param {Part[]} parts
+ * @returns {SceneFile}
+ */
+function joined(parts) {
+  const coefficients = Math.max(...parts.map((part) => part.coefficients)), count = parts.reduce((sum, part) => sum + part.count, 0);
+  return unpacked(count, Math.sqrt(coefficients + 1) - 1, async (begin, into, width, some) => {
+    let first = 0;
+    for (const part of parts) {
+      const from = Math.max(begin, first), to = Math.min(begin + some, first + part.count);
+      if (from < to) await part.fill(from - first, into, (from - begin) * width, width, to - from, coefficients);
+      first += part.count;
+    }
+  }, parts[0].rendering);
+}
+
+/**
+ * @param {import("./zip.js").Files} files
+ * @returns {Promise<Part>}
+ */
+async function sogPart(files) {
+  const meta = await json(files, META);
   const { version = 1, means, scales, quats, sh0, shN } = meta, table = version === 2 ? codebook : steps;
   if (version !== 1 && version !== 2) throw new SceneError(words.scene.newSog);
   const count = version === 2 ? meta.count : means.shape[0];
@@ -57,9 +120,9 @@ async function sogScene(files, meta) {
   });
   /** @type {Awaited<ReturnType<typeof all>> | null} */
   let read = null;
-  return unpacked(count, Math.sqrt(coefficients + 1) - 1, async (begin, into, width, some) => {
+  const fill = async (/** @type {number} */ begin, /** @type {Float32Array} */ into, /** @type {number} */ o, /** @type {number} */ width, /** @type {number} */ some, /** @type {number} */ stride) => {
     const { lows, highs, scale, rotation, color, label } = read ??= await all();
-    for (let i = 0, p = 4 * begin, o = 0; i < some; i++, p += 4, o += width) {
+    for (let i = 0, p = 4 * begin; i < some; i++, p += 4, o += width) {
       for (let axis = 0; axis < 3; axis++) {
         const step = (lows[p + axis] | (highs[p + axis] << 8)) / 65535, value = low[axis] + (high[axis] - low[axis]) * step;
         into[o + axis] = Math.sign(value) * Math.expm1(Math.abs(value));
@@ -73,10 +136,11 @@ async function sogScene(files, meta) {
       for (let n = 0; n < coefficients; n++) {
         const v = 4 * ((label[p] | (label[p + 1] << 8)) * coefficients + n);
         if (v >= palette.bytes.length) throw new SceneError(words.scene.unreadable);
-        for (let c = 0; c < 3; c++) into[o + HARMONICS + c * coefficients + n] = harmonicOf[0][palette.bytes[v + c]];
+        for (let c = 0; c < 3; c++) into[o + HARMONICS + c * stride + n] = harmonicOf[0][palette.bytes[v + c]];
       }
     }
-  }, extrasRendering({ ...meta.extras, model: meta.model }));
+  };
+  return { count, coefficients, fill, rendering: extrasRendering({ ...meta.extras, model: meta.model }) };
 }
 
 /**

@@ -20,9 +20,10 @@ from sgsst_core.files.formats.scene_format import FileStart, SceneFormat, SceneH
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.splat import SPLAT
 from sgsst_core.files.formats.spz import SPZ, SPZ_3
+from sgsst_core.files.formats.streamed_sog import INDEX_NAME, STREAMED_SOG
 
 #: All scene formats, in the order in which they are tried and listed. Formats without a magic number come last.
-FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_3, SOG, GLB, KSPLAT, SPLAT)
+FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_3, STREAMED_SOG, SOG, GLB, KSPLAT, SPLAT)
 #: Formats of results: PLY, and those that can be written in addition to it.
 RESULT_FORMATS = tuple(each for each in FORMATS if each.write)
 EXTRA_FORMATS = tuple(each for each in RESULT_FORMATS if each is not PLY)
@@ -67,12 +68,19 @@ def result_name(ply: str, format: SceneFormat) -> str:
     return ply.removesuffix(PLY.suffix) + format.suffix
 
 
+def scene_path(path: Path) -> Path:
+    """Return the index of a streamed SOG, given its folder; any other path as it is."""
+    index = path / INDEX_NAME
+    return index if index.is_file() else path
+
+
 def read_scene_header(path: Path) -> SceneHeader:
-    """Detect the format of a scene file from its content, and check its header.
+    """Detect the format of a scene file, or of the folder of a streamed SOG, from its content; check its header.
 
     Raises:
         SceneError: If the file cannot be read, is truncated, has a wrong header, or has an unsupported format.
     """
+    path = scene_path(path)
     if path.is_dir():
         refuse_scene_folder(path)
     try:

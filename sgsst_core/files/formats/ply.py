@@ -129,9 +129,14 @@ def _likely_content(header: PlyHeader) -> str:
     return "something else" if vertex else "a PLY without vertices"
 
 
-def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write a binary little-endian float32 PLY with the usual order of properties. Normals are 0."""
-    count, coefficients = arrays["sh_rest"].shape[:2]
+def write_ply(output: BinaryIO, arrays: Arrays, rendering: Rendering, least_coefficients: int = 0) -> None:
+    """Write a binary little-endian float32 PLY with the usual order of properties. Normals are 0.
+
+    Args:
+        least_coefficients: SH coefficients per color channel above degree 0 that each row has; missing ones are 0.
+    """
+    count, stored = arrays["sh_rest"].shape[:2]
+    coefficients = max(stored, least_coefficients)
     names = [*PROPERTIES["means"], "nx", "ny", "nz", *PROPERTIES["sh_dc"]]
     names += [*(f"f_rest_{i}" for i in range(3 * coefficients)), "opacity", *PROPERTIES["scales"], *PROPERTIES["quats"]]
     lines = ["ply", "format binary_little_endian 1.0", *comment_lines(rendering), f"element vertex {count}"]
@@ -142,7 +147,9 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
         rows = np.zeros((len(block["means"]), len(names)), "<f4")
         rows[:, :3] = block["means"]
         rows[:, 6:9] = block["sh_dc"]
-        rows[:, 9:-8] = block["sh_rest"].transpose(0, 2, 1).reshape(len(rows), -1)  # channel-major
+        rest = np.zeros((len(rows), 3, coefficients), np.float32)  # channel-major
+        rest[:, :, :stored] = block["sh_rest"].transpose(0, 2, 1)
+        rows[:, 9:-8] = rest.reshape(len(rows), -1)
         rows[:, -8] = block["opacities"]
         rows[:, -7:-4] = block["scales"]
         rows[:, -4:] = block["quats"]
@@ -153,4 +160,4 @@ def _matches(start: FileStart) -> bool:
     return start.head.startswith(b"ply") and not COMPRESSED_PLY.matches(start)
 
 
-PLY = SceneFormat("ply", "PLY", 248, _matches, _read_header, write=_write)
+PLY = SceneFormat("ply", "PLY", 248, _matches, _read_header, write=write_ply)

@@ -14,14 +14,9 @@ import io
 import json
 import math
 import re
-import struct
 import zipfile
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +25,7 @@ from PIL import Image
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import converted, is_checkpoint, is_usdz
+from sgsst_core.files.formats.archive import ZIP_MAGIC, FilesOfScene
 from sgsst_core.files.formats.codebooks import VALUES, nearest_entries, palette, value_codebook
 from sgsst_core.files.formats.quantized import (
     OPACITY_LOGITS,
@@ -51,24 +47,15 @@ from sgsst_core.files.formats.scene_format import (
     extras_of,
     extras_tag,
     json_numbers,
-    read_bytes,
-    without_padding,
 )
 from sgsst_core.scene.rendering import Rendering
 
 #: Name of the file that describes a scene, in an archive or a folder.
 META_NAME = "meta.json"
-_ZIP_MAGIC = b"PK\x03\x04"
-#: Record at the end of a ZIP archive, and its signature; archives above 4 GB have a locator of another record before.
-_END = struct.Struct("<4s4H2LH")
-_END_MAGIC, _LOCATOR_MAGIC, _LOCATOR_BYTES = b"PK\x05\x06", b"PK\x06\x07", 20
-_MAX_COMMENT_BYTES = 1 << 16
-#: Maximum number of files in an archive, and bytes of their list and of meta.json.
-_MAX_ENTRIES = 256
-_MAX_LIST_BYTES = 1 << 18
-_MAX_META_BYTES = 1 << 20
+#: Maximum bytes of meta.json, and of that of a part of a streamed SOG, which may have a thousand of them.
+_MAX_META_BYTES, _MAX_PART_META_BYTES = 1 << 20, 1 << 17
 #: Maximum number of Gaussians per byte of the images. Real scenes take ten bytes per Gaussian.
-_GAUSSIANS_PER_BYTE = 16
+GAUSSIANS_PER_BYTE = 16
 #: Maximum pixels of an image for a number of Gaussians. Writers round width and height up.
 _PIXELS_PER_GAUSSIAN, _MORE_PIXELS = 2, 1 << 16
 #: Bytes that a lossless image may take beyond 4 per pixel.
@@ -90,8 +77,8 @@ _FIRST_TAG = 252
 _IMAGES = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
 #: File names: without folders, so that no other files are read.
 _NAME = re.compile(r"[\w-][\w.-]{0,99}")
-#: Errors of a meta.json with missing or wrong values.
-_WRONG_META = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, OverflowError)
+#: Errors of a JSON document with missing or wrong values.
+WRONG_JSON = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, OverflowError)
 
 #: Effort of lossless compression, 0 to 100.
 _EFFORT = 50
@@ -118,63 +105,13 @@ class SogHeader(SceneHeader):
     harmonics: NDArray[np.float64] | None
 
 
-class _Files:
-    """Files of a SOG scene: those of an archive, or those beside meta.json.
-
-    Attributes:
-        path: Path of the archive or of meta.json.
-        surplus: Note on bytes before or after the archive.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._archived = read_bytes(path, 0, 4) == _ZIP_MAGIC
-        self.path = path
-        self.surplus = _check_end(path) if self._archived else ()
+class SogFiles(FilesOfScene):
+    """Files of a SOG scene, or of a part of a streamed SOG."""
 
     def meta(self) -> bytes:
         """Return the content of meta.json."""
-        return self.load(META_NAME if self._archived else self.path.name, _MAX_META_BYTES)
-
-    def size(self, name: str) -> int:
-        """Return an upper bound for the bytes of a file: its size, or that of the archive, whose list may be wrong."""
-        try:
-            return (self.path if self._archived else self.path.with_name(name)).stat().st_size
-        except OSError as error:
-            raise self._unreadable(name, error) from error
-
-    def load(self, name: str, limit: int, *, whole: bool = True) -> bytes:
-        """Return the content of a file of at most `limit` bytes, or its first `limit` bytes if `whole` is False."""
-        try:
-            with self._open(name) as file:
-                data = file.read(limit + whole)
-        except KeyError as error:
-            raise SceneError(
-                f"{self.path}: is a ZIP archive without {name}, so no SOG scene. Unpack it, and give the scene in it."
-            ) from error
-        except OSError as error:
-            raise self._unreadable(name, error) from error
-        except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, struct.error) as error:
-            raise SceneError(f"{self.path}: {name} is damaged: {error}. Copy or export the scene again.") from error
-        if len(data) > limit:
-            raise SceneError(
-                f"{self.path}: {name} has more than {limit} bytes, too many for this scene. Export it again."
-            )
-        return data
-
-    def _unreadable(self, name: str, error: OSError) -> SceneError:
-        return SceneError(f"{self.path}: {name} cannot be read: {error.strerror}. Give the whole folder, or a .sog.")
-
-    @contextmanager
-    def _open(self, name: str) -> Iterator[IO[bytes]]:
-        if not self._archived:
-            with self.path.with_name(name).open("rb") as file:
-                yield file
-            return
-        with zipfile.ZipFile(self.path) as archive:
-            if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise zipfile.BadZipFile("its compression is not supported")
-            with archive.open(name) as member:
-                yield member
+        name = META_NAME if self.is_archived or self.folder else self.path.name
+        return self.load(name, _MAX_PART_META_BYTES if self.folder else _MAX_META_BYTES)
 
     def dimensions(self, name: str, least: int, most: int | None = None) -> tuple[int, int]:
         """Return width and height of a WebP image, from its first bytes alone.
@@ -192,18 +129,22 @@ class _Files:
         elif kind == b"VP8X":
             size = int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
         if size is None or head[:4] != b"RIFF" or head[8:12] != b"WEBP":
-            raise SceneError(f"{self.path}: {name} is not a lossless WebP image. Export the scene again.")
+            raise SceneError(f"{self.path}: {self.folder}{name} is not a lossless WebP image. Export the scene again.")
         if not least <= size[0] * size[1] <= (_PIXELS_PER_GAUSSIAN * least + _MORE_PIXELS if most is None else most):
             raise SceneError(
-                f"{self.path}: {name} has {size[0]} x {size[1]} pixels, which do not fit {least} Gaussians: meta.json "
-                "or the image is wrong. Export the scene again."
+                f"{self.path}: {self.folder}{name} has {size[0]} x {size[1]} pixels, which do not fit {least} "
+                "Gaussians: meta.json or the image is wrong. Export the scene again."
             )
         return size
 
+    def image(self, name: str, least: int, most: int | None = None) -> tuple[tuple[int, int], bytes]:
+        """Return width and height of an image, and its file. Arguments are those of `dimensions`."""
+        size = self.dimensions(name, least, most)
+        return size, self.load(name, 4 * size[0] * size[1] + _IMAGE_OVERHEAD)
+
     def pixels(self, name: str, least: int, most: int | None = None) -> NDArray[np.uint8]:
         """Return an image [height, width, 4] uint8. Arguments are those of `dimensions`."""
-        size = self.dimensions(name, least, most)
-        data = self.load(name, 4 * size[0] * size[1] + _IMAGE_OVERHEAD)
+        size, data = self.image(name, least, most)
         try:
             with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
                 if image.size != size or getattr(image, "n_frames", 1) != 1:
@@ -211,58 +152,41 @@ class _Files:
                 return np.asarray(image.convert("RGBA"))
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise SceneError(
-                f"{self.path}: {name} is not a readable WebP image: {error}. Export the scene again."
+                f"{self.path}: {self.folder}{name} is not a readable WebP image: {error}. Export the scene again."
             ) from error
-
-
-def _check_end(path: Path) -> tuple[str, ...]:
-    """Check the end of an archive before its list of files is read, and return the note on bytes around the archive."""
-    with path.open("rb") as file:
-        size = file.seek(0, io.SEEK_END)
-        file.seek(max(0, size - _LOCATOR_BYTES - _END.size - _MAX_COMMENT_BYTES))
-        tail = file.read()
-    position = tail.rfind(_END_MAGIC)
-    if position < 0 or position + _END.size > len(tail):
-        raise SceneError(f"{path}: is a truncated ZIP archive. Copy or export the scene again.")
-    entries, list_bytes, list_offset, comment_bytes = _END.unpack_from(tail, position)[4:]
-    if (
-        entries > _MAX_ENTRIES
-        or list_bytes > _MAX_LIST_BYTES
-        or tail[max(0, position - _LOCATOR_BYTES) : position].startswith(_LOCATOR_MAGIC)
-    ):
-        raise SceneError(f"{path}: is a ZIP archive of {entries} files, so no SOG scene. Unpack it first.")
-    before = size - len(tail) + position - list_bytes - list_offset
-    after = without_padding(tail[position + _END.size + comment_bytes :])
-    return about_surplus(max(0, before) + len(after), "byte")
 
 
 def _matches(start: FileStart) -> bool:
     head = start.head
-    archive = head.startswith(_ZIP_MAGIC) and not is_checkpoint(head) and not is_usdz(head)
+    archive = head.startswith(ZIP_MAGIC) and not is_checkpoint(head) and not is_usdz(head)
     return archive or (head.lstrip().startswith(b"{") and b'"means"' in head)
 
 
 def _read_header(start: FileStart) -> SogHeader:
-    files = _Files(start.path)
-    text = files.meta()
+    return sog_header(SogFiles(start.path))
+
+
+def sog_header(files: SogFiles) -> SogHeader:
+    """Return the checked header of a SOG scene."""
+    text, where = files.meta(), f"{files.path}: {files.folder}{META_NAME}"
     try:
         header = _parsed(files, json.loads(text))
-    except _WRONG_META as error:
+    except WRONG_JSON as error:
         raise SceneError(
-            f"{start.path}: meta.json is not that of a SOG scene ({repr(error)[:200]}). Export the scene again."
+            f"{where} is not that of a SOG scene ({repr(error)[:200]}). Export the scene again."
         ) from error
     name = header.names["means"][0]
     files.dimensions(name, header.count)
-    if header.count > _GAUSSIANS_PER_BYTE * files.size(name):
+    if header.count > GAUSSIANS_PER_BYTE * files.size(name):
         raise SceneError(
-            f"{start.path}: meta.json declares {header.count} Gaussians, more than {files.size(name)} bytes can hold: "
+            f"{where} declares {header.count} Gaussians, more than {files.size(name)} bytes can hold: "
             "the file is truncated or meta.json is wrong. Copy or export the scene again."
         )
     return header
 
 
-def _parsed(files: _Files, meta: dict[str, Any]) -> SogHeader:
-    """Parse meta.json. Errors of `_WRONG_META` mean that a value is missing or wrong."""
+def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
+    """Parse meta.json. Errors of `WRONG_JSON` mean that a value is missing or wrong."""
     version = meta.get("version", 1)
     if version not in (1, 2):
         raise SceneError(
@@ -317,47 +241,93 @@ def _steps(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
 
 
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
-    """Fill the arrays of a scene, and return the note on pixels after the last Gaussian that are no padding."""
     assert isinstance(header, SogHeader)
-    path, files = file.path, _Files(file.path)
+    return read_sog(SogFiles(file.path), header, into)
 
-    def whole(name: str, index: int = 0) -> NDArray[np.uint8]:
-        return files.pixels(header.names[name][index], header.count).reshape(-1, 4)
 
-    def image(name: str, index: int = 0) -> NDArray[np.uint8]:
-        return whole(name, index)[: header.count]
-
-    low, high = image("means"), image("means", 1)
-    for block in blocks(header.count):
-        steps = (low[block, :3] | high[block, :3].astype(np.uint16) << 8) / 65535
-        values = header.bounds[0] + (header.bounds[1] - header.bounds[0]) * steps
-        with np.errstate(over="ignore", invalid="ignore"):  # non-finite results are reported later
-            into["means"][block] = np.sign(values) * np.expm1(np.abs(values))
-    quats = whole("quats")
+def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> tuple[str, ...]:
+    """Fill the arrays of a scene, and return the note on pixels after the last Gaussian that are no padding."""
+    where = f"{files.path}: {files.folder}"
+    read_positions(files, header, into["means"])
+    quats = _pixels(files, header, "quats")
     surplus = int((quats[header.count :, 3] >= _FIRST_TAG).sum())  # padding has no valid rotations
     quats = quats[: header.count]
     for block in blocks(header.count):
         index = quats[block, 3].astype(np.int64) - _FIRST_TAG
         if index.min() < 0:
-            raise SceneError(f"{path}: {header.names['quats'][0]} has no valid rotations. Export the scene again.")
+            raise SceneError(f"{where}{header.names['quats'][0]} has no valid rotations. Export the scene again.")
         into["quats"][block] = with_largest(index, (quats[block, :3] / 255 - 0.5) * np.sqrt(2))
-    scales, colors = image("scales"), image("sh0")
+    scales, colors = (_pixels(files, header, name)[: header.count] for name in ("scales", "sh0"))
     with np.errstate(over="ignore", invalid="ignore"):
         for axis in range(3):
             into["scales"][:, axis] = header.scales[axis].astype(np.float32)[scales[:, axis]]
-            into["sh_dc"][:, axis] = header.colors[axis].astype(np.float32)[colors[:, axis]]
+        into["sh_dc"][:] = _colors(header, colors)
         into["opacities"][:] = header.opacities.astype(np.float32)[colors[:, 3]]
         if header.harmonics is not None:
             vectors = files.pixels(header.names["shN"][0], 1, _PALETTE_PIXELS)[..., :3]
-            colors_of = header.harmonics.astype(np.float32)[vectors.reshape(-1, header.coefficients, 3)]
-            labels = image("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
-            if labels.max() >= len(colors_of):
+            entries = header.harmonics.astype(np.float32)[vectors.reshape(-1, header.coefficients, 3)]
+            labels = _pixels(files, header, "shN", 1)[: header.count, :2].astype(np.int64) @ np.array([1, 256])
+            if labels.max() >= len(entries):
                 raise SceneError(
-                    f"{path}: {header.names['shN'][1]} refers to vector {labels.max()} of {len(colors_of)}. Export the "
+                    f"{where}{header.names['shN'][1]} refers to vector {labels.max()} of {len(entries)}. Export the "
                     "scene again."
                 )
-            into["sh_rest"][:] = colors_of[labels]
+            into["sh_rest"][:] = entries[labels]
     return about_surplus(surplus, "Gaussian")
+
+
+def _pixels(files: SogFiles, header: SogHeader, name: str, index: int = 0) -> NDArray[np.uint8]:
+    """Return the pixels of an image of a property, [at least the number of Gaussians, 4] uint8."""
+    return files.pixels(header.names[name][index], header.count).reshape(-1, 4)
+
+
+def read_positions(files: SogFiles, header: SogHeader, into: NDArray[np.float32]) -> None:
+    """Fill an array [n, 3] with the positions of a scene."""
+    low, high = (_pixels(files, header, "means", index)[: header.count] for index in (0, 1))
+    for block in blocks(header.count):
+        steps = (low[block, :3] | high[block, :3].astype(np.uint16) << 8) / 65535
+        values = header.bounds[0] + (header.bounds[1] - header.bounds[0]) * steps
+        with np.errstate(over="ignore", invalid="ignore"):  # non-finite results are reported later
+            into[block] = np.sign(values) * np.expm1(np.abs(values))
+
+
+def read_colors(files: SogFiles, header: SogHeader, into: NDArray[np.float32]) -> None:
+    """Fill an array [n, 3] with the SH coefficients of degree 0 of a scene."""
+    into[:] = _colors(header, _pixels(files, header, "sh0")[: header.count])
+
+
+def _colors(header: SogHeader, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the SH coefficients of degree 0 of pixels [n, 4] of their image, [n, 3]."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.stack([header.colors[axis].astype(np.float32)[pixels[:, axis]] for axis in range(3)], axis=1)
+
+
+def recolored(files: SogFiles, header: SogHeader, change: NDArray[np.float32]) -> dict[str, bytes]:
+    """Return the files of a SOG scene with other colors, by name. All but these keep their bytes.
+
+    Args:
+        change: Change of the SH coefficients of degree 0, [n, 3].
+
+    Raises:
+        OutputError: If colors change, and the scene is SOG of version 1, which has no codebooks.
+    """
+    stored = {
+        name: files.image(name, *((1, _PALETTE_PIXELS) if (role, index) == ("shN", 0) else (header.count,)))[1]
+        for role, names in header.names.items()
+        for index, name in enumerate(names)
+    } | {META_NAME: files.meta()}
+    if not change.any():
+        return stored
+    meta, (name,) = json.loads(stored[META_NAME]), header.names["sh0"]
+    if meta.get("version") != 2:
+        raise OutputError(f"{files.folder} of it is SOG of version 1. Write it again with splat-transform.")
+    image = files.pixels(name, header.count)
+    pixels = image.reshape(-1, 4).copy()
+    colors = _colors(header, pixels[: header.count]) + change
+    codebook = value_codebook(colors)
+    pixels[: header.count, :3] = nearest_entries(colors, codebook)
+    meta["sh0"]["codebook"] = codebook.tolist()
+    return stored | {name: _webp(pixels, image.shape[1]), META_NAME: json.dumps(meta).encode()}
 
 
 def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:

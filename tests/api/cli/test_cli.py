@@ -32,6 +32,7 @@ from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.gaussians import TENSORS
+from tests.sgsst_core.files.formats.streamed import files_of, streamed, unpacked
 from tests.sgsst_core.trainer_scenes import write_gsplat, write_nerfstudio
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
@@ -778,6 +779,48 @@ def test_convert_writes_usd(files: Files, capsys: pytest.CaptureFixture[str]) ->
     assert [path.name for path in out.parent.iterdir()] == ["scene.usdc"]
 
 
+def test_streamed_sog_is_stylized_at_all_levels(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = wall(sh_degree=1)
+    files.ply = unpacked(files.ply.parent / "levels", streamed([[scene], [scene.subset(torch.arange(0, 616, 5))]]))
+    files.out = files.out.with_name("stylized.zip")
+    assert main(files.stylize("--refine", "2")) == 2
+    assert "Omit --refine" in capsys.readouterr().err
+    assert main(files.stylize("--steps-sos", "2")) == 0
+    assert re.search("compressed: +zip, .* dB PSNR against the PLY", " ".join(capsys.readouterr().out.split()))
+    written, ply = files_of(files.out), files.out.with_suffix(".ply")
+    assert len(read_scene(ply).scene) == len(read_scene(files.out).scene) == 616
+    assert written["1_0/sh0.webp"] != (files.ply / "1_0" / "sh0.webp").read_bytes()
+    again = files.out.with_name("again.zip")
+    assert main(["convert", str(ply), str(again), "--levels-of", str(files.ply / "lod-meta.json")]) == 0
+    assert files_of(again) == written
+    for arguments, message in (
+        ([str(ply), str(again)], "needs the levels of a streamed SOG"),
+        ([str(ply), str(ply.with_suffix(".sog")), "--levels-of", str(files.ply)], "has no levels of detail"),
+        ([str(ply), str(again), "--levels-of", str(ply)], "is no streamed SOG"),
+        ([str(files.ply), str(files.ply / "lod-meta.json")], "which would be overwritten"),
+    ):
+        capsys.readouterr()
+        assert main(["convert", *arguments]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_padded_plys_have_248_bytes_a_row(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
+    converted = files.out.with_name("converted.ply")
+    assert main(["convert", str(files.ply), str(converted), "--pad-sh"]) == 0
+    assert main(files.stylize("--steps-sos", "2", "--pad-sh")) == 0
+    for path in (converted, files.out):
+        head, _, rows = path.read_bytes().partition(b"end_header\n")
+        assert len(rows) == 616 * 248
+        assert [line.split()[2] for line in head.splitlines() if b" f_rest" in line] == [
+            f"f_rest_{i}".encode() for i in range(45)
+        ]
+        rest = read_scene(path).scene.sh_rest
+        assert torch.equal(rest[:, :3], read_scene(files.ply).scene.sh_rest)
+        assert not rest[:, 3:].any()
+    assert main(["convert", str(files.ply), str(converted.with_suffix(".spz")), "--pad-sh"]) == 2
+    assert "only a PLY can be padded" in capsys.readouterr().err
+
+
 def test_convert_compares_in_an_orbit(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["convert", str(files.ply), str(files.out), "--compare"]) == 0
     assert "renders identical to scene.ply" in capsys.readouterr().out
@@ -881,6 +924,7 @@ def test_error_is_one_line_on_stderr(tmp_path: Path) -> None:
 #: Commands that write, up to the file or folder, all with inputs that do not exist.
 _WRITING = [
     ["stylize", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "s.ply"],
+    ["batch", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "results"],
     ["plan", "no.ply", "--style", "no.png", "--orbit", "3", "--out", "plan.json"],
     ["plan", "no.ply", "--style", "no.png", "--orbit", "3", "--sheet", "views.jpg"],
     ["render", "no.ply", "--orbit", "3", "--out", "views"],

@@ -6,6 +6,7 @@ import asyncio
 import gzip
 import hashlib
 import inspect
+import json
 import math
 import os
 import signal
@@ -18,6 +19,7 @@ from typing import Any
 
 import pytest
 import stamina
+import torch
 
 from api.client import AsyncClient, Client, uploads
 from api.client.answers import ApiError, Event, Job, RequestError
@@ -29,6 +31,7 @@ from service.store import Store
 from tests.api.service import Service
 from tests.http_servers import serve
 from tests.nginx import Nginx
+from tests.sgsst_core.files.formats.streamed import archived, streamed, unpacked
 from tests.small_scenes import wall, write_files
 
 
@@ -122,6 +125,24 @@ def test_interrupted_call_is_canceled(service: Service, files: dict[str, Path]) 
 
 
 # --- the same scenario through both --------------------------------------------------------------------------------
+
+
+@both
+def test_unpacked_streamed_sog_is_sent_as_an_archive(
+    connect: Any, service: Service, files: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = unpacked(tmp_path / "robot", streamed([[wall()], [wall().subset(torch.arange(10))]]))
+    with connect(service.url) as client:
+        for scene in (folder, folder / "lod-meta.json"):
+            data = client.job(client.submit(scene, files["style"], orbit=2).id).data
+            assert data["name"] == "robot · style"
+            assert "robot.zip" in json.dumps(data["inputs"])
+        with pytest.raises(RequestError, match=r"0_0/meta\.json is missing"):
+            client.submit(
+                archived(tmp_path / "a.zip", {"lod-meta.json": (folder / "lod-meta.json").read_bytes()}),
+                files["style"],
+                orbit=2,
+            )
 
 
 @both

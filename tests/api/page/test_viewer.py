@@ -28,6 +28,7 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.page.browser import Watched, decoded, psnr, rendered, serve_files, view_script
 from tests.real_scenes import scene_path
 from tests.sgsst_core.files.formats.samples import ksplat
+from tests.sgsst_core.files.formats.streamed import archived, streamed
 from tests.sgsst_core.files.test_filtered_and_flat_scenes import with_filter, without_thickness
 from tests.small_scenes import cameras, wall, write_files
 
@@ -129,6 +130,15 @@ def test_glb_of_several_sets_and_spz_without_gzip_are_shown(visit: Visit, tmp_pa
     ply.write_bytes(with_two_sets(ply.read_bytes()))
     assert len(read_scene(ply).scene) == 616
     assert_shown_like(watched, tmp_path, ply, differs=True)
+
+
+def test_finest_level_of_a_streamed_sog_is_shown(visit: Visit, tmp_path: Path) -> None:
+    ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
+    near, far = (dust().subset(torch.arange(start, 616, 2)) for start in (0, 1))
+    far = replace(far, sh_rest=far.sh_rest[:, :0])
+    archived(ply, streamed([[near], [near.subset(torch.arange(20))]], far), "scene/")
+    assert len(read_scene(ply).scene) == 616
+    assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=False)
 
 
 def test_quantized_and_moved_glb_is_shown(visit: Visit, tmp_path: Path) -> None:

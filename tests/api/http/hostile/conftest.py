@@ -11,6 +11,7 @@ from pathlib import Path
 import httpx2
 import psutil
 import pytest
+import torch
 
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
@@ -21,6 +22,7 @@ from tests.api.conftest import Services
 from tests.api.http.sending import MB, Files, form
 from tests.api.service import Service, wait_for
 from tests.sgsst_core.files.formats.samples import ksplat
+from tests.sgsst_core.files.formats.streamed import archived, streamed
 from tests.small_scenes import wall
 
 #: Maximum growth in bytes of the API process during one test, at its peak.
@@ -40,6 +42,8 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Files:
         write_scene(folder / format.name, scene, format)
         files[format.name] = (folder / format.name).read_bytes()
     files["ksplat"] = ksplat(scene, level=1)
+    levels = streamed([[scene], [scene.subset(torch.arange(20))]])
+    files["zip"] = archived(folder / "zip", levels, "scene/").read_bytes()
     color = bytes([200, 100, 50, 255, 255, 128, 128, 128])
     rows = [struct.pack("<6f", *mean, 0.16, 0.16, 0.01) + color for mean in scene.means.tolist()]
     return {**files, "splat": b"".join(rows)}

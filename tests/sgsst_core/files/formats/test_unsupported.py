@@ -27,11 +27,6 @@ OBJ = b"# Blender\nmtllib cube.mtl\no Cube\n" + b"".join(b"v %d 0 1.5\n" % i for
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "scene.ply", "Run `git lfs pull`"),
         (b"\n<!DOCTYPE html>\n<html><body>404", "scene.ply", "is an HTML page.*Download the scene again"),
         (b"<!DOCTYPE html>\n<title>SuperSplat Viewer</title>", "a.html", "a viewer of SuperSplat.*as PLY or SOG"),
-        (
-            b'{"version":1,"asset":{"generator":"splat-transform"},"lodLevels":2}',
-            "lod-meta.json",
-            "is a streamed SOG.*`splat-transform lod-meta.json scene.ply`",
-        ),
         (b'{"asset":{"version":"1.1"},"geometricError":5}', "tileset.json", "is a tileset of 3D Tiles"),
         (b'{"version":"5.0","totalSplats":1}', "scene.lcc", "of XGRIDS.*`splat-transform scene.lcc scene.ply`"),
         (b"PXR-USDC" + bytes(90), "a.usdc", "is OpenUSD, which is written but not read"),
@@ -82,7 +77,6 @@ def test_text_is_not_taken_for_an_obj_file(tmp_path: Path) -> None:
             ["ckpts/ckpt_6999_rank0.pt", "ckpts/ckpt_29999_rank0.pt", "ckpts/ckpt_29999_rank1.pt"],
             "`sgsst convert {}/ckpts/ckpt_29999_rank0.pt scene.ply`",
         ),
-        (["lod-meta.json", "0_0/meta.json"], "is a streamed SOG. Convert it first: `splat-transform {}/lod-meta.json "),
         ([], "is a folder. Give the file of a scene"),
     ],
 )
