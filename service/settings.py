@@ -80,6 +80,8 @@ class ServiceSettings(BaseSettings):
         url_bytes: Size limit of all inputs that one request names by URL.
         url_seconds: Time limit for fetching all inputs of one request, from the first name lookup to the last byte.
         url_private_addresses: Whether `url_hosts` may have addresses in private networks.
+        embed_origins: Origins whose pages may show shared results in a frame, separated by commas, as in `url_hosts`;
+            empty for none.
         log_format: "json" or "text".
     """
 
@@ -136,9 +138,10 @@ class ServiceSettings(BaseSettings):
     url_bytes: int = Field(1 * GB, gt=0)
     url_seconds: float = Field(120, gt=0)
     url_private_addresses: bool = False
+    embed_origins: str = ""
     log_format: str = "text"
 
-    @field_validator("url_hosts")
+    @field_validator("url_hosts", "embed_origins")
     @classmethod
     def _check_hosts(cls, text: str) -> str:
         parse_origins(text)
@@ -176,6 +179,12 @@ class ServiceSettings(BaseSettings):
     def retention_seconds(self) -> float:
         """Duration of `retention_days` in seconds."""
         return self.retention_days * 86_400.0
+
+    @property
+    def frame_ancestors(self) -> str:
+        """Sources of Content-Security-Policy that may show shared results in a frame."""
+        origins = sorted(parse_origins(self.embed_origins))
+        return " ".join(f"{scheme}://{host}:{port}" for scheme, host, port in origins) or "'none'"
 
     @property
     def on_loopback(self) -> bool:

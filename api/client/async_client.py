@@ -269,15 +269,20 @@ class AsyncClient:
         """Queue a failed, canceled or stopped job again."""
         return await self.act(job_id, Transition.RETRY)
 
-    async def share(self, job_id: str, days: float = 7.0) -> dict[str, Any]:
-        """Create a read-only link to a result; `url` is its address.
+    async def share(self, job_id: str, days: float = 7.0, *, poster: bool = False) -> dict[str, Any]:
+        """Create a read-only link to a result; `url` is its address, `embed_url` that for a frame in another page.
 
         Args:
             days: Lifetime of the link, from a minute (1 / 1440) to 90.
         """
-        response = await self._transport.call("POST", f"{_job_path(job_id)}/shares", json={"days": days})
+        body = {"days": days, "poster": poster}
+        response = await self._transport.call("POST", f"{_job_path(job_id)}/shares", json=body)
         share: dict[str, Any] = response.json()
-        return share | {"url": f"{self.url}/shared#{share['url'].partition('#')[2]}"}
+        for name in ("url", "embed_url"):
+            if share.get(name):
+                share[name] = f"{self.url}/shared{share[name].rpartition('/shared')[2]}"
+        return share
+            poster: Whether sites where the link is posted can show an image of the result.
 
     async def shares(self, job_id: str) -> list[dict[str, Any]]:
         """Return the links to a result that have not expired, without their addresses."""

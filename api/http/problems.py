@@ -28,7 +28,7 @@ MEDIA_TYPE = "application/problem+json"
 _TITLES = {460: "Checksum Mismatch"}
 METHODS = ("GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS")
 #: Start of paths that contain the token of a share.
-_SHARED = "/v1/shared/"
+_SHARED = ("/v1/shared/", "/shared/")
 #: Maximum number of characters of an input that a problem document quotes.
 _SHOWN = 100
 

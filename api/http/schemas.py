@@ -416,7 +416,7 @@ class JobChange(BaseModel):
 class NewShare(BaseModel):
     """Share link to create for the result of a job."""
 
-    model_config = _strict(days=7)
+    model_config = _strict(days=7, poster=False)
 
     days: float = Field(
         7.0,
@@ -431,6 +431,12 @@ class NewShare(BaseModel):
 class ShareView(BaseModel):
     """A link to the result of a job."""
 
+    poster: bool = Field(
+        False,
+        strict=True,
+        description="Whether the token is in the path of the link, so that sites and messengers where it is posted can "
+        "show an image of the result.",
+    )
     model_config = _with_example(id=SHARE_ID, created_at=_CREATED, expires_at=_NOW)
 
     id: str
@@ -441,11 +447,18 @@ class ShareView(BaseModel):
 class ShareCreated(ShareView):
     """A new link to the result of a job, with its token."""
 
-    model_config = _with_example(**example_of(ShareView), url=f"/shared#{SHARE_TOKEN}")
+    model_config = _with_example(
+        **example_of(ShareView), url=f"/shared#{SHARE_TOKEN}", embed_url=f"/shared?embed=1#{SHARE_TOKEN}"
+    )
 
     url: str = Field(
         description="Address of the page, on this service. The part after # is the token, which is not stored: "
-        "browsers send it to this service only, in the path of `/v1/shared/{token}`."
+        "browsers send it to this service only, in the path of `/v1/shared/{token}`. With `poster`, the token is the "
+        "last part of the path."
+    )
+    embed_url: str | None = Field(
+        description="Address for a frame in another page: the viewer alone. Null unless the operator allows it "
+        "(`SGSST_EMBED_ORIGINS`)."
     )
 
 

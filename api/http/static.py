@@ -29,6 +29,7 @@ from api.http.sending import names_etag
 from api.static_files import FOLDER, read_static
 from service import problems
 from service.deadlines import suspended
+from service.settings import ServiceSettings
 
 #: Placeholder in pages for the URL prefix of the files.
 _PREFIX = b"{{static}}"
@@ -49,6 +50,8 @@ POLICY = (
 #: Content-Security-Policy of `/docs`. Swagger UI's style sheet has inline icons.
 DOCS_POLICY = POLICY.replace("img-src 'self' blob:", "img-src 'self' data:")
 _PAGES = {"/": ("index.html", POLICY), "/shared": ("shared.html", POLICY), "/docs": ("docs.html", DOCS_POLICY)}
+#: Headers of pages: neither other sites nor scripts of other types get anything from them.
+PAGE_HEADERS = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
 #: Start of the names of the example's files.
 EXAMPLE = "example/"
 #: Acceptance of gzip in an Accept-Encoding header; `q=0` refuses it.
@@ -138,6 +141,8 @@ def add_static(app: FastAPI) -> None:
 
     async def get_page(request: Request) -> Response:
         name, policy = _PAGES[path_of(request.scope)]
+        if name == "shared.html":
+            policy = shared_policy(request, app.state.context.settings)
         return _answer(request, static.pages[name], "no-cache", policy)
 
     async def get_file(request: Request, digest: str, name: str) -> Response:
@@ -154,6 +159,19 @@ def add_static(app: FastAPI) -> None:
     app.add_api_route("/static/{digest}/{name:path}", get_file, **options)  # type: ignore[arg-type]
 
 
+def shared_policy(request: Request, settings: ServiceSettings) -> str:
+    """Return the policy of the page of a shared result; with `embed=1`, permitted origins may show it in a frame."""
+    if request.query_params.get("embed") != "1":
+        return POLICY
+    return POLICY.replace("frame-ancestors 'none'", f"frame-ancestors {settings.frame_ancestors}")
+
+
+def shared_page(head: str) -> bytes:
+    """Return the page of a shared result for addresses one folder deeper than `/shared`, with more in its head."""
+    body = static_files().pages["shared.html"].body
+    return body.replace(b'"static/', b'"../static/').replace(b"</head>", f"{head}</head>".encode())
+
+
 def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Response:
     accepted = _GZIP.search(request.headers.get("accept-encoding", ""))
     compressed = file.compressed if accepted else None
@@ -163,8 +181,7 @@ def _answer(request: Request, file: StaticFile, caching: str, policy: str) -> Re
         "Cache-Control": caching,
         "Vary": "Accept-Encoding",
         "Content-Security-Policy": policy,
-        "X-Content-Type-Options": "nosniff",
-        "Referrer-Policy": "no-referrer",
+        **PAGE_HEADERS,
     }
     if names_etag(request.headers.get("if-none-match"), tag):
         return Response(status_code=304, headers=response_headers)

@@ -12,13 +12,14 @@ export class ShareCard {
   constructor(id) {
     this.path = `v1/jobs/${id}/shares`;
     this.days = h("select", { "aria-label": say.lifetime }, DAYS.map((days) => h("option", { value: days, selected: days === 7 }, say.days(days))));
+    this.poster = h("input", { type: "checkbox" });
     this.link = h("div");
     /** Id of the share whose link is shown. */
     this.linked = "";
     this.list = h("ul.files");
     this.wrong = h("p.wrong", { hidden: true, role: "alert" });
     this.element = h("section.card.share", h("h2", say.title), h("p.help", say.help),
-      h("div.row", h("button.quiet", { type: "button", onclick: () => this.act(() => this.create()) }, say.create), this.days), this.link, this.list, this.wrong);
+      h("div.row", h("button.quiet", { type: "button", onclick: () => this.act(() => this.create()) }, say.create), this.days), h("label.option.inline", this.poster, h("span", say.poster)), this.link, this.list, this.wrong);
     this.act(() => this.show());
   }
 
@@ -34,11 +35,12 @@ export class ShareCard {
   }
 
   async create() {
-    const { id, url } = await (await ask("POST", this.path, { json: { days: Number(this.days.value) } })).json();
-    const input = h("input", { type: "text", readOnly: true, value: new URL(`shared${url.slice(url.indexOf("#"))}`, location.href).href, "aria-label": say.link, onfocus: () => input.select() });
+    const { id, url, embed_url: frame } = await (await ask("POST", this.path, { json: { days: Number(this.days.value), poster: this.poster.checked } })).json();
+    const at = (/** @type {string} */ path) => new URL(path.slice(path.lastIndexOf("/shared") + 1), location.href).href;
+    const link = copied(say.link, at(url));
     this.linked = id;
-    put(this.link, h("div.row", input, h("button.primary", { type: "button", onclick: () => copy(input) }, say.copy)), h("p.help", say.once));
-    input.focus();
+    put(this.link, link, frame ? copied(say.frame, say.iframe(at(frame))) : null, h("p.help", say.once));
+    link.querySelector("input")?.focus();
     await this.show();
   }
 
@@ -55,6 +57,12 @@ export class ShareCard {
     announce(say.revoked);
     await this.show();
   }
+}
+
+/** Return a text with a button that copies it. @param {string} name @param {string} value */
+function copied(name, value) {
+  const input = h("input", { type: "text", readOnly: true, value, "aria-label": name, title: name, onfocus: () => input.select() });
+  return h("div.row", input, h("button.primary", { type: "button", title: name, onclick: () => copy(input) }, say.copy));
 }
 
 /** Copy the text of an input; without a secure context, browsers have no other way than the selection. @param {HTMLInputElement} input */

@@ -218,7 +218,7 @@ export const words = {
   strengths: { legend: "Style strength", titles: /** @type {Record<string, string>} */ ({ light: "Light", balanced: "Balanced", strong: "Strong" }) },
   share: {
     title: "Share", help: "Anyone with the link can see this result in 3D, before and after, but nothing else.", create: "Create a link", lifetime: "Link expires after", days: (/** @type {number} */ n) => several(n, "day"),
-    link: "Link to this result", copy: "Copy", copied: "Copied.", once: "Copy the link now; it won't be shown again.", until: (/** @type {string} */ at) => `Works until ${at}`, revoke: "Revoke", revokeOf: (/** @type {string} */ at) => `Revoke the link until ${at}`, revoked: "The link no longer works.",
+    link: "Link to this result", copy: "Copy", copied: "Copied.", once: "Copy it now; it won't be shown again.", poster: "Show an image where the link is posted", frame: "HTML for your web page", iframe: (/** @type {string} */ url) => `<iframe src="${url}" title="3D scene" width="800" height="450" style="border: 0" loading="lazy" allow="fullscreen; xr-spatial-tracking"></iframe>`, until: (/** @type {string} */ at) => `Works until ${at}`, revoke: "Revoke", revokeOf: (/** @type {string} */ at) => `Revoke the link until ${at}`, revoked: "The link no longer works.",
   },
   shared: { title: "Shared result", until: (/** @type {string} */ at) => `Shared until ${at}`, gone: "This link doesn't work" },
   signIn: { title: "Sign in", heading: "Sign in", lead: "This service requires an API key.", expired: "Your session has expired, or you signed out in another tab. Sign in to continue where you were.", where: "Enter your API key. Ask your administrator for one.", key: "API key", go: "Sign in", wrong: "That key isn't valid.", out: "You signed out." },

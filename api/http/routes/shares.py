@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import html
 from dataclasses import replace
 from typing import Annotated
 
@@ -18,8 +19,10 @@ from api.http.routes.inputs import INPUT_POLICY, find_input, input_file
 from api.http.routes.jobs import JobId, find
 from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, share_view
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file
+from api.http.static import PAGE_HEADERS, shared_page, shared_policy
 from service import problems
-from service.errors import NoJobError, NoShareError
+from service.errors import NoJobError, NoShareError, ServiceError
+from service.files.artifacts import media_type
 from service.problems import SHARE_ID, SHARE_TOKEN
 from service.store.access import Shared
 from service.store.quotas import Quotas
@@ -27,8 +30,8 @@ from service.store.quotas import Quotas
 router = APIRouter(tags=["shares"])
 
 _DAY = 86_400.0
-#: Results that a share shows.
-_RESULTS = ("colors.f16", "stylized.ply")
+#: Results that a share shows, with the names of their artifacts.
+_RESULTS = {"colors.f16": "colors.f16", "stylized.ply": "stylized.ply", "poster": "previews/thumbnail.jpg"}
 #: Parameters of a job that matter for rendering.
 _RENDERED = ("background", "near", "render_mode", "eps2d", "sh_attenuation")
 #: Media type of shared files.
@@ -85,7 +88,10 @@ async def create_share(
     """
     await asyncio.to_thread(find, context, caller, job_id)
     row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
-    view = ShareCreated(**share_view(row).model_dump(), url=address(f"/shared#{token}"))
+    place = f"/{token}" if new.poster else f"#{token}"
+    view = ShareCreated(**share_view(row).model_dump(), url=address(f"/shared{place}"), embed_url=None)
+    if context.settings.embed_origins:
+        view.embed_url = address(f"/shared{place}?embed=1" if new.poster else f"/shared?embed=1{place}")
     return Response(view.model_dump_json(), 201, {"Cache-Control": "no-store"}, media_type="application/json")
 
 
@@ -135,7 +141,7 @@ def _shared_view(context: Context, shared: Shared) -> SharedView:
     jobs, job_id = context.store.jobs, shared.job.id
     try:
         job, _ = jobs.detail(job_id, None)
-        files = [name for name in _RESULTS if jobs.artifact(job_id, name)]
+        files = [name for name, artifact in _RESULTS.items() if jobs.artifact(job_id, artifact)]
     except NoJobError:
         raise problems.NO_SHARE() from None
     return SharedView(
@@ -147,9 +153,37 @@ def _shared_view(context: Context, shared: Shared) -> SharedView:
     )
 
 
+@router.get("/shared/{token}", include_in_schema=False)
+async def show_page(request: Request, context: ContextDep, token: ShareToken) -> Response:
+    """Return the page of a link with its token in the path: its head names the image for those who preview links."""
+    head, status = "", 200
+    try:
+        shared = await get_shared(request, context, token)
+        head = await asyncio.to_thread(_preview_tags, request, context, shared, token)
+    except ServiceError as problem:  # the page asks again, and shows the message
+        status = problem.status
+    answer_headers = {**PAGE_HEADERS, **_SECRET, "Content-Security-Policy": shared_policy(request, context.settings)}
+    return Response(shared_page(head), status, answer_headers, media_type="text/html; charset=utf-8")
+
+
+def _preview_tags(request: Request, context: Context, shared: Shared, token: str) -> str:
+    """Return the tags of the Open Graph protocol, whose addresses are absolute."""
+    tags = {"og:type": "website", "og:title": shared.job.name}
+    if context.store.jobs.artifact(shared.job.id, _RESULTS["poster"]):
+        poster = address(f"/v1/shared/{token}/poster")
+        tags |= {
+            "og:image": f"{request.url.scheme}://{request.url.netloc}{poster}",
+            "twitter:card": "summary_large_image",
+        }
+    return "".join(f'<meta property="{name}" content="{html.escape(value)}">\n' for name, value in tags.items())
+
+
 #: Files that a share gives access to: the scene and its cameras as they were sent, and the result.
-_NAMES = r"^(scene|cameras:[0-7]|colors\.f16|stylized\.ply)$"
-_ANSWERS = file_answers({"application/octet-stream": "ply\nformat binary_little_endian 1.0\n"}, always_policy=True)
+_NAMES = r"^(scene|cameras:[0-7]|colors\.f16|stylized\.ply|poster)$"
+_ANSWERS = file_answers(
+    {"application/octet-stream": "ply\nformat binary_little_endian 1.0\n", "image/jpeg": "\xff\xd8\xff\xe0"},
+    always_policy=True,
+)
 
 
 @router.head("/v1/shared/{token}/{name}", operation_id="head_shared_file", response_class=Response, responses=_ANSWERS)
@@ -161,7 +195,8 @@ async def get_shared_file(
     name: Annotated[
         str,
         Path(
-            description="`scene` and `cameras:0` as they were sent, `colors.f16` or `stylized.ply` as stylized.",
+            description="`scene` and `cameras:0` as they were sent, `colors.f16` or `stylized.ply` as stylized, or "
+            "`poster`, an image of the result.",
             pattern=_NAMES,
             examples=["scene"],
         ),
@@ -187,6 +222,7 @@ def _find_file(context: Context, shared: Shared, name: str) -> SentFile:
     if entry is not None:
         if blob := context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"]):
             return input_file(context, shared.job.owner, blob, name, _KIND)
-    elif row := context.store.jobs.artifact(shared.job.id, name):
-        return replace(artifact_file(context, shared.job.owner, row, name, _KIND), policy=INPUT_POLICY)
+    elif row := context.store.jobs.artifact(shared.job.id, _RESULTS.get(name, name)):
+        kind = media_type(row.name) if name == "poster" else _KIND
+        return replace(artifact_file(context, shared.job.owner, row, name, kind), policy=INPUT_POLICY)
     raise problems.NO_SHARED_FILE(name=name)

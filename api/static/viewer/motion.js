@@ -10,7 +10,7 @@ const TURNS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
 /** Movements by keys along right, down and forward. @type {Record<string, number[]>} */
 const STEPS = { a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0], w: [0, 0, 1], s: [0, 0, -1] };
 /** Radians per second, and scene radii per second; factors while Shift and Ctrl are held. */
-const TURN_SPEED = 1.5, STEP_SPEED = 0.8, FAST = 4, SLOW = 0.25;
+const TURN_SPEED = 1.5, SPIN_SPEED = 0.2, STEP_SPEED = 0.8, FAST = 4, SLOW = 0.25;
 /** CSS pixels of a drag per radian. */
 const PIXELS_PER_RADIAN = 180;
 /** Milliseconds in which a glide loses two thirds of its speed, and speed in CSS pixels per millisecond where it ends. */
@@ -31,6 +31,8 @@ export class Motion {
     this.speed = null;
     /** @type {{from: Vector, to: Vector, left: number} | null} */
     this.turning = null;
+    /** Whether the camera rotates about the scene by itself. */
+    this.spinning = false;
     this.requested = 0;
     this.last = 0;
   }
@@ -82,9 +84,16 @@ export class Motion {
     this.start();
   }
 
+  /** Rotate about the scene until `stop`. */
+  spin() {
+    this.spinning = !stillness();
+    this.start();
+  }
+
   stop() {
     this.held.clear();
     this.speed = this.turning = null;
+    this.spinning = false;
   }
 
   start() {
@@ -98,7 +107,7 @@ export class Motion {
     this.requested = 0;
     const milliseconds = Math.min(MAX_FRAME, Math.max(MIN_FRAME, now - this.last));
     this.last = now;
-    if (this.viewer.ended || (!this.held.size && !this.speed && !this.turning)) return;
+    if (this.viewer.ended || (!this.held.size && !this.speed && !this.turning && !this.spinning)) return;
     this.advance(milliseconds);
     this.viewer.moved();
     this.requested = requestAnimationFrame((next) => this.step(next));
@@ -111,6 +120,7 @@ export class Motion {
       if (TURNS[key]) camera.turn(TURNS[key][0] * TURN_SPEED * seconds, TURNS[key][1] * TURN_SPEED * seconds, this.orbit);
       else camera.move(times(STEPS[key], STEP_SPEED * camera.size * seconds));
     }
+    if (this.spinning) camera.turn(SPIN_SPEED * seconds, 0, true);
     if (speed) {
       this.drag(speed.x * milliseconds, speed.y * milliseconds, speed.pans);
       const rest = Math.exp(-milliseconds / GLIDE);

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,13 +22,13 @@ from tests.api.conftest import KEYED, Services
 from tests.api.service import Service, check_documented
 from tests.small_scenes import wall, write_files
 
-PLY, COLORS = b"ply\nstylized", b"\0\1" * 9
+PLY, COLORS, THUMBNAIL = b"ply\nstylized", b"\0\1" * 9, b"\xff\xd8\xff\xe0"
 
 
 @pytest.fixture(scope="module")
 def service(services: Services) -> Service:
-    """Return an API process that requires keys, without a dispatcher."""
-    return services(**KEYED)
+    """Return an API process that requires keys and may be embedded, without a dispatcher."""
+    return services(**KEYED, SGSST_EMBED_ORIGINS="gallery.example, http://localhost:3000")
 
 
 @pytest.fixture
@@ -58,8 +59,14 @@ def finished(client: httpx2.Client, service: Service, store: Store, files: dict[
     artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
     while (lease := store.leases.take("test")) is not None:
         results = []
-        for name, content in (("stylized.ply", PLY), ("colors.f16", COLORS), ("report.json", b"{}")):
-            path = folder / name
+        contents = {
+            "stylized.ply": PLY,
+            "colors.f16": COLORS,
+            "report.json": b"{}",
+            "previews/thumbnail.jpg": THUMBNAIL,
+        }
+        for name, content in contents.items():
+            path = folder / Path(name).name
             path.write_bytes(content)
             results.append(artifacts.put(lease.job_id, lease.epoch, name, path))
         store.leases.start(lease)
@@ -93,7 +100,7 @@ def test_link_shows_the_result_and_nothing_else(
         "expires_at": view["expires_at"],
         "parameters": {"background": [1.0, 1.0, 1.0]},
         "cameras": ["cameras.json"],
-        "files": ["colors.f16", "stylized.ply"],
+        "files": ["colors.f16", "stylized.ply", "poster"],
     }
     for name, content in (
         ("scene", files["scene"].read_bytes()),
@@ -115,6 +122,50 @@ def test_link_shows_the_result_and_nothing_else(
     listed = me.get(f"/v1/jobs/{job_id}/shares").json()["shares"]
     assert [each["id"] for each in listed] == [view["id"]]
     assert token.partition(".")[2] not in json.dumps(listed)
+
+
+def test_link_with_poster_names_its_image(
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    job_id = finished(me, service, store, files, tmp_path)
+    assert me.patch(f"/v1/jobs/{job_id}", json={"name": 'my "<wall>"'}).status_code == 200
+    view = me.post(f"/v1/jobs/{job_id}/shares", json={"poster": True}).json()
+    path, token = view["url"], view["url"].rpartition("/")[2]
+    assert path == f"/shared/{token}"
+    assert view["embed_url"] == f"{path}?embed=1"
+    page = visitor.get(path)
+    assert page.headers["referrer-policy"] == "no-referrer"
+    assert page.headers["cache-control"] == "no-store"
+    assert '<meta property="og:title" content="my &quot;&lt;wall&gt;&quot;">' in page.text
+    (image,) = re.findall(r'<meta property="og:image" content="(.*?)">', page.text)
+    assert image == f"{service.url}/v1/shared/{token}/poster"
+    poster = httpx2.get(image)  # as the server of a social network does
+    assert (poster.content, poster.headers["content-type"]) == (THUMBNAIL, "image/jpeg")
+    (script,) = re.findall(r'<script type="module" src="(.*?)">', page.text)
+    assert visitor.get(f"/shared/{script}").status_code == 200
+    proxied = visitor.get(path, headers={"Host": 'x"><script>'})
+    assert "<script>" not in proxied.text.partition("og:image")[2].partition("</head>")[0]
+    (row,) = me.get(f"/v1/jobs/{job_id}/shares").json()["shares"]
+    assert me.delete(f"/v1/jobs/{job_id}/shares/{row['id']}").status_code == 204
+    revoked = visitor.get(path)
+    assert (revoked.status_code, "og:" in revoked.text, "shared.js" in revoked.text) == (404, False, True)
+    assert_missing(visitor.get(f"/v1/shared/{token}/poster"))
+    assert token not in service.log.read_text()
+
+
+def test_only_permitted_sites_may_frame_a_link(
+    service: Service, services: Services, store: Store, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    job_id = finished(me, service, store, files, tmp_path)
+    hidden, posted = (me.post(f"/v1/jobs/{job_id}/shares", json={"poster": poster}).json() for poster in (False, True))
+    assert hidden["embed_url"].startswith("/shared?embed=1#shr_")
+    for view in (hidden, posted):
+        page, frame = (me.get(view[name]).headers["content-security-policy"] for name in ("url", "embed_url"))
+        assert page.endswith("; frame-ancestors 'none'")
+        assert frame == page.removesuffix("'none'") + "http://localhost:3000 https://gallery.example:443"
+    with services(**KEYED).client() as other:  # which permits none
+        assert other.get("/shared?embed=1").headers["content-security-policy"].endswith("frame-ancestors 'none'")
+    assert me.get("/?embed=1").headers["content-security-policy"].endswith("frame-ancestors 'none'")
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,40 @@
-"""Test of sharing a result: the link opens its viewer without a key, until it is revoked."""
+"""Tests of sharing a result: the link opens its viewer without a key, in frames of permitted sites too."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
+from typing import Any
 
 import pytest
 
 from tests.api.page.actions import STEPS, Visit, done, submit
+from tests.api.page.browser import Watched
 from tests.api.service import Service
+from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.slow
+#: Script that waits until the 3D view has drawn more frames than a number.
+_FRAMES = """(most) => new Promise((done) => {
+  const stage = document.querySelector(".stage");
+  new MutationObserver((_, watch) => stage.dataset.frames > most && done(watch.disconnect()))
+    .observe(stage, { attributes: true });
+})"""
 
 
-def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    job_id = done(service, submit(service, files, **(STEPS | {"steps_sos": 2}), name="my wall"))
+@pytest.fixture(scope="module")
+def job_id(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the id of a finished job."""
+    ply, file, style = write_files(tmp_path_factory.mktemp("files"), wall(sh_degree=1), cameras(3, 96, 72))
+    files = {"scene": ply, "cameras": file, "style": style}
+    return done(service, submit(service, files, **(STEPS | {"steps_sos": 2}), name="my wall"))
+
+
+def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: Service, job_id: str) -> None:
     watched = visit(f"/#/jobs/{job_id}")
     page = watched.page
     page.get_by_label("Link expires after").select_option("1")
@@ -49,3 +70,66 @@ def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: S
     other.page.get_by_role("heading", name="This link doesn't work").wait_for()
     other.check("404")
     watched.check()
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[tuple[int, Path]]:
+    """Yield the port and the folder of another site."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(tmp_path)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield server.server_port, tmp_path
+    server.shutdown()
+    server.server_close()
+
+
+def test_permitted_site_shows_a_link_in_a_frame(
+    visit: Visit, browser: Any, service: Service, job_id: str, site: tuple[int, Path]
+) -> None:
+    port, folder = site
+    settings = {"SGSST_CACHE": service.environment["SGSST_CACHE"], "SGSST_EMBED_ORIGINS": f"http://localhost:{port}"}
+    with Service(service.data, alone=True, **settings) as permitting:
+        watched = Watched(browser, permitting.url)
+        watched.page.goto(f"{permitting.url}/#/jobs/{job_id}")
+        watched.page.get_by_label("Show an image where the link is posted").check()
+        watched.page.get_by_role("button", name="Create a link").click()
+        snippet = watched.page.get_by_label("HTML for your web page", exact=True).input_value()
+        link = watched.page.get_by_label("Link to this result", exact=True).input_value()
+        watched.check()
+        watched.context.close()
+        assert re.fullmatch(rf"{permitting.url}/shared/shr_[^/#]+", link)
+        gallery, page = folder / "gallery.html", f"http://localhost:{port}/gallery.html"
+        gallery.write_text(snippet)
+
+        still = browser.new_page(reduced_motion="reduce")
+        still.goto(page)
+        frame = still.frame_locator("iframe")
+        frame.locator("canvas[data-state=settled]").wait_for()
+        assert frame.locator(":is(.top, .tools, .head, .poster):visible").count() == 0, "nothing but the scene"
+        still.close()
+
+        rotating, scenes, referrers = browser.new_page(), list[Any](), list[str]()
+        rotating.on("request", lambda request: referrers.append(request.headers.get("referer", "")))
+        rotating.route("**/v1/shared/*/scene", lambda route: scenes.append(route))
+        with rotating.expect_request("**/v1/shared/*/scene"):
+            rotating.goto(page)
+        frame = rotating.frame_locator("iframe")
+        frame.locator(".poster").wait_for()
+        scenes.pop().continue_()
+        frame.locator(".poster").wait_for(state="detached")
+        count = int(frame.locator(".stage").get_attribute("data-frames") or 0)
+        rotating.frames[1].evaluate(_FRAMES, count + 20)
+        frame.locator("canvas").first.click(position={"x": 60, "y": 60})  # beside the divider
+        frame.locator("canvas[data-state=settled]").wait_for()
+        assert not [referrer for referrer in referrers if "shr_" in referrer]
+        rotating.close()
+
+        for address, embedded in (
+            (page.replace("localhost", "127.0.0.1"), snippet),  # another origin
+            (page, snippet.replace("?embed=1", "")),
+            (page, snippet.replace(permitting.url, service.url)),
+        ):
+            gallery.write_text(embedded)
+            refused = browser.new_page()
+            with refused.expect_console_message(lambda message: "frame-ancestors" in message.text):
+                refused.goto(address)
+            refused.close()
