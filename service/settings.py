@@ -73,7 +73,7 @@ class ServiceSettings(BaseSettings):
         preview_seconds: Interval between preview images of a running job; its log is updated as often if it has grown.
         stop_seconds: Time that a job has for stopping before it is killed.
         poll_seconds: Interval between a dispatcher's searches for jobs to start, stop or clean up after.
-        webhooks: Whether jobs may name a URL that is notified when they end.
+        webhooks: Whether jobs may name a URL that gets messages about them.
         webhook_private_addresses: Whether webhook URLs may lead to private networks.
         url_hosts: Hosts that inputs named by URL may be fetched from, separated by commas; empty for none. `HOST` means
             `https://HOST`; other schemes and ports are written out, as in `http://minio:9000`.

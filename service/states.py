@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal
 
 
 class JobStatus(StrEnum):
@@ -56,6 +57,9 @@ class Transition(StrEnum):
     #: The retention time of the results is over.
     EXPIRE = "expire"
 
+
+#: Event of a job about which its webhook can get a message.
+WebhookEvent = Literal["started", "progress", "completed"]
 
 _S = JobStatus
 #: States in which a dispatcher works toward the job's result.

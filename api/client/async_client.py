@@ -74,6 +74,7 @@ class AsyncClient:
         photos: str | Path | None = None,
         masks: Mapping[str, str | Path] | None = None,
         webhook: str | None = None,
+        webhook_events: Sequence[str] = (),
         progress: Progress = no_progress,
         **parameters: Any,
     ) -> Job:
@@ -87,7 +88,8 @@ class AsyncClient:
             photos: Folder of photos for the content term; None for unstylized renders.
             masks: Mask files, or folders of mask images, by the names that the parameter `regions` gives them
                 (`mask=NAME`, `masks=NAME`).
-            webhook: URL that is called when the job has ended; None for none.
+            webhook: URL that gets a message when the job has ended; None for none.
+            webhook_events: Messages that it gets instead: of "started", "progress", "completed".
             progress: Callback that receives the uploaded bytes and the total bytes of all large files.
             parameters: Fields of `JobParameters`; those that are None are not sent.
 
@@ -95,7 +97,9 @@ class AsyncClient:
             RequestError: If an input cannot be used; the message says which and why.
         """
         files = _files(scene, style, cameras, photos, masks)
-        created = await uploads.create_job(self._transport, files, parameters, webhook=webhook, progress=progress)
+        given = {"webhook": webhook, "webhook_events": ",".join(webhook_events)}
+        sent = {name: value for name, value in given.items() if value}
+        created = await uploads.create_job(self._transport, files, parameters, sent, progress)
         return Job.of(created)
 
     async def plan(
@@ -274,6 +278,7 @@ class AsyncClient:
 
         Args:
             days: Lifetime of the link, from a minute (1 / 1440) to 90.
+            poster: Whether sites where the link is posted can show an image of the result.
         """
         body = {"days": days, "poster": poster}
         response = await self._transport.call("POST", f"{_job_path(job_id)}/shares", json=body)
@@ -282,7 +287,6 @@ class AsyncClient:
             if share.get(name):
                 share[name] = f"{self.url}/shared{share[name].rpartition('/shared')[2]}"
         return share
-            poster: Whether sites where the link is posted can show an image of the result.
 
     async def shares(self, job_id: str) -> list[dict[str, Any]]:
         """Return the links to a result that have not expired, without their addresses."""

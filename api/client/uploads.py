@@ -66,12 +66,11 @@ def _read_part(path: Path, offset: int) -> tuple[bytes, dict[str, str]]:
 
 
 async def create_job(
-    transport: Transport, files: JobFiles, parameters: Mapping[str, Any], *, webhook: str | None, progress: Progress
+    transport: Transport, files: JobFiles, parameters: Mapping[str, Any], webhook: Mapping[str, str], progress: Progress
 ) -> dict[str, Any]:
     """Submit a job, and return the service's response; see `AsyncClient.submit`."""
     fields = await _send_files(transport, files, parameters, progress)
-    if webhook:
-        fields.append(("webhook", (None, webhook)))
+    fields += [(name, (None, value)) for name, value in webhook.items()]
     headers = {"Idempotency-Key": secrets.token_hex(16)}
     created: dict[str, Any] = (await transport.call("POST", "/v1/jobs", files=fields, headers=headers)).json()
     return created

@@ -38,7 +38,7 @@ MAX_TEXT = 1 << 16
 MEDIA_TYPES = "multipart/form-data or application/json"
 #: Maximum bytes of a small JSON body.
 _MAX_SMALL = 4096
-_TEXT_FIELDS = ("parameters", "webhook")
+_TEXT_FIELDS = ("parameters", "webhook", "webhook_events")
 #: Maximum number of headers of a part, and bytes of each. They hold the file's role and name.
 _MAX_HEADERS, _MAX_HEADER = 8, 4224
 #: Minimum rate of a body in bytes per second, averaged from its start, after the first `receive_seconds`.

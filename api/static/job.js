@@ -90,7 +90,7 @@ export class JobView {
     const { name, status } = this.job;
     try {
       const job = await get(`v1/jobs/${this.id}`, this.leaving.signal);
-      if (job.name === name && job.status === status) return;
+      if (job.name === name && job.status === status && status !== "queued") return; // its position changes without an event
       if (status === "succeeded" && UNFINISHED.has(job.status)) return reopen();
       this.use(job);
       if (UNFINISHED.has(job.status) && !UNFINISHED.has(status)) this.watch();

@@ -21,7 +21,7 @@ from service.scheduling.machine import Machine
 from service.store.tables import JobRow
 from sgsst_core.errors import SettingsError
 from sgsst_core.settings import Settings, make_settings
-from worker.ranks.cluster import GAUSSIAN_BYTES, memory_beside_gpus, scene_bytes
+from worker.ranks.memory import GAUSSIAN_BYTES, memory_beside_gpus, scene_bytes
 
 #: Maximum fractions of the machine's memory that all concurrent jobs together, and each of them, may plan with. The
 #: latter equals the default of a job that runs alone (`sgsst_core.budget`), so that both round in the same way.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import queue
 import shutil
 import threading
@@ -48,6 +49,8 @@ _FILE_SECONDS = 60.0
 #: Seconds between writes of progress: in the first minute, and for long-running jobs. More frequent writes would go
 #: unnoticed, and on a large fleet they are most of the database's load.
 _PROGRESS_SECONDS = (1.0, 5.0)
+#: Minimum seconds between messages about progress to a job's webhook.
+_NOTIFIED_SECONDS = 5.0
 
 T = TypeVar("T")
 
@@ -286,6 +289,8 @@ class ProgressWriter:
     def __init__(self, lease: Lease, store: Store) -> None:
         self._lease, self._store = lease, store
         self._started_at, self._written_at = time.monotonic(), 0.0
+        #: Time of the last message to the job's webhook; infinite if it gets none.
+        self._notified_at = 0.0 if "progress" in (lease.job.webhook_events or ()) else math.inf
         self._pending: Progress | None = None
         self._ends_at: float | None = None
 
@@ -300,7 +305,10 @@ class ProgressWriter:
         time_now = time.monotonic()
         due = time_now - self._written_at >= progress_seconds(time_now - self._started_at)
         if self._pending is not None and (now or due):
-            self._store.leases.report_progress(self._lease, self._pending)
+            notify = time_now - self._notified_at >= _NOTIFIED_SECONDS
+            self._store.leases.report_progress(self._lease, self._pending, notify=notify)
+            if notify:
+                self._notified_at = time_now
             self._pending, self._written_at = None, time_now
 
     def holding(self, grant: Grant) -> Holding:

@@ -34,7 +34,7 @@ from service.store.leases import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.atomic import file_digest
-from worker.ranks.cluster import scene_bytes
+from worker.ranks.memory import scene_bytes
 from worker.ranks.rank import Stored
 
 #: Interval between checks for new files to upload, in seconds.

@@ -1,4 +1,4 @@
-"""Webhooks: signed messages about finished jobs (Standard Webhooks, https://www.standardwebhooks.com).
+"""Webhooks: signed messages about jobs (Standard Webhooks, https://www.standardwebhooks.com).
 
 Receivers are not trusted. Each message is sent over its own connection, to a verified address. One deadline covers
 everything from the name lookup to the head of the response, and only the status of the response is read.
@@ -21,6 +21,7 @@ from service import problems
 from service.outgoing import parse_url, send
 from service.settings import ServiceSettings
 from service.store import Store
+from service.store.changes import PROGRESS_MESSAGE
 from service.store.operations import Delivery
 
 #: Delays before further attempts in seconds: the schedule that Standard Webhooks suggests, up to a day.
@@ -115,7 +116,8 @@ class Deliverer:
             error = f"no answer within {_DEADLINE:g} s"
         except Exception as failure:
             error = f"{type(failure).__name__}: {failure}"[:_MAX_REASON]
-        wait = None if error is None or delivery.tries > len(_RETRY_SECONDS) else _RETRY_SECONDS[delivery.tries - 1]
+        is_last = delivery.body.get("type") == PROGRESS_MESSAGE or delivery.tries > len(_RETRY_SECONDS)
+        wait = None if error is None or is_last else _RETRY_SECONDS[delivery.tries - 1]
         if error is not None:
             outcome = "given up" if wait is None else f"retrying in {wait:g} s"
             _log.warning(

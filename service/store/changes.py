@@ -8,15 +8,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import delete, insert, select
+from sqlalchemy import bindparam, delete, insert, select
 from sqlalchemy.orm import Session
 
 from service import problems
-from service.states import Transition, next_status
+from service.states import Transition, WebhookEvent, next_status
 from service.store.clocks import retained_until
 from service.store.database import count, new_id
 from service.store.tables import Base, BlobRow, BlobUseRow, DeliveryRow, EventRow, JobRow
 
+#: Type of messages about progress, which are sent once, and a job's message of this type.
+PROGRESS_MESSAGE = "job.progress"
+_WAITING_PROGRESS = (
+    select(DeliveryRow)
+    .where(DeliveryRow.job_id == bindparam("job_id"), DeliveryRow.body["type"].as_string() == PROGRESS_MESSAGE)
+    .with_for_update()
+)
 _EVENTS = Base.metadata.tables[EventRow.__tablename__]
 
 
@@ -56,11 +63,30 @@ def end(session: Session, job: JobRow, transition: Transition, now: float, reten
     job.lease_owner = job.lease_expires_at = None
     move(session, job, transition, now)
     count(session, "sgsst_jobs_finished_total", f'status="{status}"')
-    if job.webhook:
-        data = {"id": job.id, "name": job.name, "status": status, "error": job.error}
-        body = {"type": f"job.{status}", "timestamp": now, "data": data}
+    for waiting in session.scalars(_WAITING_PROGRESS, {"job_id": job.id}) if job.webhook_events else ():
+        session.delete(waiting)
+    send_webhook(session, job, "completed", status, now)
+
+
+def send_webhook(session: Session, job: JobRow, event: WebhookEvent, kind: str, now: float, **more: Any) -> None:
+    """Queue a message about an event of a job, if its webhook gets such messages; by default only the last one.
+
+    A message about progress replaces the one before if that still waits to be sent.
+
+    Args:
+        kind: Last part of the message's type.
+        more: Further values about the job.
+    """
+    if not job.webhook or event not in (job.webhook_events or ("completed",)):
+        return
+    data = {"id": job.id, "name": job.name, "status": job.status, "error": job.error, **more}
+    body = {"type": f"job.{kind}", "timestamp": now, "data": data}
+    waiting = session.scalar(_WAITING_PROGRESS, {"job_id": job.id}) if event == "progress" else None
+    if waiting is None:
         message_id = new_id("msg", now)
         session.add(DeliveryRow(id=message_id, job_id=job.id, url=job.webhook, body=body, tries=0, next_at=now))
+    elif not waiting.tries:
+        waiting.body = body
 
 
 def add_status_event(session: Session, job: JobRow, now: float) -> None:

@@ -26,7 +26,7 @@ from service.store.tables import Base, CounterRow, IdempotencyRow
 from sgsst_core.errors import SettingsError
 
 #: Version of the newest migration; a database with this version is opened without loading the migrations.
-SCHEMA = "0010"
+SCHEMA = "0011"
 #: Version of the first migration; databases of earlier development versions cannot be migrated.
 _FIRST = "0010"
 MIGRATIONS = Path(__file__).with_name("migrations")

@@ -11,7 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service import problems
-from service.states import ACTIONS, ENDED, UNFINISHED, JobStatus, Transition, allowed, next_status
+from service.states import ACTIONS, ENDED, UNFINISHED, JobStatus, Transition, WebhookEvent, allowed, next_status
 from service.store import job_inputs
 from service.store.changes import add_status_event, end, forget, holder_name, job_of_owner, move
 from service.store.database import Database, count, idempotency_row, new_id
@@ -61,6 +61,7 @@ class NewJob:
     parameters: dict[str, Any]
     inputs: list[dict[str, Any]]
     webhook: str | None = None
+    webhook_events: list[WebhookEvent] | None = None
 
     def row(self, now: float) -> dict[str, Any]:
         """Return the columns of the queued job."""

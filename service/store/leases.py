@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session
 from service import problems
 from service.errors import ServiceError
 from service.states import ACTIVE, AttemptOutcome, JobStatus, Transition
-from service.store.changes import add_event, end, move
+from service.store.changes import add_event, end, move, send_webhook
 from service.store.database import Database, count, observe, upsert
 from service.store.history import add_point
 from service.store.queue import LOST, WAITING, next_jobs, reserve, reserved_by
@@ -238,13 +238,17 @@ class Leases:
         with self._held(lease) as (session, job, now):
             if job.status == JobStatus.STARTING:
                 move(session, job, Transition.START, now)
+                send_webhook(session, job, "started", "started", now, attempt=job.attempt)
                 if job.finish_requested:
                     move(session, job, Transition.FINISH, now)
 
-    def report_progress(self, lease: Lease, progress: Progress) -> None:
+    def report_progress(self, lease: Lease, progress: Progress, *, notify: bool = False) -> None:
         """Replace the job's progress and add it to the loss history (`history`).
 
         This is by far the most frequent write of dispatchers, so it uses as few statements as possible.
+
+        Args:
+            notify: Whether the job's webhook gets a message.
         """
         now = self._database.clock()
         data = {**progress.model_dump(), "attempt": lease.job.attempt, "updated_at": now}
@@ -257,6 +261,9 @@ class Leases:
             add_event(session, lease.job_id, "progress", data, now)
             add_point(session, lease.job_id, data)
             session.execute(_DELETE_OLD_PROGRESS, {"of_job": lease.job_id})
+            if notify:
+                job = session.get_one(JobRow, lease.job_id)
+                send_webhook(session, job, "progress", "progress", now, progress=data)
 
     def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
         """Publish files, replacing those of the same names; return the locations of the replaced files."""

@@ -9,12 +9,14 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, SQLColumnExpression, bindparam, case, delete, func, literal, select
+from sqlalchemy import ColumnElement, SQLColumnExpression, and_, bindparam, case, delete, func, literal, select
 
-from service.states import JobStatus
+from service.states import ACTIVE, JobStatus
 from service.store.database import Database, upsert
-from service.store.tables import CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
+from service.store.job_inputs import counts_and_named
+from service.store.tables import AttemptRow, Base, CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
 
+_JOBS = Base.metadata.tables[JobRow.__tablename__]
 #: Live dispatchers: those with a heartbeat within a lease duration. A heartbeat far in the future comes from a wrong
 #: clock.
 _IS_ALIVE = DispatcherRow.seen_at.between(bindparam("since"), bindparam("until"))
@@ -39,6 +41,21 @@ class Delivery:
     url: str
     body: dict[str, Any]
     tries: int
+
+
+@dataclass(frozen=True)
+class Line:
+    """Jobs that run and wait, in one snapshot.
+
+    Attributes:
+        running: Jobs that dispatchers hold, each with the start of its attempt and the number of its GPUs.
+        queued: First queued jobs by priority and age, with scene, styles and cameras as their inputs.
+        capacity: GPUs, or slots for jobs, of all live dispatchers.
+    """
+
+    running: list[tuple[JobRow, float, int]]
+    queued: list[JobRow]
+    capacity: int
 
 
 def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
@@ -114,6 +131,30 @@ class Operations:
         with self._database.reading() as session:
             rows = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
         return [(progress["step"], progress["seconds"]) for progress in rows if progress and progress.get("seconds")]
+
+    def line(self, most: int) -> Line:
+        """Return the running jobs and up to `most` queued ones, to forecast when those start."""
+        shown = [column for column in _JOBS.c if column.name != "inputs"]
+        attempt = and_(AttemptRow.job_id == _JOBS.c.id, AttemptRow.number == _JOBS.c.attempt)
+        active = (
+            select(*shown, AttemptRow.started_at.label("since"), AttemptRow.gpus)
+            .select_from(_JOBS)
+            .join(AttemptRow, attempt)
+        )
+        queued = select(*shown).where(_JOBS.c.status == JobStatus.QUEUED).limit(most)
+        capacity = select(func.coalesce(func.sum(DispatcherRow.slots), 0)).where(_IS_ALIVE)
+        names = [column.name for column in shown]
+        with self._database.reading_rows() as connection:
+            active_rows = connection.execute(active.where(_JOBS.c.status.in_(ACTIVE))).all()
+            waiting = connection.execute(queued.order_by(_JOBS.c.priority.desc(), _JOBS.c.queued_at, _JOBS.c.id)).all()
+            ids = [row.id for row in (*active_rows, *waiting)]
+            _, inputs = counts_and_named(connection, ids)
+            total = connection.execute(capacity, self._span()).scalar_one()
+
+        def job(row: Any) -> JobRow:
+            return JobRow(**{name: getattr(row, name) for name in names}, inputs=inputs[row.id])
+
+        return Line([(job(row), row.since, row.gpus) for row in active_rows], [job(row) for row in waiting], total)
 
     def webhook_secret(self) -> str:
         """Return the secret that signs webhooks, in the format of Standard Webhooks; it is created on first use."""

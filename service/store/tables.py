@@ -59,6 +59,7 @@ class JobRow(Base):
     result: Mapped[dict[str, Any] | None]
     error: Mapped[dict[str, Any] | None]
     webhook: Mapped[str | None] = mapped_column(Text)
+    webhook_events: Mapped[list[Any] | None]
     lease_epoch: Mapped[int] = mapped_column(Integer, default=0)
     lease_owner: Mapped[str | None] = mapped_column(String(120))
     lease_expires_at: Mapped[float | None] = mapped_column(Float)
@@ -290,7 +291,7 @@ class DeliveryRow(Base):
     __tablename__ = "deliveries"
 
     id: Mapped[str] = mapped_column(String(40), primary_key=True)
-    job_id: Mapped[str] = mapped_column(String(40))
+    job_id: Mapped[str] = mapped_column(String(40), index=True)
     url: Mapped[str] = mapped_column(Text)
     body: Mapped[dict[str, Any]]
     tries: Mapped[int] = mapped_column(Integer, default=0)

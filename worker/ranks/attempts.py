@@ -14,8 +14,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from worker.ranks.cluster import Cluster, scene_bytes
+from worker.ranks.cluster import Cluster
 from worker.ranks.failure_policy import FailedAttempt, Failure, check_retry, first_line
+from worker.ranks.memory import scene_bytes
 from worker.ranks.rank import RankProcess, RankStatus, RankTask, WorkerOptions
 from worker.ranks.rank_group import (
     AttemptFailedError,

@@ -23,9 +23,9 @@ from typing import Any
 import psutil
 
 from sgsst_core.errors import ClusterAwayError, RanksFailedError
-from sgsst_core.files.formats import format_of_name
 from worker.ranks import sweeper
 from worker.ranks.failure_policy import first_line
+from worker.ranks.memory import memory_beside_gpus
 
 #: Size of Ray's object store in bytes. The default is 30 % of all memory, but the store holds almost nothing here:
 #: torch.distributed exchanges tensors, and scenes are read from files.
@@ -346,27 +346,3 @@ def _places(ranks: int, bundle: dict[str, int], deadline: float) -> tuple[Any, .
         else:
             give_back(group)
     return tuple(there)
-
-
-#: Bytes of a Gaussian of SH degree 3 in memory: 62 float32 values.
-GAUSSIAN_BYTES = 248
-#: Bytes that a rank needs in addition to the scene: libraries of CUDA and PyTorch, and pinned buffers.
-_RANK_BYTES = 3_000_000_000
-#: Copies of the scene on a machine while it is loaded: the arrays read from the file, and the shared memory.
-_SCENE_COPIES = 2
-
-
-def scene_bytes(name: str, size: int) -> int:
-    """Estimate the bytes of a scene in memory from its file.
-
-    Args:
-        name: Name of the file; its ending determines the format.
-        size: Size of the file in bytes.
-    """
-    format = format_of_name(name)
-    return size if format is None else size * GAUSSIAN_BYTES // format.bytes_per_gaussian
-
-
-def memory_beside_gpus(ranks: int, scene: int) -> int:
-    """Estimate the host memory in bytes of `ranks` ranks on one machine with a scene of `scene` bytes."""
-    return ranks * _RANK_BYTES + _SCENE_COPIES * scene

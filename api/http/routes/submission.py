@@ -32,8 +32,9 @@ from service.files.staging import MOST_STYLES, check_roles, default_job_name, st
 from service.inspection.inspector import Show
 from service.parameters import JobParameters
 from service.problems import UPLOAD_ID
+from service.scheduling.forecast import expected_starts
 from service.scheduling.webhooks import check_url
-from service.states import JobStatus
+from service.states import JobStatus, WebhookEvent
 from service.store.jobs import Idempotency, NewJob
 from service.store.tables import BlobRow, UploadRow
 from service.weights import check_weights
@@ -46,7 +47,19 @@ _MAX_JSON = 1 << 20
 _PATH = re.compile(r"/v1/jobs/(job_[0-9a-f]{20,40})/inputs/([a-z]{1,10}(?::[0-9]{1,6})?)", re.ASCII)
 
 
-class JobFromUploads(BaseModel):
+class Webhook(BaseModel):
+    """Messages about a job."""
+
+    webhook: str | None = Field(None, max_length=2000, description="URL that gets messages about the job.")
+    webhook_events: list[WebhookEvent] | None = Field(
+        None,
+        min_length=1,
+        description="Messages that it gets: when the job has `started`, about its `progress` (one in 5 s at most), and "
+        "when it has `completed`, well or not. Null: the last one.",
+    )
+
+
+class JobFromUploads(Webhook):
     """A job from files that the service already has, or that it fetches.
 
     Each file is named by the id of its upload (`POST /v1/uploads`), by the path of an input of an earlier job, such as
@@ -78,7 +91,6 @@ class JobFromUploads(BaseModel):
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
     mask: list[str] = Field(default_factory=list, max_length=10_000, description="Masks that `regions` name.")
     parameters: JobParameters = Field(default_factory=JobParameters)
-    webhook: str | None = Field(None, max_length=2000, description="URL to notify when the job ends.")
 
 
 _FILE = {"type": "string", "format": "binary"}
@@ -108,7 +120,11 @@ _FORM = {
             "views in a folder.",
         },
         "parameters": {"type": "string", "description": "JSON: see JobParameters."},
-        "webhook": {"type": "string", "description": "URL to notify when the job ends."},
+        "webhook": {"type": "string", "description": "URL that gets messages about the job."},
+        "webhook_events": {
+            "type": "string",
+            "description": "Messages that it gets, as for JSON, separated by commas: `started,completed`.",
+        },
     },
     "examples": [
         {
@@ -194,7 +210,7 @@ def _find_inputs(
     caller: Caller,
     received: Received,
     parameters: JobParameters,
-    webhook: str | None,
+    webhook: Webhook,
     fetched: Mapping[str, str],
 ) -> tuple[list[dict[str, Any]], dict[str, BlobRow]]:
     """Return the entries of all files of a job and their blobs, after the checks that need no file's content.
@@ -206,8 +222,10 @@ def _find_inputs(
     inputs, rows = _resolve_inputs(context, caller, received, fetched)
     regions = parameters.region_requests
     check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights, regions=regions)
-    if webhook:
-        check_url(webhook, context.settings)
+    if webhook.webhook:
+        check_url(webhook.webhook, context.settings)
+    elif webhook.webhook_events:
+        raise problems.INVALID_REQUEST("webhook_events: there is no webhook. Give its URL, or omit the events.")
     return inputs, rows
 
 
@@ -223,14 +241,14 @@ def _queue_job(
     caller: Caller,
     inputs: list[dict[str, Any]],
     parameters: JobParameters,
-    webhook: str | None,
+    webhook: Webhook,
     idempotency: Idempotency | None,
     receipt: Receipt,
 ) -> Response:
     """Queue a checked job, and return the response."""
     values = parameters.model_dump(mode="json", exclude_unset=True)
     name = parameters.name or default_job_name(inputs, parameters.region_requests)
-    new = NewJob(caller.owner, name, caller.priority, values, inputs, webhook or None)
+    new = NewJob(caller.owner, name, caller.priority, values, inputs, webhook.webhook, webhook.webhook_events)
     jobs = context.store.jobs
     job, created = jobs.create(
         new, limit=context.settings.max_jobs_per_key, quotas=caller.quotas, idempotency=idempotency, receipt=receipt.id
@@ -240,12 +258,13 @@ def _queue_job(
     response_headers = {"Location": address(f"/v1/jobs/{job.id}"), "Retry-After": "2"}
     if not created:
         response_headers["Idempotency-Replayed"] = "true"
-    body = job_view(jobs.detail(job.id, caller.owner)[0]).model_dump_json()
+    shown, _ = jobs.detail(job.id, caller.owner)
+    body = job_view(shown, expected_starts(context.store, [job.id] if shown.position else [])).model_dump_json()
     return Response(body, 202, response_headers, media_type="application/json")
 
 
 #: Files and texts of a request, with the parameters and the webhook of the job.
-_Parts = tuple[Received, JobParameters, str | None]
+_Parts = tuple[Received, JobParameters, Webhook]
 
 
 async def _from_form(request: Request, context: Context, receipt: Receipt) -> _Parts:
@@ -256,7 +275,10 @@ async def _from_form(request: Request, context: Context, receipt: Receipt) -> _P
         raise problems.INVALID_REQUEST("parameters: is not a JSON object.", input="parameters")
     parameters = JobParameters.model_validate(values)
     parameters.settings()
-    return received, parameters, received.texts.get("webhook", "").strip() or None
+    url, events = (received.texts.get(name, "").strip() for name in ("webhook", "webhook_events"))
+    listed = [event.strip() for event in events.split(",")] if events else None
+    webhook = Webhook.model_validate({"webhook_events": listed})  # `check_url` checks the URL
+    return received, parameters, webhook.model_copy(update={"webhook": url or None})
 
 
 async def _from_json(request: Request, context: Context) -> _Parts:
@@ -270,7 +292,7 @@ async def _from_json(request: Request, context: Context) -> _Parts:
     if len(named) > (most := most_files(context.settings)):
         raise problems.TOO_MANY_FILES(limit=most, what="files")
     uploads = [(index, *each) for index, each in enumerate(named)]
-    return Received(uploads=uploads), job.parameters, job.webhook
+    return Received(uploads=uploads), job.parameters, job
 
 
 def _resolve_inputs(
@@ -343,11 +365,12 @@ def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:
 
 
 def _idempotency(
-    key: str | None, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters, webhook: str | None
+    key: str | None, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters, webhook: Webhook
 ) -> Idempotency | None:
     if key is None:
         return None
     # Defaults are excluded so that the digest stays the same if a later version adds parameters.
     values = parameters.model_dump(mode="json", exclude_defaults=True)
-    text = json.dumps([list(inputs), values, webhook], sort_keys=True)
+    events = [webhook.webhook_events] if webhook.webhook_events else []
+    text = json.dumps([list(inputs), values, webhook.webhook, *events], sort_keys=True)
     return Idempotency(key, hashlib.sha256(text.encode()).hexdigest())

@@ -26,8 +26,8 @@ def test_uncallable_webhook_urls_are_rejected(service: Service, tmp_path: Path) 
         for role, path in (("scene", scene), ("cameras", cameras), ("style", style))
     ]
 
-    def submit(url: str) -> httpx2.Response:
-        return client.post("/v1/jobs", files=files, data={"webhook": url})
+    def submit(url: str, **more: str) -> httpx2.Response:
+        return client.post("/v1/jobs", files=files, data={"webhook": url, **more})
 
     refused = ["http://[::1", "http://℀.com/", "http://a:99999/", "http://user:pw@example.com/", "ftp://example.com"]
     with service.client() as client:
@@ -38,6 +38,14 @@ def test_uncallable_webhook_urls_are_rejected(service: Service, tmp_path: Path) 
             problem = answer.json()
             assert (problem["code"], problem["input"]) == ("invalid-webhook", "webhook")
         assert submit("https://example.com/hook").status_code == 202
+        assert submit("https://example.com/hook", webhook_events="started, progress").status_code == 202
+        for url, events in (("https://example.com/hook", "ended"), ("", "started")):
+            answer = submit(url, webhook_events=events)
+            check_documented(answer)
+            assert (answer.status_code, answer.json()["code"]) == (422, "invalid-request")
+            assert "webhook_events" in answer.text
     store = open_store(ServiceSettings(data=service.data))
-    assert store.jobs.page(None, limit=1)[0].row.webhook == "https://example.com/hook"
+    chosen, default = (shown.row for shown in store.jobs.page(None, limit=2))
     store.close()
+    assert (default.webhook, default.webhook_events) == ("https://example.com/hook", None)
+    assert chosen.webhook_events == ["started", "progress"]

@@ -32,6 +32,7 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.tables import DeliveryRow
+from sgsst_core.progress import Progress
 from tests.http_servers import serve
 from tests.service.store.helpers import Clock
 from tests.stores import migrated_database, new_store
@@ -180,6 +181,46 @@ def test_rejected_message_is_retried(tmp_path: Path, store: Store, receiver: Rec
     _deliver(store, tmp_path)
     assert len(receiver.received) == 2
     assert _tries(store) == []
+
+
+def test_chosen_events_are_sent_and_progress_does_not_queue_up(
+    tmp_path: Path, store: Store, receiver: Receiver, clock: Clock
+) -> None:
+    def sent() -> list[str]:
+        return [json.loads(body)["type"] for _, body in receiver.received]
+
+    store.inputs.add_blob("a" * 64, "aa/b", 1)
+    inputs = [{"role": "scene", "name": "s", "sha256": "a" * 64, "size": 1}]
+    for events in (["started", "progress", "completed"], ["started"], None):
+        store.jobs.create(NewJob("local", "wall", 0, {}, inputs, receiver.url, events), limit=1000)
+        lease = store.leases.take("one")
+        assert lease is not None
+        store.leases.start(lease)
+        for step in (1, 2, 3):
+            progress = Progress(stage="sos", step=step, total=9)
+            store.leases.report_progress(lease, progress, notify=bool(events and "progress" in events))
+        _deliver(store, tmp_path)
+        if events is not None and "progress" in events:
+            assert sorted(sent()) == ["job.progress", "job.started"]
+            messages = {message["type"]: message["data"] for message in (json.loads(b) for _, b in receiver.received)}
+            assert messages["job.progress"]["progress"]["step"] == 3
+            assert messages["job.started"] == {
+                "id": lease.job_id,
+                "name": "wall",
+                "status": "running",
+                "error": None,
+                "attempt": 1,
+            }
+            receiver.status = 500
+            store.leases.report_progress(lease, progress, notify=True)
+            _deliver(store, tmp_path)
+            assert _tries(store) == [], "it is not tried again"
+            receiver.status = 200
+            store.leases.report_progress(lease, progress, notify=True)
+            receiver.received.clear()
+        store.leases.fail(lease, {"code": "x", "message": "x"}, permanent=True)
+        _deliver(store, tmp_path)
+    assert sent() == ["job.failed", "job.started", "job.failed"]
 
 
 def test_redirects_are_not_followed(tmp_path: Path, store: Store, receiver: Receiver) -> None:
