@@ -10,12 +10,16 @@ from pathlib import Path
 
 import pytest
 
+from api.static_files import exported_viewer
 from service import problems
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
-from service.files.staging import RESULT
+from service.files.staging import RESULT, Staged
 from service.files.threads import FileThreads
 from service.inspection.derived import MOST_BLENDS, Blend, DerivedFiles
+from service.inspection.process import WORK
+from service.inspection.work import WorkRequest
+from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -24,6 +28,7 @@ from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import JobRow
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.scene_file import write_scene
 from tests.api.service import PATIENCE
 from tests.raised import raises_problem
 from tests.service.store.helpers import usage_of
@@ -132,3 +137,26 @@ def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Pat
     assert {row.name for row in stored.store.jobs.artifacts(job.id)} == before | {"stylized.spz", "stylized.spz.json"}
     derived = sum(row.size for row in stored.store.jobs.artifacts(job.id) if row.name not in before)
     assert usage_of(stored.store, "one").stored_bytes == used + derived
+
+
+@pytest.mark.parametrize(("columns", "holds_both"), [(28, True), (20, False)])
+def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, columns: int, holds_both: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_scene(Path("scene.ply"), wall())
+    write_scene(Path(RESULT), wall(columns))
+    request = WorkRequest(
+        work="page",
+        folder=tmp_path,
+        staged=Staged(scene=Path("scene.ply"), styles=(), cameras=None, photos=None),
+        parameters=JobParameters(background=(1.0, 1.0, 1.0)),
+        seconds=0,
+        memory=0,
+        options={"result": RESULT, "viewer": exported_viewer(), "title": "wall"},
+        output=("page.html", 0),
+    )
+    WORK["page"][0](request, lambda response: None)
+    text = Path("page.html").read_text(encoding="utf-8")
+    assert ('id="colors"></script>' not in text) == holds_both
+    assert '"background": [1.0, 1.0, 1.0]' in text
