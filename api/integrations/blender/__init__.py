@@ -78,49 +78,49 @@ def show_result(source: Any, path: Path, kind: str) -> Any:
 
 
 class Current:
-    """Job of this Blender; `tick` follows it in Blender's own thread."""
+    """Job of this Blender, and the message of the last one."""
 
     job: BackgroundJob | None = None
     source_name = ""
     folder: tempfile.TemporaryDirectory[str] | None = None
     message = ""
 
-    @classmethod
-    def start(cls, source: Any, settings: Any, service: Service) -> None:
-        """Send an object's splat; raises like `splat_columns`, and ValueError without a style image."""
-        style = Path(bpy.path.abspath(settings.style))
-        if not style.is_file():
-            raise ValueError(f"There is no style image {settings.style!r}. Choose an image file.")
-        cls.folder = tempfile.TemporaryDirectory()
-        scene, out = (Path(cls.folder.name) / name for name in ("splat.ply", "stylized.ply"))
-        write_splat(scene, splat_columns(source.data))
-        options = {"preset": settings.preset, "orbit": settings.views or "auto", "up": settings.up}
-        if settings.minutes:
-            options["within"] = 60 * settings.minutes
-        cls.job = BackgroundJob(service, (scene, style, out), **options)
-        cls.source_name, cls.message = source.name, ""
-        cls.job.start()
-        bpy.app.timers.register(cls.tick, first_interval=0.5)
 
-    @classmethod
-    def tick(cls) -> float | None:
-        """Show the progress or the result; return the seconds until the next call, None if the job has ended."""
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                area.tag_redraw()
-        assert cls.job is not None
-        assert cls.folder is not None
-        if cls.job.is_alive():
-            return 0.5
-        source = bpy.data.objects.get(cls.source_name)
-        if cls.job.error or source is None:
-            cls.message = cls.job.error or f"The object {cls.source_name} is gone. Its result was not added."
-        else:
-            kind = bpy.context.scene.sgsst.result
-            cls.message = f"Painted {show_result(source, Path(cls.folder.name) / 'stylized.ply', kind).name}."
-        cls.folder.cleanup()
-        cls.job = None
-        return None
+def start(source: Any, settings: Any, service: Service) -> None:
+    """Send an object's splat; raises like `splat_columns`, and ValueError without a style image."""
+    style = Path(bpy.path.abspath(settings.style))
+    if not style.is_file():
+        raise ValueError(f"There is no style image {settings.style!r}. Choose an image file.")
+    Current.folder = tempfile.TemporaryDirectory()
+    scene, out = (Path(Current.folder.name) / name for name in ("splat.ply", "stylized.ply"))
+    write_splat(scene, splat_columns(source.data))
+    options = {"preset": settings.preset, "orbit": settings.views or "auto", "up": settings.up}
+    if settings.minutes:
+        options["within"] = 60 * settings.minutes
+    Current.job = BackgroundJob(service, (scene, style, out), **options)
+    Current.source_name, Current.message = source.name, ""
+    Current.job.start()
+    bpy.app.timers.register(follow, first_interval=0.5, persistent=True)
+
+
+def follow() -> float | None:
+    """Show the progress or the result; return the seconds until the next call, None if the job has ended."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            area.tag_redraw()
+    assert Current.job is not None
+    assert Current.folder is not None
+    if Current.job.is_alive():
+        return 0.5
+    source = bpy.data.objects.get(Current.source_name)
+    if Current.job.error or source is None:
+        Current.message = Current.job.error or f"The object {Current.source_name} is gone. Its result was not added."
+    else:
+        result = Path(Current.folder.name) / "stylized.ply"
+        Current.message = f"Painted {show_result(source, result, bpy.context.scene.sgsst.result).name}."
+    Current.folder.cleanup()
+    Current.job = None
+    return None
 
 
 class SgsstPreferences(bpy.types.AddonPreferences):
@@ -180,7 +180,7 @@ class SgsstStylize(bpy.types.Operator):
         try:
             if not bpy.app.online_access and urlsplit(service.url).hostname not in _LOCAL:
                 raise ValueError("Allow Online Access in Preferences > System, or use a service on this machine.")
-            Current.start(context.object, context.scene.sgsst, service)
+            start(context.object, context.scene.sgsst, service)
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -237,6 +237,8 @@ def unregister() -> None:
     """Cancel a running job, and unregister the classes."""
     if Current.job is not None:
         Current.job.canceled.set()
+        Current.job = None
+        bpy.app.timers.unregister(follow)
     del bpy.types.Scene.sgsst
     for each in reversed(_CLASSES):
         bpy.utils.unregister_class(each)

@@ -26,7 +26,8 @@ def stylize(source, **settings):
         if settings.get("minutes") == 1440:
             bpy.ops.sgsst.cancel()
         time.sleep(0.1)
-        addon.Current.tick()  # without a window, Blender calls no timers
+        if addon.follow() is None:  # without a window, Blender calls no timers
+            bpy.app.timers.unregister(addon.follow)
     return addon.Current.message, texts
 
 
@@ -73,5 +74,9 @@ answer["added objects"] = len(bpy.data.objects) - count
 answer["colors"] = [list(each.color_srgb) for each in source.data.color_attributes["stylized"].data]
 bpy.ops.mesh.primitive_cube_add()
 answer["cube"] = refusal()
-bpy.ops.preferences.addon_disable(module=module)
+bpy.context.view_layer.objects.active = source
+bpy.context.scene.sgsst.style = style
+bpy.ops.sgsst.stylize()
+bpy.ops.preferences.addon_disable(module=module)  # while a job runs
+answer["timer"] = bpy.app.timers.is_registered(addon.follow)
 Path("answer.json").write_text(json.dumps(answer))
