@@ -150,7 +150,7 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
         work="page",
         folder=tmp_path,
         staged=Staged(scene=Path("scene.ply"), styles=(), cameras=None, photos=None),
-        parameters=JobParameters(background=(1.0, 1.0, 1.0)),
+        parameters=JobParameters.model_validate({"background": [1.0, 1.0, 1.0]}),
         seconds=0,
         memory=0,
         options={"result": RESULT, "viewer": exported_viewer(), "title": "wall"},

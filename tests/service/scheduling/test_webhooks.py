@@ -29,6 +29,7 @@ from service.outgoing import is_public
 from service.scheduling import webhooks
 from service.scheduling.webhooks import Deliverer, check_url
 from service.settings import ServiceSettings
+from service.states import WebhookEvent
 from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.tables import DeliveryRow
@@ -191,7 +192,8 @@ def test_chosen_events_are_sent_and_progress_does_not_queue_up(
 
     store.inputs.add_blob("a" * 64, "aa/b", 1)
     inputs = [{"role": "scene", "name": "s", "sha256": "a" * 64, "size": 1}]
-    for events in (["started", "progress", "completed"], ["started"], None):
+    choices: tuple[list[WebhookEvent] | None, ...] = (["started", "progress", "completed"], ["started"], None)
+    for events in choices:
         store.jobs.create(NewJob("local", "wall", 0, {}, inputs, receiver.url, events), limit=1000)
         lease = store.leases.take("one")
         assert lease is not None
