@@ -356,8 +356,8 @@ def _foot(subject: Subject, up: Tensor) -> float:
     """Return the area of the lowest points as a fraction of the subject's area: convex hulls, seen from above."""
     heights = subject.points @ up
     flat = subject.points @ _across(up)
-    # quantiles, so that a few strays do not count as a foot
-    low, high = (quantile(heights, subject.weights, fraction) for fraction in (0.001, 0.999))
+    # quantiles, so that neither strays nor the few points of a hollow base below its rim count as a foot
+    low, high = (quantile(heights, subject.weights, fraction) for fraction in (0.01, 0.99))
     return _area(flat[heights <= low + _FOOT * (high - low)]) / max(_area(flat), 1e-300)
 
 

@@ -53,6 +53,14 @@ def test_standing_subject_has_its_foot_below(rotation: Rotation) -> None:
     assert "times as tall as wide" in up.reason
 
 
+@pytest.mark.parametrize("rotation", ROTATIONS)
+def test_few_points_below_a_foot_are_not_the_foot(rotation: Rotation) -> None:
+    drips = box((-0.02, 0.0, -0.02), (0.02, 0.1, 0.02), 25)
+    up = up_of(moved(joined(figure(), scene_of(drips)), rotation))
+    assert degrees(up, rotation) < 5
+    assert up.sure
+
+
 def test_long_subject_on_wheels_lies_instead_of_standing() -> None:
     wheels = [box((x, -0.3, z), (x + 0.6, 0.0, z + 0.2), 300) for x in (-1.9, 1.3) for z in (-0.8, 0.6)]
     body = ball((0, 0, 0), 1.0, 3000) * torch.tensor([2.2, 0.5, 0.8]) + torch.tensor([0.0, -0.7, 0.0])
