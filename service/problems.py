@@ -148,6 +148,18 @@ TOO_MANY_VIEWS = _unusable(
     message="There are {count:,} views. At most {limit:,} are allowed.",
     example={"count": 3000, "limit": 2000, "input": "cameras"},
 )
+UNSURE_UP = ProblemType(
+    "unsure-up",
+    422,
+    "The scene does not show which way is up: {reason}. Set `up`: {likely} is likely.",
+    members=("input", "candidates"),
+    example={
+        "reason": "neither a ground nor a long axis was found, and most captures point this way",
+        "likely": "-y or z",
+        "candidates": ["-y", "z"],
+        "input": "up",
+    },
+)
 TOO_MANY_PIXELS = _unusable(
     "too-many-pixels",
     message="All views have {count:,} pixels. At most {limit:,} are allowed.",

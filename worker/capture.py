@@ -105,12 +105,15 @@ class Capture:
         return replace(self, photos=photos, decisions=(*decisions, *self.decisions))
 
 
-def read_capture(source: SceneRequest, scene: Scene, images: Path | None = None) -> Capture:
+def read_capture(
+    source: SceneRequest, scene: Scene, images: Path | None = None, remaining: Tensor | None = None
+) -> Capture:
     """Read or generate the requested cameras, at the requested resolution, still without photos.
 
     Args:
         scene: Scene that an orbit surrounds.
         images: Folder of photos, for cameras whose file states no sizes.
+        remaining: [N] bool, Gaussians that an orbit surrounds; None for all.
 
     Raises:
         CameraError: If the cameras cannot be used.
@@ -118,7 +121,7 @@ def read_capture(source: SceneRequest, scene: Scene, images: Path | None = None)
     orbit = None
     notes: list[str] = []
     if source.cameras is None:
-        orbit = make_orbit(scene, orbit_request(source))
+        orbit = make_orbit(scene, orbit_request(source), remaining)
         cameras = list(orbit.cameras)
     else:
         cameras = read_cameras(source.cameras, images, notes.append)

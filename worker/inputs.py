@@ -44,7 +44,7 @@ from worker.capture import Capture, about_background, about_notes, about_renderi
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.ranks.shared_scene import read_shared_scene
 from worker.region_requests import RegionRequest
-from worker.selecting import select_regions
+from worker.selecting import cropped, select_regions
 from worker.styles import StyleFile
 
 T = TypeVar("T")
@@ -141,7 +141,7 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
         together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
     with errors_of("cameras"):
         check_choice(source)
-        capture = _capture_on_all_ranks(source, scene_file.scene, images, collectives).fitted(settings)
+        capture = _capture_on_all_ranks(request, scene_file, images, collectives).fitted(settings)
         cameras = capture.cameras
         if limits:
             limits.check_cameras(cameras)
@@ -301,13 +301,16 @@ def load_styles(files: Sequence[StyleFile], background: Color = WHITE) -> Style:
     return Style(images, weights, names, tuple(notes))
 
 
-def _capture_on_all_ranks(source: SceneRequest, scene: Scene, images: Path | None, collectives: Collectives) -> Capture:
+def _capture_on_all_ranks(request: JobSpec, file: SceneFile, images: Path | None, collectives: Collectives) -> Capture:
     """Return the result of `read_capture`, the same on every rank.
 
     Every rank reads a camera file itself. Only rank 0 computes an orbit, since processors may round differently.
     """
+    source, scene = request.source, file.scene
     if source.cameras is None:
-        return collectives.broadcast(lambda: read_capture(source, scene))
+        return collectives.broadcast(
+            lambda: read_capture(source, scene, remaining=cropped(request.regions, file, source.near))
+        )
     return together(collectives, lambda: read_capture(source, scene, images))
 
 

@@ -82,6 +82,27 @@ def select_regions(
     return regions
 
 
+def cropped(requests: Sequence[RegionRequest], file: SceneFile, near: float) -> Tensor | None:
+    """Return the Gaussians that a crop leaves, [N] bool: those that are not frozen, if the rest is.
+
+    Returns:
+        None if the rest is not frozen, if nothing or everything remains, or if masks of views select, which belong to
+        cameras.
+
+    Raises:
+        InvalidInputError: If a file cannot be used.
+    """
+    if not any(request.selection is None and request.freeze for request in requests):
+        return None
+    remaining = torch.zeros(len(file.scene), dtype=torch.bool)
+    for request in requests:
+        if request.selection is not None:
+            if request.selection.kind == "masks":
+                return None
+            remaining[select(request.selection, file, (), near)] = not request.freeze
+    return remaining if bool(remaining.any()) and not bool(remaining.all()) else None
+
+
 def select(selection: Selection, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
     """Return a flag for each Gaussian of a scene, [N] bool: whether the selection contains it. See `select_regions`."""
     means, numbers, path = file.scene.means, selection.numbers, selection.path

@@ -23,10 +23,12 @@ export class CropPanel {
   /**
    * @param {import("./stage.js").Stage} stage
    * @param {(box: string) => void} apply receives the text of the box; "" for none
+   * @param {() => void} changed called after another box is in use
    */
-  constructor(stage, apply) {
+  constructor(stage, apply, changed) {
     this.stage = stage;
     this.apply = apply;
+    this.changed = changed;
     /** Text of the box in use; "" for none. */
     this.box = "";
     this.button = h("button.tool", { type: "button", title: say.crop, "aria-label": say.crop, "aria-pressed": "false", hidden: true, onclick: () => (this.element.hidden ? this.open() : this.close()) }, icon("crop"));
@@ -61,9 +63,19 @@ export class CropPanel {
 
   /** Show a box as the one in use. @param {string} box */
   show(box) {
+    if (box === this.box) return;
     this.box = box;
     this.button.setAttribute("aria-pressed", String(!!box));
     if (this.element.hidden) this.draw(new Float32Array(0));
+    this.changed();
+  }
+
+  /** Return the bounds of what remains of the scene, which an orbit surrounds; undefined until it is loaded. */
+  remaining() {
+    const middle = this.stage.viewer?.sides?.left.scene.middle;
+    if (!middle || !this.box) return middle;
+    const { center, sizes } = boxOf(this.box);
+    return { ...middle, low: middle.low.map((low, i) => Math.max(low, center[i] - sizes[i])), high: middle.high.map((high, i) => Math.min(high, center[i] + sizes[i])) };
   }
 
   /** Draw the outline of the box that is being changed, or of the one in use. @param {Float32Array<ArrayBuffer>} lines */

@@ -152,6 +152,11 @@ export class OptionsPart {
     return [...this.controls.values()].filter(({ name }) => orbiting || !this.groups.Views.includes(name));
   }
 
+  /** Fill in the time budget that suits the service's machine. */
+  useBudget() {
+    this.restore({ within: this.budget }, undefined);
+  }
+
   /** Fill in values. @param {Record<string, any>} values by name @param {string | undefined} preset */
   restore(values, preset) {
     for (const [name, value] of Object.entries(values)) {

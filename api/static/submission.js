@@ -72,7 +72,7 @@ export class Submission {
       const text = JSON.stringify(body), key = this.keys.get(text) ?? randomKey();
       this.keys.set(text, key); // a second attempt creates only those jobs that are missing
       try {
-        jobs.push(await (await ask("POST", "v1/jobs", { json: body, headers: { "Idempotency-Key": key } })).json());
+        jobs.push(await (await ask("POST", "v1/jobs?sure_up=true", { json: body, headers: { "Idempotency-Key": key } })).json());
       } catch (error) {
         if (jobs.length && error instanceof Error) error.message += ` ${say.createdSome(jobs.length, bodies.length)}`;
         throw error;

@@ -20,6 +20,7 @@ import { oneModel, Slot } from "./slots.js";
 import { Stage } from "./stage.js";
 import { Submission } from "./submission.js";
 import { UnfinishedNotice } from "./unfinished.js";
+import { upQuestion } from "./up_question.js";
 import { ViewsPart } from "./views_part.js";
 import { words } from "./words.js";
 
@@ -51,10 +52,10 @@ export class SubmitView {
     this.options = new OptionsPart(this.name);
     this.selecting = new SelectPanel(this.stage);
     this.regions = new RegionList(() => this.paintingsChanged(), this.stage.viewer ? (row) => this.selectRegion(row) : undefined);
-    this.crop = new CropPanel(this.stage, (box) => this.regions.crop(box));
+    this.crop = new CropPanel(this.stage, (box) => this.regions.crop(box), () => this.views.showCameras());
     this.example = new ExamplePart(() => this.startExample());
     this.paintings = new PaintingsPart(this.slots.style, this.regions, () => this.styleChanged(), this.leaving.signal, this.example.offers[1]);
-    this.views = new ViewsPart(this.slots, this.stage, this.options, () => this.refresh());
+    this.views = new ViewsPart(this.slots, this.stage, this.options, this.crop, () => this.refresh());
     this.scene = new ScenePart(this.slots.scene, this.stage, { loaded: () => this.views.showCameras(), reload: () => this.sceneChanged() });
     this.submission = new Submission(this.leaving.signal);
     this.refusals = new Refusals(this.slots, this.options, this.regions);
@@ -105,7 +106,7 @@ export class SubmitView {
       options.restore(draft.values, draft.preset);
       if (draft.orbiting) this.views.restore();
       this.views.show();
-    } else options.restore({ within: options.budget }, undefined);
+    } else options.useBudget();
     this.form.addEventListener("input", (/** @type {Event} */ event) => {
       this.saveDraft();
       if (!options.presets.contains(event.target)) options.forgetTimes();
@@ -262,14 +263,15 @@ export class SubmitView {
     if (!plan) return;
     const { jobs } = this.paintings;
     this.options.showTimes(body, plan);
-    put(this.result, costCard(plan, this.options.controls.has("within") ? () => this.hurry() : null), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
+    if (plan.up?.sure === false) return this.askUp(plan.up.candidates, true);
+    put(this.result, costCard(plan, this.options.controls.has("within") ? () => (this.options.useBudget(), this.act(true)) : null), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
     this.result.scrollIntoView({ block: "nearest", behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth" });
   }
 
-  /** Plan the job again, with a time budget. */
-  hurry() {
-    this.options.restore({ within: this.options.budget }, undefined);
-    this.act(true);
+  /** Ask which way is up, and then continue. @param {string[]} candidates @param {boolean} dry whether to plan only */
+  askUp(candidates, dry) {
+    put(this.result, upQuestion(this.stage, candidates, (up) => (this.views.standUp(up), this.act(dry))));
+    this.result.scrollIntoView({ block: "nearest" });
   }
 
   /** Open the view of created jobs. @param {any[]} jobs */
@@ -282,6 +284,7 @@ export class SubmitView {
 
   /** @param {unknown} error */
   refuse(error) {
+    if (error instanceof Problem && error.code === "unsure-up") return this.askUp(error.body.candidates, false);
     if (error instanceof Problem && error.code === "unknown-upload") this.submission.card.uploads.clear();
     this.refusals.show(error);
   }

@@ -33,8 +33,6 @@ export function uprightButtons(stage, choose) {
       if (!stage.viewer?.sides) return;
       const { up, axes } = stage.viewer.camera, name = turnedUp(up, wanted(axes));
       choose(name);
-      stage.up = UPS[name];
-      stage.home();
     },
   }, icon(name));
   return h("div.upright", button("turn", ([right]) => times(right, -1)), button("tip", ([, , forward]) => forward));

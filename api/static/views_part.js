@@ -27,12 +27,14 @@ export class ViewsPart {
    * @param {Record<"scene" | "cameras" | "photos", Slot>} slots
    * @param {import("./stage.js").Stage} stage
    * @param {import("./options_part.js").OptionsPart} options
+   * @param {import("./crop_panel.js").CropPanel} crop
    * @param {() => void} changed called after the views have changed
    */
-  constructor(slots, stage, options, changed) {
+  constructor(slots, stage, options, crop, changed) {
     this.slots = slots;
     this.stage = stage;
     this.options = options;
+    this.crop = crop;
     this.changed = changed;
     /** Whether the user has chosen between cameras and an orbit; otherwise the files decide. */
     this.chosen = false;
@@ -43,10 +45,7 @@ export class ViewsPart {
     this.automatic = h("p.help", say.noCameras, " ", h("button.quiet.small", { type: "button", onclick: () => slots.cameras.input.click() }, say.chooseCameras));
     this.body = h("div.views-body");
     this.found = h("p.quiet");
-    this.upright = uprightButtons(stage, (up) => {
-      options.controls.get("up")?.set(up);
-      this.showCameras();
-    });
+    this.upright = uprightButtons(stage, (up) => this.standUp(up));
     stage.tools.prepend(this.upright);
     options.ring.addEventListener("input", () => this.showCameras());
     this.element = h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.body, this.found);
@@ -55,6 +54,14 @@ export class ViewsPart {
   /** Whether the views orbit the scene. */
   get orbiting() {
     return this.around.input.checked;
+  }
+
+  /** Choose the up direction. @param {string} up value of the option `up` */
+  standUp(up) {
+    this.options.controls.get("up")?.set(up);
+    this.showCameras();
+    this.stage.up = UPS[up];
+    this.stage.home();
   }
 
   choose() {
@@ -98,7 +105,7 @@ export class ViewsPart {
 
   /** @returns {[JobCamera[], string]} */
   ringNow() {
-    const { controls } = this.options, middle = this.stage.viewer?.sides?.left.scene.middle;
+    const { controls } = this.options, middle = this.crop.remaining();
     const count = controls.get("orbit")?.value(), number = typeof count === "number" && count >= 1 ? Math.min(count, 400) : 0;
     const told = number ? words.cameras.ring(number) : words.cameras.ringAuto;
     if (!middle) return [[], told];

@@ -125,7 +125,10 @@ export const words = {
     moveShape: "Move", resize: (/** @type {string} */ axis, /** @type {number} */ sign) => `Resize ${sign > 0 ? "+" : "−"}${axis}`, center: ["X", "Y", "Z"], sizes: ["Half width", "Half height", "Half depth"], sphereRadius: "Radius",
     undo: "Undo", redo: "Redo", invert: "Invert", grow: "Grow", clear: "Clear", cancel: "Cancel", done: "Use selection",
   },
-  upright: { turn: "Turn the scene by 90°", tip: "Tip the scene by 90°, toward you" },
+  upright: {
+    turn: "Turn the scene by 90°", tip: "Tip the scene by 90°, toward you", which: "Which way is up?", unsure: "The scene doesn't show it, and the views orbit the object upright. Choose the image that stands upright.",
+    isUp: (/** @type {string} */ up) => `${up.toUpperCase().replace("-", "−")} is up`, neither: "None of these",
+  },
   crop: { crop: "Crop the scene", help: "Only what is inside the box is painted; the rest keeps its colors. Drag the handles, or use the arrow keys on them.", use: "Crop to this box", remove: "Remove the crop", inside: "inside" },
   painting: {
     edit: (/** @type {string} */ name) => `Rotate or crop ${name}`, help: "Drag over the painting to keep a part of it.", left: "Rotate left", right: "Rotate right", whole: "Whole painting", use: "Use it", edges: ["Left %", "Top %", "Right %", "Bottom %"],

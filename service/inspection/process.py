@@ -137,8 +137,11 @@ def _read(request: WorkRequest) -> Inputs:
 
 
 def _findings(inputs: Inputs) -> dict[str, Any]:
-    """Return `gaussians`, `dropped`, `sh_degree`, `style` (width, height), `photos`, `views`, and `pixels` of these."""
-    scene, image = inputs.scene_file.scene, inputs.style.images[0]
+    """Return `gaussians`, `dropped`, `sh_degree`, `style` (width, height), `photos`, `views`, and `pixels` of these.
+
+    `up` is that of an orbit, in the format of the API; None with cameras.
+    """
+    scene, image, up = inputs.scene_file.scene, inputs.style.images[0], inputs.orbit and inputs.orbit.up
     return {
         "gaussians": len(scene),
         "dropped": inputs.scene_file.dropped,
@@ -147,6 +150,7 @@ def _findings(inputs: Inputs) -> dict[str, Any]:
         "photos": len(inputs.photos or []),
         "views": len(inputs.cameras),
         "pixels": _pixels(inputs.cameras),
+        "up": up and {"direction": up.name, "sure": up.sure, "candidates": up.candidates, "reason": up.reason},
     }
 
 
@@ -174,10 +178,8 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
         memory, on_device = expected.peak_bytes, expected.device_bytes
         coarse = expected.seconds_coarse or expected.seconds
         seconds = expected.seconds * settings.steps_sos + coarse * job_plan.steps_coarse
-    up = inputs.orbit and inputs.orbit.up
     return {
         **findings,
-        "up": up and {"direction": up.name, "sure": up.sure, "candidates": up.candidates, "reason": up.reason},
         "plan": plan_json(job_plan),
         "estimated_seconds": seconds,
         "total_seconds": total,

@@ -15,7 +15,7 @@ from sgsst_core.orbit.cameras import ELEVATION, middle_of, orbit
 from sgsst_core.orbit.subject import Subject, Up, find_subject, find_up
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
-from sgsst_core.scene.gaussians import Scene, sampled
+from sgsst_core.scene.gaussians import Scene, sampled, sampled_rows
 
 #: Elevations in degrees of rings that may be added to the first. Rings below the horizon are only for an isolated
 #: subject, without ground or background.
@@ -86,15 +86,22 @@ class Orbit:
     inside: float
 
 
-def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
+def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = None) -> Orbit:
     """Create the requested orbit, and choose everything that was not specified.
+
+    Args:
+        remaining: [N] bool, Gaussians of a cropped scene that the orbit surrounds; None for all. The others may still
+            hide them, and show where up is.
 
     Raises:
         SettingsError: If an option is out of range; see `cameras.orbit`.
     """
-    subject = find_subject(scene)
+    subject = whole = find_subject(scene)
+    if remaining is not None:
+        subject = find_subject(scene.subset(remaining))
     if request.up is None:
         up = find_up(subject)
+        up = up if up.sure or subject is whole else find_up(whole)
     else:
         axis = torch.tensor(request.up, dtype=torch.float64)
         up = Up(axis / axis.norm().clamp_min(1e-300), "requested")
@@ -104,7 +111,7 @@ def make_orbit(scene: Scene, request: OrbitRequest) -> Orbit:
     if request.elevation is None and rings > 1:
         alone = not up.ground and subject.left_out <= _OUTSIDE
         tried += [*_ABOVE, *(_BELOW if alone else ())]
-    trial = _Trial(scene, subject, up, request)
+    trial = _Trial(scene, subject, up, request, remaining)
     areas, fractions = zip(*(trial.of_ring(elevation) for elevation in tried), strict=True)
     chosen, shown, left = _needed(areas, max(rings, 1))
     elevations = tuple(tried[ring] for ring in chosen)
@@ -172,12 +179,13 @@ def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence
 class _Trial:
     """Renderer of small trial views of a scene, or of an enlarged sample of its Gaussians, for comparing rings."""
 
-    def __init__(self, scene: Scene, subject: Subject, up: Up, request: OrbitRequest) -> None:
+    def __init__(self, scene: Scene, subject: Subject, up: Up, request: OrbitRequest, remaining: Tensor | None) -> None:
         self._subject, self._up, self._request = subject, up, request
         colorless = replace(scene, sh_rest=scene.means.new_zeros((len(scene), 0, 3)))
         self._scene = sampled(colorless, _TRIAL_GAUSSIANS)
         self._rasterizer = make_rasterizer("cpu", self._scene, near=request.near)
         self._framed = subject.holds(self._scene.means)
+        self._cropped = None if remaining is None else ~remaining[sampled_rows(len(scene), _TRIAL_GAUSSIANS)]
 
     def cameras(self, count: int, elevations: Sequence[float]) -> list[Camera]:
         """Return the cameras of the orbit with these rings."""
@@ -188,6 +196,8 @@ class _Trial:
         """Return the fraction of the surface that is hidden from all rings, given the areas [n] that each shows."""
         lengths = self._scene.scales.double().clamp(-60, 60).exp().sort(dim=1).values
         surface = 2 * math.pi * torch.sigmoid(self._scene.opacities.double()) * lengths[:, 1] * lengths[:, 2]
+        if self._cropped is not None:
+            surface[self._cropped] = 0
         shown = torch.stack(list(areas)).amax(0)
         return float(surface[shown < _HARDLY * surface].sum() / surface.sum().clamp_min(1e-300))
 
@@ -210,6 +220,8 @@ class _Trial:
             areas = torch.maximum(areas, shown)
             if float(shown.sum()) > 0:
                 subject.append(float(shown[self._framed].sum() / shown.sum()))
+        if self._cropped is not None:
+            areas[self._cropped] = 0
         return areas, subject or [1.0]
 
 

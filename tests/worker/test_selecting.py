@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from sgsst_core.style import Style
 from tests.small_scenes import cameras, wall, write_files
 from worker.inputs import load_styles
 from worker.region_requests import RegionRequest, parse_selection
-from worker.selecting import select, select_regions
+from worker.selecting import cropped, select, select_regions
 
 
 def region(name: str, spec: str, **values: Any) -> RegionRequest:
@@ -58,6 +59,19 @@ def test_later_region_wins_overlaps(file: SceneFile) -> None:
     regions = select_regions((narrow, wide), file, cameras(), 0.2, load_styles)
     assert regions is not None
     assert [each.selected for each in regions.every] == [0, int((x >= 1).sum()), int((x >= -1).sum())]
+
+
+def test_crop_leaves_what_is_not_frozen_if_the_rest_is(file: SceneFile) -> None:
+    right, far, x = region("a", "half-space=1,0,0,-1"), region("b", "half-space=1,0,0,1"), file.scene.means[:, 0]
+    rest = RegionRequest("rest", freeze=True)
+    remaining = cropped([right, rest], file, 0.2)
+    assert remaining is not None
+    assert remaining.tolist() == (x >= -1).tolist()
+    between = cropped([right, replace(far, freeze=True), rest], file, 0.2)
+    assert between is not None
+    assert between.tolist() == ((x >= -1) & (x < 1)).tolist()
+    for requests in ([right], [replace(right, freeze=True)], [region("a", "half-space=1,0,0,-9"), rest], [rest]):
+        assert cropped(requests, file, 0.2) is None
 
 
 @pytest.mark.parametrize("kind", ["i4", "u1", "f8", "f4"])

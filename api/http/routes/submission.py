@@ -168,6 +168,14 @@ async def create_job(
     dry_run: Annotated[
         bool, Query(description="Check everything and plan, but queue nothing.", examples=[True])
     ] = False,
+    sure_up: Annotated[
+        bool,
+        Query(
+            description="Refuse an orbit whose up direction the scene does not determine with `unsure-up`, whose "
+            "`candidates` are values of `up` to choose from. A dry run answers with `up` in any case.",
+            examples=[True],
+        ),
+    ] = False,
 ) -> Response:
     """Queue a job. All files are read and checked before the answer; unusable ones are refused with 422."""
     async with AsyncExitStack() as stack:
@@ -183,12 +191,17 @@ async def create_job(
                 fetched = await context.fetcher.fetch(urls, receipt)
         inputs, rows = await context.threads.run(caller.owner, find_inputs, fetched)
         recall = partial(context.inspector.recall, "validate", caller.owner, inputs, parameters)
-        if await context.threads.run(caller.owner, recall) is None:
+        findings = await context.threads.run(caller.owner, recall)
+        if findings is None:
             size = sum(row.size for row in rows.values())
             await context.threads.run(caller.owner, _check_files, context, inputs, rows, size=size)
             if not dry_run or context.inspector.is_planning:  # else the files are checked and planned in one reading
-                await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
+                findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
+            up = findings and findings["up"]
+            if sure_up and up and not up["sure"]:
+                likely = " or ".join(up["candidates"])
+                raise problems.UNSURE_UP(reason=up["reason"], likely=likely, candidates=up["candidates"], input="up")
             idempotency = _idempotency(idempotency_key, inputs, parameters, webhook)
             queue_job = partial(_queue_job, context, caller, inputs, parameters, webhook)
             return await asyncio.to_thread(queue_job, idempotency, receipt)

@@ -200,6 +200,23 @@ def test_plan_of_an_orbit_says_whether_up_is_sure(service: Service, files: dict[
         assert (asked["sure"], len(asked["candidates"])) == (False, 2)
         assert asked["candidates"][0] == "-y"
         assert "most captures" in asked["reason"]
+        refused = client.post("/v1/jobs", **request(without, orbit=2) | {"params": {"sure_up": True}})
+        assert (refused.status_code, refused.json()["code"]) == (422, "unsure-up")
+        assert refused.json()["candidates"] == asked["candidates"]
+        assert client.get("/v1/jobs").json()["jobs"] == []
         given = client.post("/v1/jobs", **request(without, orbit=2, up="z")).json()["up"]
         assert given == {"direction": "z", "sure": True, "candidates": ["z"], "reason": "requested"}
         assert client.post("/v1/jobs", **request(files)).json()["up"] is None
+
+
+def test_orbit_surrounds_what_a_crop_leaves(service: Service, files: dict[str, bytes]) -> None:
+    without = {role: content for role, content in files.items() if role != "cameras"}
+    crop = [{"name": "inside", "select": "box=-1,-1,2,0,0,4"}, {"name": "rest", "freeze": True}]
+    with service.client() as client:
+        plans = [
+            client.post("/v1/jobs", **request(without, orbit=2, **more)).json() for more in ({}, {"regions": crop})
+        ]
+    whole, cropped = (
+        next(each["decision"] for each in plan["plan"]["decisions"] if each["item"] == "cameras") for plan in plans
+    )
+    assert float(cropped.split()[-4]) < 0.8 * float(whole.split()[-4])

@@ -92,7 +92,7 @@ def drop(watched: Watched, files: dict[str, Path]) -> None:
 def started(watched: Watched, service: Service, name: str = "Start") -> dict[str, Any]:
     """Start the job of the form, and return it."""
     with watched.page.expect_response(
-        lambda answer: answer.url.endswith("/v1/jobs") and answer.request.method == "POST"
+        lambda answer: answer.url.endswith("/v1/jobs?sure_up=true") and answer.request.method == "POST"
     ) as answer:
         watched.page.get_by_role("button", name=name, exact=True).click()
     assert answer.value.status == 202, answer.value.text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import httpx2
@@ -11,9 +12,11 @@ import pytest
 from PIL import Image
 
 from sgsst_core.files.scene_file import read_scene
-from tests.api.page.actions import STEPS, Visit, choose, done, set_options, started
+from tests.api.page.actions import REFUSED, STEPS, Visit, choose, done, set_options, started
 from tests.api.page.browser import Watched
 from tests.api.service import Service
+from tests.sgsst_core.orbit.objects import box, scene_of
+from tests.small_scenes import write_files
 
 pytestmark = pytest.mark.slow
 
@@ -43,13 +46,15 @@ def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict
     assert page.locator("[data-name=up] select").input_value() == "-x"
     page.get_by_role("button", name="Tip the scene by 90°").click()
     assert page.locator("[data-name=up] select").input_value() in ("z", "-z")
+    whole = from_first_camera(watched)
+    page.get_by_role("button", name="Show everything").click()
     page.get_by_role("button", name="Crop the scene").click()
     handle = page.get_by_role("button", name="Resize +Y")
     for _ in range(8):
         handle.press("ArrowUp")
         handle.press("ArrowLeft")
     page.get_by_role("button", name="Crop to this box").click()
-    watched.settled()
+    assert np.abs(from_first_camera(watched) - whole).mean() > 10, "the orbit surrounds what remains"
 
     job = started(watched, service)
     up, regions = job["parameters"]["up"], job["parameters"]["regions"]
@@ -75,6 +80,45 @@ def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict
     assert crop.get_attribute("aria-pressed") == "false"
     assert page.get_by_role("group", name="Region").count() == 0
     watched.check()
+
+
+def from_first_camera(watched: Watched) -> np.ndarray:
+    """Return the view of the orbit's first camera."""
+    watched.page.get_by_label("Camera", exact=True).select_option("0")
+    return watched.pixels()
+
+
+def test_page_asks_which_way_is_up(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
+    block = box((-1, -0.4, -0.6), (1, 0.4, 0.6), 900)
+    scene = scene_of(block, 0.08)
+    write_files(tmp_path, replace(scene, sh_dc=2 * block))
+    watched = visit(width=1200, height=800)
+    page = watched.page
+    choose(watched, {"scene": files["scene"], "style": files["style"]})
+    set_options(watched, orbit=3, resolution=64, **STEPS)
+    watched.settled()
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.get_by_role("heading", name="Which way is up?").wait_for()
+    assert httpx2.get(f"{service.url}/v1/jobs").json()["jobs"] == [], "the job waits for the answer"
+    first, second = shown_upright(watched, ["−Y is up", "Z is up"])
+    assert np.abs(first - second).mean() > 5, "the scene stands differently"
+    page.get_by_role("button", name="None of these").click()
+    others = shown_upright(watched, ["X is up", "−X is up", "Y is up", "−Z is up"])
+    assert len(others) == 4
+    job = started(watched, service, "−X is up")
+    assert job["parameters"]["up"] == "-x"
+    done(service, job["id"])
+    watched.check(REFUSED)
+
+
+def shown_upright(watched: Watched, answers: list[str]) -> list[np.ndarray]:
+    """Return the images of the answers to the question which way is up."""
+    images = []
+    for answer in answers:
+        image = watched.page.get_by_role("button", name=answer, exact=True).locator("img[src]")
+        image.wait_for()
+        images.append(np.asarray(Image.open(io.BytesIO(image.screenshot())).convert("RGB"), dtype=np.float64))
+    return images
 
 
 def test_painting_is_turned_and_cropped(visit: Visit, service: Service, files: dict[str, Path]) -> None:

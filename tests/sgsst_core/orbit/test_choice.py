@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from sgsst_core.decision import Decision
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import middle_of
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit, orbit_decisions
-from sgsst_core.orbit.subject import find_subject
+from sgsst_core.orbit.subject import find_subject, find_up
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import resized
@@ -21,8 +22,10 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.planner import plan_job
-from tests.sgsst_core.orbit.objects import ball, box, figure, ground, joined, scene_of
+from tests.sgsst_core.orbit.objects import ball, box, figure, ground, joined, moved, scene_of
 from tests.small_scenes import style
+
+REQUEST = OrbitRequest(count=12)
 
 
 def elevations(scene: Scene, orbit: Orbit) -> list[float]:
@@ -90,6 +93,31 @@ def test_requested_properties_are_used() -> None:
     assert (decisions["up"].decision, decisions["up"].reason) == ("z", "requested")
     assert decisions["cameras"].decision == "14 views in a ring at 35 degrees, 6.5 from the center"
     assert decisions["cameras"].reason == "requested"
+
+
+def test_orbit_surrounds_what_remains_of_a_cropped_scene() -> None:
+    subject, other = figure(), scene_of(box((3, -4, 2), (6, 0, 5), 4000))
+    scene = joined(other, subject)
+    remaining = torch.arange(len(scene)) >= len(other)
+    orbit, alone, whole = (
+        make_orbit(scene, REQUEST, remaining),
+        make_orbit(subject, REQUEST),
+        make_orbit(scene, REQUEST),
+    )
+    for camera, expected in zip(orbit.cameras, alone.cameras, strict=True):
+        assert torch.allclose(camera.world_to_camera, expected.world_to_camera)
+        assert camera.fx == expected.fx
+    assert whole.radius > 1.5 * orbit.radius
+    assert orbit.hidden > 0, "the rest of the scene still stands in front"
+
+
+def test_ground_outside_a_crop_shows_where_up_is() -> None:
+    above = scene_of(ball((0, -0.5, 0), 0.4))
+    scene = moved(joined(ground(4.0), above), Rotation.from_euler("z", 90, degrees=True))
+    remaining = torch.arange(len(scene)) >= len(scene) - len(above)
+    assert not find_up(find_subject(scene.subset(remaining))).sure
+    up = make_orbit(scene, REQUEST, remaining).up
+    assert (up.name, up.sure, up.ground) == ("x", True, True)
 
 
 def test_plan_lines_state_the_reasons_of_an_orbit() -> None:
