@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import httpx2
@@ -85,3 +86,26 @@ def test_refined_scene_is_watched(visit: Visit, service: Service, files: dict[st
     watched.page.locator(".side.right", has_text="Stylized").wait_for(state="attached")
     watched.settled()
     watched.check("status of 404")  # the page first asks for colors alone, which do not exist
+
+
+def test_job_that_ended_early_continues(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    job_id = submit(service, files, steps_sos=600)
+    watched = visit(f"/#/jobs/{job_id}", width=600, height=700)
+    page = watched.page
+    page.locator(".state", has_text=re.compile(r"step [1-9]")).wait_for()
+    page.get_by_role("button", name="Stop here and keep it").click()
+    page.locator(".head", has_text="This job was stopped early").wait_for()
+    before = httpx2.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()["result"]
+    assert before["steps"] < before["total"] == 600
+    page.get_by_role("button", name="Continue").click()
+    page.locator(".badge", has_text="Running").wait_for()
+    page.locator(".badge", has_text="Done").wait_for()
+    assert "stopped early" not in page.locator(".head").inner_text()
+    assert page.get_by_role("button", name="Continue").count() == 0
+    result = httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()["result"]
+    assert (result["steps"], result["total"]) == (600, 600)
+    points = httpx2.get(f"{service.url}/v1/jobs/{job_id}/progress").json()["points"]
+    steps = [point["step"] for point in points]
+    assert steps == sorted(steps), "it continues where it stopped"
+    page.locator(".side.right", has_text="Stylized").wait_for(state="attached")
+    watched.check()
