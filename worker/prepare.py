@@ -102,7 +102,7 @@ def prepare(
         preview: Writer of previews, used on rank 0 of a new job; None to write none.
         plan_file: Plan that `dry_run` has handed over; None or a missing file for none.
         left: Seconds left of the time budget, which chooses what the checkpoint or the plan has not; None without one.
-        start: Seconds since the start of the program, which count as part of the job.
+        start: Seconds since the start of the job before this call.
 
     Raises:
         InvalidInputError: If an input cannot be used. Every rank raises the same error.

@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,15 @@ class ProcessId:
             return process if abs(process.create_time() - self.started) < 1 else None
         except psutil.Error:
             return None
+
+
+def process_start() -> float:
+    """Return when this process was started, in seconds since the epoch."""
+    if sys.platform != "linux":
+        return float(psutil.Process().create_time())
+    # psutil knows the time of the machine's start to a second
+    ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+    return time.time() - time.clock_gettime(time.CLOCK_BOOTTIME) + ticks / os.sysconf("SC_CLK_TCK")
 
 
 def home() -> tuple[str, ...]:

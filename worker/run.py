@@ -5,6 +5,7 @@ Neither PyTorch nor Ray is imported before a job runs: the driver of several ran
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -142,12 +143,12 @@ def run_rank(
     """
     from sgsst_core.parallel.collectives import ALONE
     from sgsst_core.planning.time_budget import seconds_left
-    from sgsst_core.timing import process_seconds
     from worker.execute import execute
     from worker.prepare import describe, prepare
     from worker.previews import Previews
 
-    start = process_seconds() if collectives is None else 0.0  # processes of ranks may have waited for their job
+    # what preceded a job of several ranks belongs to its command, on another clock perhaps
+    start = max(time.time() - options.started, 0.0) if collectives is None else 0.0
     preview, collectives = None, collectives or ALONE
     left = seconds_left(request.settings.within, options.started)
     if options.preview_folder:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, requires
 from typing import Annotated, Any
 
-import psutil
 import typer
 
 from api.cli import client_commands, operator_commands
@@ -36,6 +35,7 @@ from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import DISK_FULL
 from sgsst_core.files.camera_folder import CameraWarning
 from worker.options import EXPERT, GROUPS
+from worker.processes import process_start
 
 _DISTRIBUTION = "sgsst-service"
 #: Base of errors in the arguments, which typer does not export.
@@ -114,7 +114,7 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Expected errors become one message on stderr and an exit code, without a traceback."""
-    started = psutil.Process().create_time() if arguments is None else time.time()
+    started = process_start() if arguments is None else time.time()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     warnings.formatwarning = _format_warning
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":  # file names hold any characters

@@ -13,10 +13,10 @@ from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXEL_UNIT, PIXELS, layer_stride
 from sgsst_core.loss.nearest import nearest_layers, nearest_weight
+from sgsst_core.loss.scale_weights import scale_count
 from sgsst_core.loss.statistics_terms import PAPERS_WEIGHTS, TermWeights, statistics_layers, term_weights
 from sgsst_core.loss.targets import LayerTarget
 from sgsst_core.scene.colors import WEIGHTS as LUMINANCE_WEIGHTS
-from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import StyleLossName
 
 

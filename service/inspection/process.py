@@ -61,7 +61,7 @@ from worker.inputs import Inputs, errors_of, read_inputs
 from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo
 from worker.prepare import dry_run
-from worker.processes import die_with_parent
+from worker.processes import die_with_parent, process_start
 from worker.video import VideoRequest, render_video
 
 with contextlib.suppress(ImportError):
@@ -192,8 +192,7 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
 @functools.cache
 def _seconds_to_start() -> float:
     """Return the seconds from the start of this process to its first request, nearly all of them for imports."""
-    created: float = psutil.Process().create_time()
-    return _ready_at - created
+    return _ready_at - process_start()
 
 
 def _show(now: Progress, send: _Send) -> None:

@@ -17,7 +17,6 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import psutil
 from pydantic import BaseModel
 
 from service.files.staging import PLAN
@@ -27,7 +26,7 @@ from service.states import AttemptOutcome
 from service.store.retries import Cause
 from sgsst_core.progress import Progress
 from worker.job import JobSpec
-from worker.processes import die_with_parent
+from worker.processes import die_with_parent, process_start
 
 if TYPE_CHECKING:
     from worker.job import Result
@@ -106,7 +105,7 @@ class AttemptProcess:
             resume_required=False,
             workplace=task.workplace,
             plan_file=Path(PLAN),
-            started=psutil.Process().create_time(),
+            started=process_start(),
         )
         workers = task.workers if task.workers > 1 or task.cluster else None
         return stylize(task.spec, workers, listener, options).result

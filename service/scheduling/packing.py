@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from service.scheduling.machine import Machine
 from service.store.tables import JobRow
 from sgsst_core.errors import SettingsError
+from sgsst_core.loss.scale_weights import ScaleWeights, scale_count
 from sgsst_core.settings import Settings, make_settings
 from worker.ranks.memory import GAUSSIAN_BYTES, memory_beside_gpus, scene_bytes
 
@@ -31,9 +32,9 @@ _MEMORY_FRACTION, _JOB_FRACTION = 0.8, 0.4
 #: for 50,000.
 _MIN_MEMORY = 1_000_000_000
 _SCENE_COPIES = 4
-#: Estimated seconds of a step on an H200: network per pixel of a view by precision, rasterization per Gaussian, and
+#: Estimated seconds of a step on an H200: network per evaluated pixel by precision, rasterization per Gaussian, and
 #: kernel launches. A step of phase 1, which optimizes only the coarsest scale, takes a tenth.
-_PIXEL_SECONDS = {"auto": 7e-9, "float32": 7e-8, "winograd": 7e-8, "tf32": 1.6e-8, "bfloat16": 7e-9, "float16": 7e-9}
+_PIXEL_SECONDS = {"auto": 5e-9, "float32": 5e-8, "winograd": 5e-8, "tf32": 1.2e-8, "bfloat16": 5e-9, "float16": 5e-9}
 _GAUSSIAN_SECONDS, _FIXED_SECONDS, _COARSE_FRACTION = 1e-9, 1e-3, 0.1
 #: Default longer side of views, and ratio of height to width.
 _LONGER_SIDE, _ASPECT = 1600, 0.625
@@ -151,14 +152,16 @@ def estimated_seconds(job: JobRow, gpus: int = 1) -> float:
 
     The constants are for H200 GPUs; `service.scheduling.selection` scales the estimate by the measured pace.
     """
-    return _START_SECONDS + _seconds_of_steps(job) / max(gpus, 1)
+    return min(_START_SECONDS + _seconds_of_steps(job) / max(gpus, 1), _settings(job).within or math.inf)
 
 
 def _seconds_of_steps(job: JobRow) -> float:
     """Estimate the duration of all steps of a job on one GPU in seconds."""
     settings = _settings(job)
     side = min(_requested(job, "resolution") or _LONGER_SIDE, settings.max_resolution or math.inf)
-    network = _PIXEL_SECONDS[settings.precision] * _ASPECT * side**2
+    scales = scale_count(int(_ASPECT * side), int(side), settings.coarsest_side)
+    evaluated = ScaleWeights(settings.scales).evaluated(scales, settings.scale_sampling)
+    network = _PIXEL_SECONDS[settings.precision] * _ASPECT * side**2 * evaluated
     step = _FIXED_SECONDS + _GAUSSIAN_SECONDS * _scene_bytes(job) / GAUSSIAN_BYTES + network
     steps = settings.steps_sos + _COARSE_FRACTION * settings.steps_coarse
     return min(settings.views_per_step * steps * step, settings.within or math.inf)

@@ -1,17 +1,33 @@
-"""Weights of the pyramid's scales: E = sum_s w_s E_transfer(s) / sum_s w_s over the scales of a view.
+"""Scales of a view, and their weights: E = sum_s w_s E_transfer(s) / sum_s w_s.
 
 By default all weights are equal, so E is the mean over scales, as in the paper. Scales of weight 0 are not computed.
+This module imports no PyTorch: the service estimates jobs with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.errors import SettingsError
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import Settings
+
+if TYPE_CHECKING:
+    from sgsst_core.scene.camera import Camera
+
+
+def scale_count(height: int, width: int, coarsest: int = COARSEST_SHORTER_SIDE) -> int:
+    """Return the number of scales n_s: halve the shorter side (integer division) until it is at most `coarsest`.
+
+    Small views have one scale.
+    """
+    count, side = 1, min(height, width)
+    while side > coarsest:
+        side //= 2
+        count += 1
+    return count
 
 
 @dataclass(frozen=True)
@@ -58,16 +74,21 @@ class ScaleWeights:
         fractions = self.fractions(chosen)
         return {scale: fractions[scale] * period ** (len(chosen) - 1 - chosen.index(scale)) for scale in drawn}
 
-    def sampled_cost(self, count: int, period: int) -> float:
-        """Return the cost of all scales but the coarsest in a mean step with `sampled` weights, relative to all of it.
+    def evaluated(self, count: int, period: int = 1) -> float:
+        """Return the pixels that a mean step with `sampled` weights evaluates, relative to those of the view.
 
         Args:
             count: Number of scales of a view.
-            period: See `sampled`.
+            period: See `sampled`; 1 for all scales in every step.
         """
-        *finer, _ = self.chosen(count)
-        costs = [(4.0**-scale, float(period) ** -(len(finer) - place)) for place, scale in enumerate(finer)]
-        return sum(cost * fraction for cost, fraction in costs) / sum(cost for cost, _ in costs) if costs else 1.0
+        coarsest_first = reversed(self.chosen(count))
+        return sum(4.0**-scale * float(period) ** -place for place, scale in enumerate(coarsest_first))
+
+    def sampled_cost(self, count: int, period: int) -> float:
+        """Return the cost of all scales but the coarsest in a mean step, relative to a step with all scales."""
+        *finer, coarsest = self.chosen(count)
+        always = 4.0**-coarsest
+        return (self.evaluated(count, period) - always) / (self.evaluated(count) - always) if finer else 1.0
 
     def mean(self, losses: Mapping[int, float]) -> float:
         """Return E, the weighted mean of losses by scale. Every scale in `losses` must have a positive weight."""

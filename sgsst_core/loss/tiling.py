@@ -16,10 +16,9 @@ from sgsst_core.features.partition import (
     partition,
     scaled_region,
 )
-from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
+from sgsst_core.loss.scale_weights import EVEN, ScaleWeights, scale_count
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Piece, Shares, Size, divide
-from sgsst_core.scene.pyramid import scale_count
 
 #: Cost of rendering a pixel and its gradient, relative to that of a pixel in the network, by device. It is a constant,
 #: so that the division of work, and with it the rounding, does not depend on timings. On a CPU it was measured as 0.004

@@ -13,7 +13,7 @@ from sgsst_core.decision import ANOTHER_LOSS, VIEWS, Decision
 from sgsst_core.loss.convergence import MIN_FALL, window_length
 from sgsst_core.loss.graphs import FIRST_VISITS, failure_is_fatal
 from sgsst_core.loss.nearest import MAX_VECTORS, NEAREST_WEIGHTS
-from sgsst_core.loss.scale_weights import ScaleWeights
+from sgsst_core.loss.scale_weights import ScaleWeights, scale_count
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.number_format import duration
 from sgsst_core.parallel.division import Size
@@ -21,7 +21,6 @@ from sgsst_core.planning.context import LEAST_VISITS, Facts, NetworkPixels, Savi
 from sgsst_core.planning.measurement_choice import LOSS_VIEWS
 from sgsst_core.planning.plan import Plan, Shape
 from sgsst_core.rasterizer import RASTERIZERS
-from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import CachedWeights, PlannedBackground, PlannedPrecision, Settings
 
 #: Fraction of uncovered pixels above which statistics are weighted by coverage, unless the settings say otherwise.

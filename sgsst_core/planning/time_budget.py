@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from sgsst_core.decision import Decision
+from sgsst_core.loss.scale_weights import ScaleWeights, scale_count
 from sgsst_core.number_format import duration
 from sgsst_core.scene.camera import Camera, resized, spread
-from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import Settings
 
 #: Function that returns the seconds that are left of a time budget.
@@ -218,8 +218,8 @@ def pixels_of(cameras: Sequence[Camera], side: int, settings: Settings) -> tuple
     pixels, most = 0.0, 1
     for camera in (resized(each, min(side, each.side)) for each in cameras):
         scales = scale_count(camera.height, camera.width, settings.coarsest_side)
-        parts = (0.25**scale / settings.scale_sampling ** (scales - 1 - scale) for scale in range(scales))
-        pixels += camera.width * camera.height * sum(parts)
+        evaluated = ScaleWeights(settings.scales).evaluated(scales, settings.scale_sampling)
+        pixels += camera.width * camera.height * evaluated
         most = max(most, scales)
     return pixels / len(cameras), most
 

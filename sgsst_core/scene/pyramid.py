@@ -1,26 +1,12 @@
-"""Image pyramid: exact 2^s x 2^s box averages, their adjoint, and the number of scales."""
+"""Image pyramid: exact 2^s x 2^s box averages, and their adjoint."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from sgsst_core.constants import COARSEST_SHORTER_SIDE
-
 #: A style image is downscaled only if it is larger than the view by more than this factor.
 STYLE_SIZE_TOLERANCE = 1.1
-
-
-def scale_count(height: int, width: int, coarsest: int = COARSEST_SHORTER_SIDE) -> int:
-    """Return the number of scales n_s: halve the shorter side (integer division) until it is at most `coarsest`.
-
-    Small views have one scale.
-    """
-    count, side = 1, min(height, width)
-    while side > coarsest:
-        side //= 2
-        count += 1
-    return count
 
 
 def downscale(image: Tensor, scale: int) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from sgsst_core.budget import measuring_memory, memory_for, peak_memory
 from sgsst_core.decision import Decision
-from sgsst_core.loss.scale_weights import ScaleWeights
+from sgsst_core.loss.scale_weights import ScaleWeights, scale_count
 from sgsst_core.number_format import duration
 from sgsst_core.planning import choices
 from sgsst_core.planning.context import Facts, NetworkPixels, Saving
@@ -22,7 +22,6 @@ from sgsst_core.planning.measurement_choice import (
     novel_view_seconds,
 )
 from sgsst_core.planning.plan import Plan, Prediction, Shape
-from sgsst_core.scene.pyramid import scale_count
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.trial import Trial
 

@@ -99,7 +99,7 @@ class WorkerOptions:
         resume_required: Whether resuming a job fails if no checkpoint can be used.
         workplace: Workplace for ranks on machines without a shared folder; None for this process's working folder.
         plan_file: Plan of a dry run, to use if it was made for the same job; None for none.
-        started: Start of the job's time budget, in seconds since the epoch; the default is now.
+        started: Start of the job and of its time budget, in seconds since the epoch; the default is now.
     """
 
     rank_timeout: float = RunOptions().rank_timeout

@@ -332,8 +332,10 @@ def job(scene: int, **parameters: Any) -> JobRow:
     [
         ({"preset": "preview"}, 1),
         ({"preset": "paper", "resolution": 5187}, 8),
-        ({"resolution": 5187}, 3),
-        ({"resolution": 5187, "precision": "float32"}, 8),
+        ({"resolution": 5187}, 1),
+        ({"resolution": 5187, "scale_sampling": 1}, 3),
+        ({"resolution": 5187, "precision": "float32"}, 3),
+        ({"resolution": 5187, "precision": "float32", "within": 5}, 1),
         ({"preset": "paper", "resolution": 5187, "max_resolution": 64, "steps_sos": 7}, 1),
         ({"steps_sos": "many", "preset": "unknown", "resolution": "large", "bygone": 1}, 1),
     ],
@@ -349,6 +351,12 @@ def test_estimated_seconds_do_not_depend_on_the_format() -> None:
     for name, scene in (("s.compressed.ply", 61_000_000), ("s.SPZ", 25_000_000), ("s.splat", 32_000_000)):
         row = JobRow(id="job", parameters={}, inputs=[{"role": "scene", "name": name, "size": scene}])
         assert estimated_seconds(row) == plain
+
+
+def test_estimated_seconds_end_with_the_time_budget() -> None:
+    long = {"preset": "paper", "resolution": 5187}
+    assert estimated_seconds(job(GB, **long)) > 1000
+    assert estimated_seconds(job(GB, **long, within=30)) == 30
 
 
 def test_memory_limit_of_a_single_job_is_at_most_its_fraction_of_the_machine() -> None:

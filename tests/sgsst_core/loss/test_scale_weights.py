@@ -91,6 +91,9 @@ def test_mean_gradient_of_all_draws_is_that_of_the_whole_loss(
 
 
 def test_cost_of_drawn_scales_is_the_mean_over_draws() -> None:
+    assert EVEN.evaluated(3) == pytest.approx(1 + 1 / 4 + 1 / 16)
+    assert EVEN.evaluated(3, 2) == pytest.approx(1 / 4 + 1 / 8 + 1 / 16)
+    assert ScaleWeights((1.0, 0.0, 2.0)).evaluated(3, 3) == pytest.approx(1 / 3 + 1 / 16)
     assert EVEN.sampled_cost(3, 1) == EVEN.sampled_cost(1, 5) == 1
     assert EVEN.sampled_cost(2, 4) == pytest.approx(1 / 4)
     assert EVEN.sampled_cost(3, 2) == pytest.approx((16 / 4 + 4 / 2) / 20)

@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from sgsst_core.scene.pyramid import add_upscaled_, downscale, scale_count, style_size
+from sgsst_core.loss.scale_weights import scale_count
+from sgsst_core.scene.pyramid import add_upscaled_, downscale, style_size
 
 
 @pytest.mark.parametrize(
