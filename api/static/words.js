@@ -49,7 +49,7 @@ export const words = {
     notScene: `Not a scene file. Use ${titles}.`,
     notShown: (/** @type {string} */ title) => `${title} can't be previewed. You can still upload it; the result will be shown.`,
     notPly: "Not a PLY file.",
-    notBinary: "Only binary little-endian PLY can be previewed. The service may still accept this file.",
+    notBinary: "Big-endian PLY can't be previewed. The service may still accept this file.",
     notGaussians: "This PLY contains no 3D Gaussians that can be previewed.",
     noSplats: "This GLB contains no 3D Gaussians.",
     newSog: "This SOG version can't be previewed. You can still upload it; the result will be shown.",

@@ -57,6 +57,13 @@ export class ByteReader {
     return found;
   }
 
+  /** Take the bytes that arrive next; null at the end. @returns {Promise<Uint8Array | null>} */
+  async some() {
+    const { rest } = this;
+    this.rest = new Uint8Array(0);
+    return rest.length ? rest : (await this.reader.read()).value ?? null;
+  }
+
   /**
    * Take all remaining bytes.
    *

@@ -10,7 +10,8 @@ import { words } from "../words.js";
 /**
  * @typedef {{offset: number, type: string}} Column `offset`: bytes from the start of a row
  * @typedef {{name: string, count: number, stride: number, columns: Record<string, Column>}} Element `stride`: bytes of a row
- * @typedef {{begin: number, elements: Element[], comments: string[]}} Header `begin`: bytes of the header
+ * @typedef {{begin: number, elements: Element[], comments: string[], text: boolean}} Header `begin`: bytes of the header;
+ *   `text`: whether values are written as text
  */
 
 const SIZES = /** @type {Record<string, number>} */ ({
@@ -20,7 +21,8 @@ const SIZES = /** @type {Record<string, number>} */ ({
 const NEEDED = ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0", "f_dc_1", "f_dc_2"];
 /** SH degree by the number of coefficients above degree 0. */
 export const DEGREES = /** @type {Record<number, number>} */ ({ 0: 0, 9: 1, 24: 2, 45: 3 });
-/** Maximum bytes of a header. */
+const TEXT = "format ascii 1.0";
+/** Maximum bytes of a header, and of a line of text. */
 const LONGEST_HEADER = 1 << 16;
 
 /**
@@ -36,7 +38,7 @@ export async function readHeader(reader) {
       await reader.take(begin);
       const lines = text.slice(0, end.index).split(/\r?\n/);
       const comments = lines.filter((line) => line.startsWith("comment ")).map((line) => line.slice(8).trim());
-      return { begin, elements: elementsOf(lines), comments };
+      return { begin, elements: elementsOf(lines), comments, text: lines.includes(TEXT) };
     }
     if (text.length < size) throw new CutError(words.scene.cut);
     if (size >= LONGEST_HEADER) throw new SceneError(words.scene.notPly);
@@ -48,7 +50,8 @@ export async function readHeader(reader) {
  * @param {number} size size of the file in bytes; 0 if unknown
  * @throws {CutError} if the file is shorter than its header states
  */
-export function checkLength({ begin, elements }, size) {
+export function checkLength({ begin, elements, text }, size) {
+  if (text) return; // the length of a line is not known
   const declared = elements.reduce((sum, { count, stride }) => sum + count * stride, begin);
   if (size && declared > size) throw new CutError(words.scene.shorter(elements.find(({ name }) => name === "vertex")?.count ?? 0, declared, size));
 }
@@ -58,7 +61,7 @@ export function checkLength({ begin, elements }, size) {
  * @returns {Element[]}
  */
 function elementsOf(lines) {
-  if (!lines.includes("format binary_little_endian 1.0")) throw new SceneError(words.scene.notBinary);
+  if (!lines.includes("format binary_little_endian 1.0") && !lines.includes(TEXT)) throw new SceneError(words.scene.notBinary);
   /** @type {Element[]} */
   const elements = [];
   for (const line of lines) {
@@ -77,7 +80,7 @@ function elementsOf(lines) {
  * @param {Header} header
  * @returns {SceneFile}
  */
-export function plainPly(reader, { elements, comments }) {
+export function plainPly(reader, { elements, comments, text }) {
   const [vertex] = elements, names = Object.keys(vertex?.columns ?? {}), rest = names.filter((name) => name.startsWith("f_rest_")).length;
   const wrong = vertex?.name !== "vertex" || !(vertex.count > 0) || !(vertex.stride > 0) || NEEDED.some((name) => !vertex.columns[name] && !(name === "scale_2" && isFlat(names)));
   if (wrong || !(rest in DEGREES)) {
@@ -89,13 +92,50 @@ export function plainPly(reader, { elements, comments }) {
     count: vertex.count, degree: DEGREES[rest], width: names.length + Number(flat), at,
     rendering: plyRendering(comments, names),
     async *batches() {
+      const written = text ? textLines(reader) : null;
       for (let begin = 0; begin < vertex.count; begin += BATCH) {
-        const rows = floats(vertex, await reader.take(Math.min(BATCH, vertex.count - begin) * vertex.stride));
+        const count = Math.min(BATCH, vertex.count - begin);
+        const rows = written ? await numbers(written, count, names.length) : floats(vertex, await reader.take(count * vertex.stride));
         if (at.filter_3D !== undefined) applyFilter(rows, names.length, at);
         yield flat ? withoutThickness(rows, names.length) : rows;
       }
     },
   };
+}
+
+/**
+ * Yield the lines of a text that are not empty.
+ *
+ * @param {ByteReader} reader
+ */
+async function* textLines(reader) {
+  for (let line = ""; ;) {
+    const part = await reader.some();
+    const [...whole] = (line + new TextDecoder("latin1").decode(part ?? new Uint8Array(0))).split("\n");
+    line = part ? /** @type {string} */ (whole.pop()) : "";
+    if (line.length > LONGEST_HEADER) throw new SceneError(words.scene.unreadable);
+    for (const each of whole) if (each.trim()) yield each.trim();
+    if (!part) return;
+  }
+}
+
+/**
+ * Return the numbers of the next lines, which are rows.
+ *
+ * @param {AsyncGenerator<string>} written
+ * @param {number} count
+ * @param {number} width
+ */
+async function numbers(written, count, width) {
+  const rows = new Float32Array(count * width);
+  for (let row = 0; row < count; row++) {
+    const { value } = await written.next();
+    if (value === undefined) throw new CutError(words.scene.cut);
+    const values = value.split(/\s+/);
+    if (values.length !== width) throw new SceneError(words.scene.unreadable);
+    rows.set(values.map(Number), row * width);
+  }
+  return rows;
 }
 
 /**

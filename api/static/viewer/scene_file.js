@@ -33,7 +33,7 @@ export async function openScene(reader, size) {
   if (magic.startsWith("ply")) {
     const header = await readHeader(reader);
     checkLength(header, size);
-    return header.elements.some(({ name }) => name === "chunk") ? compressedPly(reader, header) : plainPly(reader, header);
+    return header.elements.some(({ name }) => name === "chunk") && !header.text ? compressedPly(reader, header) : plainPly(reader, header);
   }
   if (start[0] === 0x1f && start[1] === 0x8b) return spz(reader.piped(/** @type {any} */ (new DecompressionStream("gzip"))));
   if (magic === "NGSP") return start[4] < 4 ? spz(reader) : spz4(reader);

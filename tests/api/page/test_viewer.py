@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.files.camera_files import read_cameras
@@ -111,12 +112,15 @@ def test_antialiased_scenes_are_shown_as_such(visit: Visit, tmp_path: Path, form
     assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=True)
 
 
-def test_filtered_and_flat_scenes_are_shown(visit: Visit, tmp_path: Path) -> None:
+def test_filtered_flat_and_text_scenes_are_shown(visit: Visit, tmp_path: Path) -> None:
     ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
     watched = visit("/#/jobs")
     with_filter(ply, dust(), torch.linspace(0, 0.02, len(dust())))
     assert_shown_like(watched, tmp_path, ply, differs=True)
     without_thickness(ply, dust())
+    assert_shown_like(watched, tmp_path, ply, differs=False)
+    write_scene(ply, dust())
+    PlyData(PlyData.read(ply).elements, text=True).write(ply)
     assert_shown_like(watched, tmp_path, ply, differs=False)
 
 
@@ -369,9 +373,10 @@ def test_lost_graphics_device_comes_back(visit: Visit, tmp_path: Path) -> None:
         (b"NGSP\4\0\0\0" + b"\1\0\0\0" + bytes(60), "Couldn't read the scene."),
         (gzip.compress(b"no scene, but text that somebody has packed"), "Not a scene file"),
         (
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
-            "Only binary little-endian PLY",
+            b"ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234",
+            "Big-endian PLY",
         ),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no 3D Gaussians"),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234",
             "no 3D Gaussians",
