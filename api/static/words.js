@@ -152,7 +152,7 @@ export const words = {
       feature_scale: "Layer weighting", style_loss: "Style comparison", position_weights: "Ignore empty background", precision: "Precision", training_background: "Background while painting",
       scales: "Scale weights", scale_sampling: "Fine details in one visit of", seed: "Random seed", memory_limit: "Memory limit", coarsest_side: "Smallest view size", warm_start: "Start from the painting's colors",
       clamp_aware_gradient: "Recover clamped colors", bounded: "Keep colors displayable", early_stop: "Stop when nothing changes", target_loss: "Stop at this loss", cached_weights: "Cached blend weights",
-      views_per_step: "Views per step", rebalance: "Balance the workers", measure: "Quality check", backbone: "Feature network", workers: "Workers",
+      views_per_step: "Views per step", rebalance: "Balance the workers", measure: "Quality check", backbone: "Feature network", pad_sh: "PLY for Unity plugins", workers: "Workers",
     }),
     help: /** @type {Record<string, string>} */ ({
       content_weight: "The strength as a number: lower values give more style, higher ones keep more of the original.",
