@@ -42,9 +42,9 @@ from sgsst_core.files.formats.sog import (
 
 #: Name of the index in a folder or an archive.
 INDEX_NAME = "lod-meta.json"
-_MAX_INDEX_BYTES = 1 << 22
+_MAX_INDEX_BYTES = 1 << 21
 #: Maximum bytes of the list of an archive's files, and number of SOG scenes; usual ones have half a million Gaussians.
-_MAX_LIST_BYTES, _MAX_PARTS = 1 << 23, 1024
+_MAX_LIST_BYTES, _MAX_PARTS = 1 << 21, 1024
 #: Path of the meta.json of a part: in folders below the index, so that no other files are read.
 _PART = re.compile(rf"((?:[\w-][\w.-]{{0,99}}/){{1,4}}){re.escape(META_NAME)}")
 
