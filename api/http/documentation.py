@@ -151,6 +151,7 @@ _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
         problems.INVALID_INPUT,
         problems.TOO_MANY_GAUSSIANS,
         problems.TOO_MANY_VIEWS,
+        problems.UNSURE_UP,
         problems.TOO_MANY_PIXELS,
         problems.IMAGE_TOO_LARGE,
         problems.TOO_MANY_FILES,
