@@ -296,7 +296,9 @@ def test_ctrl_c_saves_and_printed_command_resumes(tmp_path: Path) -> None:
     resume_command = shlex.split(error.strip().splitlines()[-1])
     assert resume_command == ["sgsst", *arguments, "--resume"]
     process = start(resume_command[1:])
-    shown, error = process.communicate(timeout=240)
+    assert process.stdout is not None
+    shown = process.stdout.read()  # `communicate` would lose what has been read along with the plan
+    _, error = process.communicate(timeout=240)
     assert process.returncode == 0, error
     assert "resuming" in shown
     report = json.loads(request.out.with_name("s.report.json").read_text())
