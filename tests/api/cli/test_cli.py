@@ -25,6 +25,7 @@ import torch
 import typer
 from PIL import Image
 from plyfile import PlyData
+from torch import Tensor
 
 from api.cli.main import app, main
 from sgsst_core.features.network_weights import BackboneWeights, cache_folder
@@ -814,8 +815,10 @@ def test_padded_plys_have_248_bytes_a_row(files: Files, capsys: pytest.CaptureFi
         assert [line.split()[2] for line in head.splitlines() if b" f_rest" in line] == [
             f"f_rest_{i}".encode() for i in range(45)
         ]
-        rest = read_scene(path).scene.sh_rest
-        assert torch.equal(rest[:, :3], read_scene(files.ply).scene.sh_rest)
+        rest, before = read_scene(path).scene.sh_rest, read_scene(files.ply).scene.sh_rest
+        assert isinstance(rest, Tensor)
+        assert isinstance(before, Tensor)
+        assert torch.equal(rest[:, :3], before)
         assert not rest[:, 3:].any()
     assert main(["convert", str(files.ply), str(converted.with_suffix(".spz")), "--pad-sh"]) == 2
     assert "only a PLY can be padded" in capsys.readouterr().err

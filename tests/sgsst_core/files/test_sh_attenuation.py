@@ -82,9 +82,10 @@ def test_file_contains_the_attenuated_coefficients(tmp_path: Path, form: str, at
 
 def test_file_is_bit_identical_without_attenuation(tmp_path: Path) -> None:
     source = read_scene(written(tmp_path))
-    for name, values in (("a", {}), ("b", {"sh_attenuation": 0.0}), ("c", {"sh_attenuation": 1e-9})):
-        write_stylized(source, tmp_path / f"{name}.ply", source.scene.sh_dc, **values)
-        assert (tmp_path / f"{name}.ply").read_bytes() == source.path.read_bytes()
+    for attenuation in (0.0, 1e-9):
+        path = tmp_path / f"{attenuation}.ply"
+        write_stylized(source, path, source.scene.sh_dc, sh_attenuation=attenuation)
+        assert path.read_bytes() == source.path.read_bytes()
     assert source.scene.attenuated(0) is source.scene
 
 

@@ -11,7 +11,6 @@ from sgsst_core.loss.scale_weights import scale_count
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.targets import StyleTarget
 from sgsst_core.loss.terms import layers_of
-from sgsst_core.scene import pyramid
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.style import Style
 from tests.networks import comparing_pixels
@@ -92,7 +91,7 @@ def check_against_untiled_autograd(weights, size, tile_sizes, covered, coarsest)
     network = FeatureNetwork(weights, layers_of("sos", weights, content=True), torch.float64)
     for tile_size in tile_sizes:
         result = evaluate(network, case, tile_size, coarsest=coarsest)
-        assert len(result.terms) == pyramid.scale_count(*size, coarsest)
+        assert len(result.terms) == scale_count(*size, coarsest)
         assert result.loss == pytest.approx(expected, rel=FLOAT64_TOLERANCE)
         assert relative_error(result.image_gradient, expected_gradient) < FLOAT64_TOLERANCE
 

@@ -20,6 +20,7 @@ from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
+from sgsst_core.loss.scale_weights import scale_count
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.statistics_terms import GRAM_WEIGHT
 from sgsst_core.planning.measurement_choice import LEVELS
@@ -28,10 +29,9 @@ from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.novel_cameras import neighbors
 from sgsst_core.quality.novel_views import MAX_VIEWS, NovelViews
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.scene import pyramid
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
 from sgsst_core.scene.gaussians import TENSORS, Scene, sampled
-from sgsst_core.scene.pyramid import resize_area
+from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Style
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
@@ -231,7 +231,7 @@ def gram_reference(weights, image: Tensor, painting: Tensor, coverage: Tensor | 
         return (flat * a[:, None]).T @ flat / a.sum()
 
     result = {}
-    for scale in range(pyramid.scale_count(image.shape[0], image.shape[1], COARSEST)):
+    for scale in range(scale_count(image.shape[0], image.shape[1], COARSEST)):
         side = 1 << scale
         seen, wanted = (
             features_reference(weights, box_average_reference(each.double(), side)) for each in (image, painting)
@@ -253,7 +253,7 @@ def test_gram_distance_agrees_with_float64(tiny_weights, network, scene: Scene, 
     assert measured.views == [0, 1, 2, 3]
     sh_dc = 4 * scene.sh_dc  # colors far outside 0 to 1
     reference = make_rasterizer("reference", scene, background=(0.2, 0.3, 0.4))
-    painting = resize_area(style(), pyramid.style_size((96, 80), (48, 64)))
+    painting = resize_area(style(), style_size((96, 80), (48, 64)))
     expected: dict[int, float] = {0: 0.0, 1: 0.0}
     for first, second in itertools.pairwise(views[:5]):
         camera = between(first, second)
