@@ -28,8 +28,8 @@ _WEIGHT = torch.tensor(
 )
 #: Side of the window of results.
 _SIDE = 4
-#: Windows per matrix product: their transforms fit the caches, and the number does not depend on the threads, so that
-#: the results do not either.
+#: Most windows per matrix product: their transforms fit the caches, and the number does not depend on the threads, so
+#: that the results do not either.
 _WINDOWS = 128
 #: Least channels on either side. Transforms take as long for each channel, matrix products longer the more there are.
 _LEAST_CHANNELS = 64
@@ -73,11 +73,12 @@ def convolve(x: Tensor, transformed: Tensor, bias: Tensor | None = None) -> Tens
     added = torch.zeros(out.shape[2]) if bias is None else bias
     lowest = -torch.inf if bias is None else 0.0
     columns, windows = _rows(width), _rows(height) * _rows(width)
-    sources = torch.empty(36 * _WINDOWS * channels)
-    products = torch.empty(36 * _WINDOWS * out.shape[2])
+    together = -(-windows // -(-windows // _WINDOWS))
+    sources = torch.empty(36 * together * channels)
+    products = torch.empty(36 * together * out.shape[2])
     with kernel_threads():
-        for first in range(0, windows, _WINDOWS):
-            count = min(_WINDOWS, windows - first)
+        for first in range(0, windows, together):
+            count = min(together, windows - first)
             source = sources[: 36 * count * channels].view(36, count, channels)
             product = products[: 36 * count * out.shape[2]].view(36, count, out.shape[2])
             kernels.transform_windows(cells, first, columns, source.numpy())

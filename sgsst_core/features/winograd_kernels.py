@@ -12,7 +12,7 @@ from sgsst_core.compiled import compiled
 
 #: Windows that a thread transforms with the same working memory.
 _TOGETHER = 8
-_TWO, _FOUR, _FIVE, _EIGHT = np.float32(2), np.float32(4), np.float32(5), np.float32(8)
+_TWO, _FOUR, _EIGHT = np.float32(2), np.float32(4), np.float32(8)
 
 
 @compiled(parallel=True)
@@ -86,16 +86,20 @@ def _cell(x, i, j, nothing):
 
 @compiled()
 def _transform_six(a, b, c, d, e, f, to_a, to_b, to_c, to_d, to_e, to_f):
-    """Write one direction of the transform of a window, for all channels."""
+    """Write one direction of the transform of a window, for all channels.
+
+    All but the second transform of equal values are exactly 0. Results are therefore equal where all values are, as
+    those of direct convolutions, and the first of the equal values of a pooling window is its maximum.
+    """
     for k in range(a.size):
         even, odd = e[k] - _FOUR * c[k], d[k] - _FOUR * b[k]
         far, apart = e[k] - c[k], _TWO * (d[k] - b[k])
-        to_a[k] = _FOUR * a[k] - _FIVE * c[k] + e[k]
+        to_a[k] = _FOUR * (a[k] - c[k]) + (e[k] - c[k])
         to_b[k] = even + odd
         to_c[k] = even - odd
         to_d[k] = far + apart
         to_e[k] = far - apart
-        to_f[k] = _FOUR * b[k] - _FIVE * d[k] + f[k]
+        to_f[k] = _FOUR * (b[k] - d[k]) + (f[k] - d[k])
 
 
 @compiled()

@@ -126,12 +126,13 @@ def choose_precision(facts: Facts, settings: Settings) -> PlannedPrecision:
     if settings.precision != "auto":
         requested = measured.get(settings.precision) if settings.precision != "float32" else None
         return settings.precision if requested and requested.error else "float32"
+    on_cpu = facts.machine.device == "cpu"
     errors = {
         name: own.error.relative_error
         for name, own in measured.items()
-        if own.error and own.error.relative_error <= _LARGEST_ERROR and own.speedup > 1
+        if own.error and own.error.relative_error <= _LARGEST_ERROR and (on_cpu or own.speedup > 1)
     }
-    if facts.machine.device == "cpu":
+    if on_cpu:
         chosen: PlannedPrecision = "float32"
         for name in sorted(errors, key=lambda name: errors[name]):
             before = 1.0 if chosen == "float32" else measured[chosen].convolution

@@ -152,7 +152,8 @@ class Comparison:
     Attributes:
         convolution: Ratio of the time of a convolution in float32 to that in this precision.
         speedup: The same ratio for the loss of a view and its gradient; 0 if a convolution is not faster.
-        error: Error of the view's pixel gradient relative to float32; None if a convolution is not faster.
+        error: Error of the gradient of the view's pixels that show more than background, relative to float32; None if a
+            convolution is not faster.
     """
 
     convolution: float
@@ -447,6 +448,8 @@ def compare_precisions(
     image = context.rasterizer.render(colors.to(context.rasterizer.device), camera).to(context.network.device)
     longer, shorter = max(image.shape[:2]) / _COMPARED_SIDE[device], min(image.shape[:2])
     image = downscale(image, min(max(0, math.ceil(math.log2(longer))), shorter.bit_length() - 1))
+    # The gradient of background depends on which of equal values a pooling window chooses, and changes no Gaussian.
+    seen = (image != torch.tensor(context.settings.background).to(image)).any(dim=-1)
     exact, seconds = compared_gradient(context, context.network, image)
     result = {}
     for name in precisions:
@@ -454,7 +457,7 @@ def compare_precisions(
         if name in faster:
             network = make_network(context.weights, context.settings, name, device)
             gradient, own = compared_gradient(context, network, image)
-            result[name] = Comparison(ratios[name], seconds / own, Difference.of(gradient, exact))
+            result[name] = Comparison(ratios[name], seconds / own, Difference.of(gradient[seen], exact[seen]))
     return result
 
 
