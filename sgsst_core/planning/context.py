@@ -58,6 +58,8 @@ _SIDE: dict[Device, int] = {"cpu": 48, "cuda": 256}
 #: slower than `_SLOW` seconds, as on CPUs that emulate the precision.
 _MEASUREMENTS = 5
 _SLOW = 0.5
+#: Resolution in seconds of a process's processor time while it is limited, as in the service's confined processes.
+_TICK = 0.004
 #: Maximum longer side of the view on which another precision is compared with float32, and number of comparisons, of
 #: which the fastest counts. CPUs take processor time, which other processes hardly change.
 _COMPARED_SIDE: dict[Device, int] = {"cpu": 160, "cuda": 2048}
@@ -417,10 +419,10 @@ def _convolution_seconds(precision: PlannedPrecision, device: Device) -> float:
     seconds = []
     with convolutions(image.device, tf32=precision == "tf32"):
         for _ in range(1 + _MEASUREMENTS):
-            timer, started = Timer(device), time.process_time()
+            timer, started = Timer(device), time.thread_time()
             with timer("convolution"):
                 convolve(image)
-            seconds.append(timer.read()["convolution"] if device == "cuda" else time.process_time() - started)
+            seconds.append(timer.read()["convolution"] if device == "cuda" else time.thread_time() - started)
             if seconds[-1] > _SLOW:
                 break
     return min(seconds[1:] or seconds)
@@ -457,7 +459,7 @@ def compare_precisions(
         if name in faster:
             network = make_network(context.weights, context.settings, name, device)
             gradient, own = compared_gradient(context, network, image)
-            result[name] = Comparison(ratios[name], seconds / own, Difference.of(gradient[seen], exact[seen]))
+            result[name] = Comparison(ratios[name], seconds / max(own, _TICK), Difference.of(gradient[seen], exact[seen]))
     return result
 
 
