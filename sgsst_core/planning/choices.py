@@ -33,10 +33,11 @@ _SCAN = 0.2
 _VIEW_DEPENDENT = 0.05
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
-#: Speedup of convolutions from which on a CPU uses a precision instead of a more accurate one, so that runs on one
-#: machine choose alike: Winograd's algorithm reaches 1.9 to 2.4. Processors with instructions for bfloat16 reach as
-#: much, or several times more with matrix units. The speedup of a view's loss would depend on its size.
-_MUCH_FASTER = 1.5
+#: Speedup of convolutions from which on a CPU uses a precision instead of the more accurate one before it. Runs on one
+#: machine must choose alike, also if it is busy: Winograd's algorithm reaches 1.7 to 2.2, and processors with
+#: instructions for bfloat16 2.0 to 2.4, or several times more with matrix units. The speedup of a view's loss would
+#: depend on its size.
+_LEAST_SPEEDUP: dict[PlannedPrecision, float] = {"winograd": 1.2, "bfloat16": 2.0}
 #: GPU that computes in each precision.
 _GPU = "an NVIDIA GPU of compute capability 8.0 or higher"
 #: Fraction of the greatest speedup that a more accurate precision must reach on a GPU.
@@ -134,9 +135,9 @@ def choose_precision(facts: Facts, settings: Settings) -> PlannedPrecision:
     }
     if on_cpu:
         chosen: PlannedPrecision = "float32"
-        for name in sorted(errors, key=lambda name: errors[name]):
+        for name, least in _LEAST_SPEEDUP.items():
             before = 1.0 if chosen == "float32" else measured[chosen].convolution
-            chosen = name if measured[name].convolution >= _MUCH_FASTER * before else chosen
+            chosen = name if name in errors and measured[name].convolution >= least * before else chosen
         return chosen
     most = max((measured[name].speedup for name in errors), default=0.0)
     fastest = [name for name in errors if measured[name].speedup >= _AS_FAST * most]
@@ -566,8 +567,8 @@ def _about_precision(plan: Plan, facts: Facts, settings: Settings, parts: Mappin
     elif not measured:
         reason = "exact; this device has no faster precision"
     else:
-        least = f"{_MUCH_FASTER} times faster convolutions" if facts.machine.device == "cpu" else "a faster loss"
-        reason = f"exact; {reason}, but {least} and an error of at most {_LARGEST_ERROR} are needed"
+        faster = "much faster convolutions" if facts.machine.device == "cpu" else "a faster loss"
+        reason = f"exact; {reason}, but {faster} and an error of at most {_LARGEST_ERROR} are needed"
     yield Decision("precision", "features in float32", reason)
 
 
