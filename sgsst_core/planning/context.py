@@ -459,7 +459,8 @@ def compare_precisions(
         if name in faster:
             network = make_network(context.weights, context.settings, name, device)
             gradient, own = compared_gradient(context, network, image)
-            result[name] = Comparison(ratios[name], seconds / max(own, _TICK), Difference.of(gradient[seen], exact[seen]))
+            error = Difference.of(gradient[seen], exact[seen])
+            result[name] = Comparison(ratios[name], seconds / max(own, _TICK), error)
     return result
 
 
