@@ -29,7 +29,7 @@ STORE = RESULTS / "error_time.json"
 #: Evaluations that the table shows: after an eighth and all of the seconds.
 SHOWN = (2, 5)
 #: Variants in the order of their columns, lines and colors.
-VARIANTS = ("standard", "preview", "paper", "bfloat16")
+VARIANTS = ("standard", "float32", "preview", "paper")
 HEAD = f"| pair | after | {' | '.join(VARIANTS)} |\n|---|---|{'---|' * len(VARIANTS)}"
 #: Size of the figure in inches, and its resolution.
 SIZE, DPI = (11, 5), 80
