@@ -37,7 +37,7 @@ _SCAN_BACKGROUND: PlannedBackground = "palette"
 #: machine must choose alike, also if it is busy: Winograd's algorithm reaches 1.7 to 2.2, and processors with
 #: instructions for bfloat16 2.0 to 2.4, or several times more with matrix units. The speedup of a view's loss would
 #: depend on its size.
-_LEAST_SPEEDUP: dict[PlannedPrecision, float] = {"winograd": 1.2, "bfloat16": 2.0}
+_LEAST_SPEEDUP: dict[PlannedPrecision, float] = {"winograd": 1.0, "bfloat16": 2.0}
 #: GPU that computes in each precision.
 _GPU = "an NVIDIA GPU of compute capability 8.0 or higher"
 #: Fraction of the greatest speedup that a more accurate precision must reach on a GPU.

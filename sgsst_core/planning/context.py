@@ -56,7 +56,7 @@ _CHANNELS: dict[Device, int] = {"cpu": 128, "cuda": 256}
 _SIDE: dict[Device, int] = {"cpu": 48, "cuda": 256}
 #: Number of measurements, of which the fastest counts: another process can interrupt one. A single one counts if it is
 #: slower than `_SLOW` seconds, as on CPUs that emulate the precision.
-_MEASUREMENTS = 5
+_MEASUREMENTS = 10
 _SLOW = 0.5
 #: Resolution in seconds of a process's processor time while it is limited, as in the service's confined processes.
 _TICK = 0.004
