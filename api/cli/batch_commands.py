@@ -65,8 +65,10 @@ class _Batch:
         try:
             entries = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
             self._entries = {name: _Entry(**entry) for name, entry in entries.items()}
-        except (OSError, ValueError, TypeError, AttributeError):  # none yet, or not one of this program
+        except FileNotFoundError:
             self._entries = {}
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise InvalidInputError(f"{folder / _RECORD}: is no record of a batch. Choose another --out.") from error
 
     def result(self, name: str) -> Path:
         """Return the path of a result."""
@@ -233,11 +235,12 @@ def _submitted(client: Client, job_id: str, name: str, request: JobSpec, options
 def _inputs(request: JobSpec) -> str:
     """Return the digest of everything that a result is made from: the contents of its files, and its options."""
     source, scene = request.source, scene_path(request.source.scene)
-    files = [scene, *(image.path for image in request.styles)]
-    files += sorted(scene.parent.rglob("*.webp")) if scene.suffix == ".json" else []  # of an unpacked scene
+    digests = [file_digest(path) for path in (scene, *(image.path for image in request.styles))]
+    names = ("*.webp", "meta.json") if scene.suffix == ".json" else ()  # of an unpacked scene
+    files = [path for name in names for path in sorted(scene.parent.rglob(name))]
     files += camera_files(source.cameras) if source.cameras else []
     paths: Any = {"source": {"scene", "cameras"}, "styles": True, "out": True, "resume": True}
-    values = [request.model_dump(mode="json", exclude=paths), [file_digest(path) for path in files]]
+    values = [request.model_dump(mode="json", exclude=paths), digests, [file_digest(path) for path in files]]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 

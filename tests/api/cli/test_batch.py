@@ -79,3 +79,17 @@ def test_interrupted_result_is_resumed(arguments: list[str], tmp_path: Path, cap
     assert capfd.readouterr().out.count("resuming") == 1
     assert len(times(tmp_path / "out")) == 4
     assert all(entry["complete"] for entry in json.loads((tmp_path / "out" / "batch.json").read_text()).values())
+
+
+def test_missing_scenes_and_foreign_records_are_named(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing = tmp_path / "missing.ply"
+    assert main(["batch", str(missing), *arguments[3:]]) == 1
+    assert "missing.ply" in capsys.readouterr().err
+    record = tmp_path / "out" / "batch.json"
+    record.parent.mkdir(exist_ok=True)
+    record.write_text("[1]")
+    assert main(arguments) == 2
+    assert "is no record of a batch" in capsys.readouterr().err
+    assert record.read_text() == "[1]"
