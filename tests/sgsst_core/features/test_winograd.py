@@ -9,9 +9,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from sgsst_core.bench.synthetic import texture
 from sgsst_core.features import winograd
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss.sos import SosLoss
+from sgsst_core.style import Style
 
 #: A whole window, sides that are no multiples of it, more than one part of windows, and fewer windows than threads.
 SIZES = [(4, 4), (9, 14), (61, 45), (1, 7), (18, 3)]
@@ -116,6 +119,21 @@ def test_features_and_gradients_are_as_accurate_as_direct_ones(
     (_, direct), (features_error, fewer) = errors
     assert features_error < 5e-6
     assert 0 < fewer < max(4 * direct, 1e-4)
+
+
+def test_tiles_add_up_to_the_gradient_of_the_whole_image(vgg16_weights: BackboneWeights) -> None:
+    """Windows of deep layers begin elsewhere in a tile than in the image."""
+    network, image = FeatureNetwork(vgg16_weights, STYLE_LAYERS, winograd=True), texture(208, 176, seed=1)
+    size, gradients = (208, 176), []
+    for fraction in (4.0, 0.6):
+        memory = int(fraction * 208 * 176 * network.held_bytes_per_pixel())
+        loss = SosLoss(network, content_weight=0, memory=memory)
+        style = loss.targets.of_style(Style.of(texture(208, 176, seed=2)), size)
+        gradients.append(loss.evaluate(image, style, loss.targets.of_view(image)).image_gradient)
+    whole, tiled = gradients
+    assert whole is not None
+    assert tiled is not None
+    assert 0 < float((tiled - whole).norm() / whole.norm()) < 1e-4
 
 
 def test_winograd_requires_float32(tiny_weights: BackboneWeights) -> None:
