@@ -62,7 +62,7 @@ def pixel_gradients(
     """Compute the gradient of the pixels from that of the first convolution's output before its ReLU.
 
     A pixel's gradient comes from three rows. Each program reads one row, so that all features are read once, and
-    writes its summands for the rows above, at and below it. Rows of zeros surround the image.
+    writes its summands for the rows above, at and below it. Outside of the image, rows are 0.
 
     Args:
         gradient: [height, width, CHANNELS], bfloat16 or float16.
