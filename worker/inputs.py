@@ -12,6 +12,7 @@ import math
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -141,7 +142,7 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
         together(collectives, lambda: check_sh_attenuation(scene_file, settings.sh_attenuation))
     with errors_of("cameras"):
         check_choice(source)
-        capture = _capture_on_all_ranks(request, scene_file, images, collectives).fitted(settings)
+        capture = _capture_on_all_ranks(request, scene_file, collectives).fitted(settings)
         cameras = capture.cameras
         if limits:
             limits.check_cameras(cameras)
@@ -301,17 +302,24 @@ def load_styles(files: Sequence[StyleFile], background: Color = WHITE) -> Style:
     return Style(images, weights, names, tuple(notes))
 
 
-def _capture_on_all_ranks(request: JobSpec, file: SceneFile, images: Path | None, collectives: Collectives) -> Capture:
-    """Return the result of `read_capture`, the same on every rank.
+def _capture_on_all_ranks(request: JobSpec, file: SceneFile, collectives: Collectives) -> Capture:
+    """Return the result of `read_job_capture`, the same on every rank.
 
     Every rank reads a camera file itself. Only rank 0 computes an orbit, since processors may round differently.
     """
-    source, scene = request.source, file.scene
-    if source.cameras is None:
-        return collectives.broadcast(
-            lambda: read_capture(source, scene, remaining=cropped(request.regions, file, source.near))
-        )
-    return together(collectives, lambda: read_capture(source, scene, images))
+    read = partial(read_job_capture, request, file)
+    return collectives.broadcast(read) if request.source.cameras is None else together(collectives, read)
+
+
+def read_job_capture(request: JobSpec, file: SceneFile) -> Capture:
+    """Read or generate the cameras of a job, given its scene; an orbit surrounds what a crop leaves.
+
+    Raises:
+        InvalidInputError: If cameras or regions cannot be used; see `read_capture`.
+    """
+    source = request.source
+    remaining = cropped(request.regions, file, source.near) if source.cameras is None else None
+    return read_capture(source, file.scene, request.images, remaining)
 
 
 def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> tuple[SceneFile, Capture]:

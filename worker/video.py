@@ -11,7 +11,7 @@ import torch
 from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.images import Color
-from sgsst_core.files.scene_file import read_scene
+from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit.cameras import ELEVATION, turntable
 from sgsst_core.orbit.subject import find_subject, find_up
@@ -20,9 +20,9 @@ from sgsst_core.report.video import Layer, write_frames
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene
-from worker.capture import about_notes, about_rendering, choose_axes, orbit_request, read_capture
-from worker.inputs import check_something_in_view
-from worker.job import SceneRequest, check_choice
+from worker.capture import Capture, about_notes, about_rendering, choose_axes, orbit_request, read_capture
+from worker.inputs import check_something_in_view, read_job_capture
+from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import DEFAULT_SIDE, VideoOptions
 from worker.outputs import check_folder, check_is_not_input
 
@@ -38,7 +38,7 @@ class VideoRequest:
         background: Background color, in 0..1.
         unstylized: Scene file at the start of a transition; None for no transition.
         transparent: Whether to write an alpha channel instead of the background.
-        images: Folder of photos, for cameras whose file states no sizes.
+        job: Job whose result the scene is, for a path through the job's own views; None for those of `source`.
     """
 
     source: SceneRequest
@@ -47,7 +47,7 @@ class VideoRequest:
     background: Color
     unstylized: Path | None = None
     transparent: bool = False
-    images: Path | None = None
+    job: JobSpec | None = None
 
     @property
     def along_cameras(self) -> bool:
@@ -97,13 +97,13 @@ def render_video(
         InvalidInputError: If an input cannot be used, or the video cannot be written.
     """
     source = request.source
-    scene, decisions = _read(source)
-    before = None
+    file, decisions = _read(source)
+    scene, before = file.scene, None
     if request.unstylized is not None:
-        before, _ = _read(source.model_copy(update={"scene": request.unstylized}))
+        before = _read(source.model_copy(update={"scene": request.unstylized}))[0].scene
     through = None
     if request.along_cameras:
-        capture = read_capture(source, scene, request.images).checked(scene, source.near)
+        capture = _read_views(request, file).checked(scene, source.near)
         through, decisions = capture.cameras, [*decisions, *capture.decisions]
     cameras = video_cameras(scene, source, through, request.options, source.resolution, even=is_encoded(request.out))
     check_something_in_view(scene, cameras, source.near)
@@ -178,9 +178,19 @@ def video_cameras(
     return [framed(camera, None, even=even) for camera in cameras]
 
 
-def _read(source: SceneRequest) -> tuple[Scene, list[Decision]]:
+def _read_views(request: VideoRequest, file: SceneFile) -> Capture:
+    """Read or generate the views that a path leads through, given the scene of the video."""
+    job = request.job
+    if job is None:
+        return read_capture(request.source, file.scene)
+    if job.source.cameras is None:  # an orbit depends on the job's scene, whose Gaussians may have been split since
+        file, _ = _read(job.source)
+    return read_job_capture(job, file)
+
+
+def _read(source: SceneRequest) -> tuple[SceneFile, list[Decision]]:
     """Read a scene with the axes that its cameras suggest and the requested render mode; add decisions about both."""
     axes, decisions = choose_axes(source)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = file.rendered(source.render_mode, source.eps2d)
-    return file.scene, [*about_notes(file), *decisions, *about_rendering(file)]
+    return file, [*about_notes(file), *decisions, *about_rendering(file)]

@@ -244,16 +244,18 @@ def _video(request: WorkRequest, send: _Send) -> dict[str, Any]:
         command = install_command("video")
         raise SettingsError(f"The service cannot encode videos: its operator has to run `{command}`.") from error
     options = JobVideo(**request.options["video"])
-    source = request.source.model_copy(update={"resolution": options.resolution})
-    unstylized = Path(request.options["unstylized"]) if options.compare else None
-    background, photos = request.parameters.settings().background, request.staged.photos
+    parameters = request.parameters.model_copy(update={"resolution": options.resolution})
+    unstylized = Path(request.options["unstylized"])
+    job = job_spec(request.staged.model_copy(update={"scene": unstylized}), parameters)
+    source = job.source.model_copy(update={"scene": request.staged.scene})
     started = time.monotonic()
 
     def progress(done: int, total: int) -> None:
         left = (time.monotonic() - started) / done * (total - done)
         _show(Progress(stage="video", step=done, total=total, eta_s=left), send)
 
-    wanted = VideoRequest(source, request.output_file, options, background, unstylized, images=photos)
+    compared, background = unstylized if options.compare else None, job.settings.background
+    wanted = VideoRequest(source, request.output_file, options, background, compared, job=job)
     cameras = render_video(wanted, progress, in_place=True)
     return {"width": cameras[0].width, "height": cameras[0].height, "frames": len(cameras)}
 

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 
 from api.static_files import exported_viewer
@@ -20,6 +22,7 @@ from service.inspection.derived import MOST_BLENDS, Blend, DerivedFiles
 from service.inspection.process import WORK
 from service.inspection.work import WorkRequest
 from service.parameters import JobParameters
+from service.request import job_spec
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
@@ -28,11 +31,16 @@ from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import JobRow
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.ply import PLY
-from sgsst_core.files.scene_file import write_scene
+from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.service import PATIENCE
 from tests.raised import raises_problem
 from tests.service.store.helpers import usage_of
 from tests.small_scenes import wall, write_files
+from worker.inputs import read_job_capture
+from worker.options import JobVideo
+from worker.video import video_cameras
 
 
 @dataclass
@@ -160,3 +168,39 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
     text = Path("page.html").read_text(encoding="utf-8")
     assert ('id="colors"></script>' not in text) == holds_both
     assert '"background": [1.0, 1.0, 1.0]' in text
+
+
+def test_video_leads_through_the_views_of_a_cropped_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mask selects rows of the job's scene; the result has others, as after Gaussians were split."""
+    monkeypatch.chdir(tmp_path)
+    write_scene(Path("scene.ply"), wall())
+    write_scene(Path(RESULT), wall(30))
+    Path("mask").mkdir()
+    np.save("mask/left.npy", (wall().means[:, :2] < -0.5).all(dim=1).numpy())
+    crop = [{"name": "left", "select": "mask=left.npy"}, {"name": "rest", "freeze": True}]
+    parameters = JobParameters.model_validate({"orbit": 3, "up": "-y", "elevation": 0, "regions": crop})
+    staged = Staged(scene=Path("scene.ply"), styles=(), cameras=None, photos=None)
+    video = JobVideo(path="cameras", fps=1, seconds=1, resolution=64)
+    request = WorkRequest(
+        work="video",
+        folder=tmp_path,
+        staged=staged.model_copy(update={"scene": Path(RESULT)}),
+        parameters=parameters,
+        seconds=0,
+        memory=0,
+        options={"video": video.model_dump(), "unstylized": "scene.ply"},
+        output=("video.mp4", 0),
+    )
+    assert WORK["video"][0](request, lambda response: None)["frames"] == 1
+    with av.open("video.mp4") as container:
+        frame = next(container.decode(video=0)).to_ndarray(format="rgb24").astype(float)
+    file, result = read_scene(Path("scene.ply")), read_scene(Path(RESULT)).scene
+
+    def error(parameters: JobParameters) -> float:
+        job = job_spec(staged, parameters)
+        views = read_job_capture(job, file).cameras
+        (camera,) = video_cameras(result, job.source, views, video, 64, even=True)
+        image = make_rasterizer("cpu", result).render(scene_colors(result, camera), camera)
+        return float(np.abs(frame - 255 * image.clamp(0, 1).double().numpy()).mean())
+
+    assert error(parameters) < 15 < error(parameters.model_copy(update={"regions": None})) / 2
