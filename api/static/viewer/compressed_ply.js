@@ -22,7 +22,7 @@ const STEPS = Float32Array.from({ length: 256 }, (_, i) => (i === 0 ? -4 : i ===
  */
 export function compressedPly(reader, { elements, comments }) {
   const [chunk, vertex, sh] = elements, rest = sh ? Object.keys(sh.columns).length : 0;
-  const wrong = chunk.name !== "chunk" || vertex?.name !== "vertex" || !(vertex.count > 0) || vertex.stride !== 16
+  const wrong = chunk.name !== "chunk" || !chunk.little || vertex?.name !== "vertex" || !(vertex.count > 0) || vertex.stride !== 16
     || chunk.count !== Math.ceil(vertex.count / CHUNK) || !(chunk.stride > 0) || !("packed_position" in vertex.columns)
     || (sh && (sh.name !== "sh" || sh.count !== vertex.count || sh.stride !== rest)) || !(rest in DEGREES);
   if (wrong) throw new SceneError(words.scene.notGaussians);

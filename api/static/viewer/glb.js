@@ -2,13 +2,16 @@
 /**
  * Reader of GLB with KHR_gaussian_splatting, converted to rows of PLY values.
  *
- * Nodes may move the Gaussians and scale them evenly. Files with rotated nodes or sparse values are not shown.
+ * Nodes may move, rotate and evenly scale the Gaussians. Files with distorting nodes or sparse values are not shown.
  */
 import { SceneError } from "./byte_reader.js";
+import { rotatedHarmonics } from "./harmonics.js";
 import { HARMONICS, OPACITY, ROTATION, SCALES, COLOR, unpacked } from "./packed.js";
 import { extrasRendering } from "./render_tag.js";
+import { cross, dot, times, unit } from "./vectors.js";
 import { words } from "../words.js";
 
+/** @typedef {import("./vectors.js").Vector} Vector */
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 
@@ -19,11 +22,10 @@ const COMPONENTS = /** @type {Record<number, ["getInt8" | "getUint8" | "getInt16
 });
 const TYPES = /** @type {Record<string, number>} */ ({ SCALAR: 1, VEC3: 3, VEC4: 4 });
 const NAMES = ["POSITION", ...["ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"].map((name) => `${EXTENSION}:${name}`)];
-/**
- * Signs of the harmonics' coefficients of degree 1 to 3 under a half rotation about z, from glTF's axes (y up) to those
- * of a PLY.
- */
-const ROTATED = [-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1];
+/** Rows of the half rotation about z from glTF's axes (y up) to those of a PLY. */
+const Y_UP = [[-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]];
+/** Maximum deviation of a node's matrix from a rotation, relative to its scale. */
+const TOLERANCE = 1e-4;
 
 /**
  * @param {ByteReader} reader
@@ -50,7 +52,7 @@ export async function glb(reader) {
 
 /** @typedef {{offset: number, stride: number, value: (data: DataView, at: number, part: number) => number}} Place place of an attribute's values in the data; `value` reads a part of one */
 
-/** @typedef {{scale: number, moved: number[]}} Pose scale of a node, then its translation */
+/** @typedef {{scale: number, axes: Vector[], moved: Vector, turn: number[], harmonics: [number, number][][]}} Pose scale of a node, rows of its rotation, its translation, and the rotation as a quaternion (wxyz) and of harmonics */
 
 /** @typedef {Pose & {count: number, places: Place[]}} Part set of Gaussians: places of `NAMES`, then of harmonics */
 
@@ -79,7 +81,7 @@ function partsIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
     const primitives = meshes[node.mesh]?.primitives.filter(isSplats) ?? [];
     return primitives.length ? [{ primitives, pose: poseOf(nodes, i) }] : [];
   });
-  const still = meshes.map((/** @type {any} */ mesh) => ({ primitives: mesh.primitives.filter(isSplats), pose: { scale: 1, moved: [0, 0, 0] } }));
+  const still = meshes.map((/** @type {any} */ mesh) => ({ primitives: mesh.primitives.filter(isSplats), pose: poseOf([{}], 0) }));
   const used = shown.length ? shown : still, [first] = used.flatMap((/** @type {any} */ each) => each.primitives);
   if (!first) throw new SceneError(words.scene.noSplats);
   /** @type {Part[]} */
@@ -98,15 +100,35 @@ function partsIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
  * @returns {Pose}
  */
 function poseOf(nodes, index) {
-  let scale = 1, moved = [0, 0, 0];
-  for (let at = index, depth = 0; at >= 0; at = nodes.findIndex(({ children = [] }) => children.includes(at)), depth++) {
-    const { matrix, rotation = [0, 0, 0, 1], scale: [own, ...others] = [1, 1, 1], translation = [0, 0, 0] } = nodes[at];
-    const even = others.every((/** @type {number} */ other) => other === own) && own > 0;
-    if (matrix || !even || rotation.slice(0, 3).some(Boolean) || depth > MAX_DEPTH) throw new SceneError(words.scene.notShown("This kind of GLB"));
-    moved = moved.map((value, axis) => own * value + translation[axis]);
-    scale *= own;
-  }
-  return { scale, moved };
+  let rows = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], depth = 0;
+  for (let at = index; at >= 0 && depth <= MAX_DEPTH; at = nodes.findIndex(({ children = [] }) => children.includes(at)), depth++) rows = product(rowsOf(nodes[at]), rows);
+  rows = product(Y_UP, rows);
+  const scale = Math.cbrt(dot(cross(rows[0], rows[1]), rows[2]));
+  const even = rows.every((row, i) => rows.every((other, j) => Math.abs(dot(row, other) - (i === j ? scale ** 2 : 0)) <= TOLERANCE * scale ** 2));
+  if (!(scale > 0) || !even || depth > MAX_DEPTH) throw new SceneError(words.scene.notShown("This kind of GLB"));
+  const axes = rows.map((row) => times(row.slice(0, 3), 1 / scale));
+  return { scale, axes, moved: rows.map((row) => row[3]), turn: quaternionOf(axes), harmonics: rotatedHarmonics(axes) };
+}
+
+/** Return the rows of a node's own transformation, each with its part of the translation. @param {any} node */
+function rowsOf({ matrix, rotation = [0, 0, 0, 1], scale = [1, 1, 1], translation = [0, 0, 0] }) {
+  if (matrix) return [0, 1, 2].map((row) => [0, 1, 2, 3].map((column) => matrix[4 * column + row]));
+  const [x, y, z, w] = unit(rotation);
+  const turned = [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+  return turned.map((row, i) => [...row.map((value, j) => value * scale[j]), translation[i]]);
+}
+
+/** Return the rows of a transformation that follows another one. @param {number[][]} last @param {number[][]} first */
+const product = (last, first) => last.map((row) => [0, 1, 2, 3].map((column) => dot(row, first.map((each) => each[column])) + (column === 3 ? row[3] : 0)));
+
+/** Return a rotation as a unit quaternion (wxyz): the longest of four multiples of it. @param {Vector[]} rows */
+function quaternionOf([[a, b, c], [d, e, f], [g, h, i]]) {
+  const multiples = [[1 + a + e + i, h - f, c - g, d - b], [h - f, 1 + a - e - i, b + d, c + g], [c - g, b + d, 1 - a + e - i, f + h], [d - b, c + g, f + h, 1 - a - e + i]];
+  return unit(multiples.reduce((best, each) => (Math.hypot(...each) > Math.hypot(...best) ? each : best)));
 }
 
 /**
@@ -142,21 +164,28 @@ function partOf(primitive, accessors, bufferViews, bytes) {
  * @param {number} o offset of its row
  * @param {number} coefficients number of harmonics per color channel in a row, which may be more than the part has
  */
-function unpack(data, { places, scale: larger, moved }, i, into, o, coefficients) {
+function unpack(data, { places, scale: larger, axes, moved, turn: [a, b, c, d], harmonics }, i, into, o, coefficients) {
   const [position, rotation, scale, opacity, color] = places.map(({ offset, stride, value }) => (/** @type {number} */ axis) => value(data, offset + i * stride, axis));
+  const at = [position(0), position(1), position(2)], [x, y, z, w] = [rotation(0), rotation(1), rotation(2), rotation(3)];
   for (let axis = 0; axis < 3; axis++) {
-    into[o + axis] = (larger * position(axis) + moved[axis]) * (axis < 2 ? -1 : 1);
+    into[o + axis] = larger * dot(axes[axis], at) + moved[axis];
     into[o + SCALES + axis] = Math.log(larger * scale(axis));
     into[o + COLOR + axis] = color(axis);
   }
   const alpha = Math.min(Math.max(opacity(0), 1e-7), 1 - 1e-7);
   into[o + OPACITY] = Math.log(alpha / (1 - alpha));
-  into[o + ROTATION] = -rotation(2);
-  into[o + ROTATION + 1] = -rotation(1);
-  into[o + ROTATION + 2] = rotation(0);
-  into[o + ROTATION + 3] = rotation(3);
+  into[o + ROTATION] = a * w - b * x - c * y - d * z;
+  into[o + ROTATION + 1] = a * x + b * w + c * z - d * y;
+  into[o + ROTATION + 2] = a * y - b * z + c * w + d * x;
+  into[o + ROTATION + 3] = a * z + b * y - c * x + d * w;
   for (let n = 0; n < places.length - NAMES.length; n++) {
-    const { offset, stride, value } = places[NAMES.length + n];
-    for (let c = 0; c < 3; c++) into[o + HARMONICS + c * coefficients + n] = ROTATED[n] * value(data, offset + i * stride, c);
+    for (let channel = 0; channel < 3; channel++) {
+      let sum = 0;
+      for (const [before, factor] of harmonics[n]) {
+        const { offset, stride, value } = places[NAMES.length + before];
+        sum += factor * value(data, offset + i * stride, channel);
+      }
+      into[o + HARMONICS + channel * coefficients + n] = sum;
+    }
   }
 }

@@ -9,7 +9,8 @@ import { words } from "../words.js";
 /** @typedef {import("./scene_file.js").SceneFile} SceneFile */
 /**
  * @typedef {{offset: number, type: string}} Column `offset`: bytes from the start of a row
- * @typedef {{name: string, count: number, stride: number, columns: Record<string, Column>}} Element `stride`: bytes of a row
+ * @typedef {{name: string, count: number, stride: number, columns: Record<string, Column>, little: boolean}} Element `stride`:
+ *   bytes of a row; `little`: whether values are little-endian
  * @typedef {{begin: number, elements: Element[], comments: string[], text: boolean}} Header `begin`: bytes of the header;
  *   `text`: whether values are written as text
  */
@@ -61,12 +62,13 @@ export function checkLength({ begin, elements, text }, size) {
  * @returns {Element[]}
  */
 function elementsOf(lines) {
-  if (!lines.includes("format binary_little_endian 1.0") && !lines.includes(TEXT)) throw new SceneError(words.scene.notBinary);
+  const little = !lines.includes("format binary_big_endian 1.0");
+  if (little && !lines.includes("format binary_little_endian 1.0") && !lines.includes(TEXT)) throw new SceneError(words.scene.notPly);
   /** @type {Element[]} */
   const elements = [];
   for (const line of lines) {
     const [keyword, kind, name] = line.trim().split(/\s+/), element = elements[elements.length - 1];
-    if (keyword === "element") elements.push({ name: kind, count: Number(name), stride: 0, columns: {} });
+    if (keyword === "element") elements.push({ name: kind, count: Number(name), stride: 0, columns: {}, little });
     else if (keyword === "property" && element) {
       element.columns[name] = { offset: element.stride, type: kind };
       element.stride += SIZES[kind] ?? NaN; // a list, whose rows have no fixed size
@@ -179,12 +181,12 @@ function withoutThickness(rows, width) {
  * @param {Element} element
  * @param {Uint8Array} bytes whole rows, at the start of their buffer
  */
-export function floats({ stride, columns }, bytes) {
+export function floats({ stride, columns, little }, bytes) {
   const all = Object.values(columns);
-  if (all.every(({ type }) => type === "float" || type === "float32")) return new Float32Array(bytes.buffer, 0, bytes.length / 4);
+  if (little && all.every(({ type }) => type === "float" || type === "float32")) return new Float32Array(bytes.buffer, 0, bytes.length / 4);
   const view = new DataView(bytes.buffer), count = bytes.length / stride, found = new Float32Array(count * all.length);
   all.forEach(({ offset, type }, place) => {
-    for (let row = 0; row < count; row++) found[row * all.length + place] = stored(view, row * stride + offset, type);
+    for (let row = 0; row < count; row++) found[row * all.length + place] = stored(view, row * stride + offset, type, little);
   });
   return found;
 }
@@ -193,11 +195,12 @@ export function floats({ stride, columns }, bytes) {
  * @param {DataView} view
  * @param {number} at
  * @param {string} type
+ * @param {boolean} little
  */
-function stored(view, at, type) {
-  if (type.startsWith("float")) return view.getFloat32(at, true);
-  if (type === "double" || type === "float64") return view.getFloat64(at, true);
+function stored(view, at, type, little) {
+  if (type === "double" || type === "float64") return view.getFloat64(at, little);
+  if (type.startsWith("float")) return view.getFloat32(at, little);
   if (SIZES[type] === 1) return type.startsWith("u") ? view.getUint8(at) : view.getInt8(at);
-  if (SIZES[type] === 2) return type.startsWith("u") ? view.getUint16(at, true) : view.getInt16(at, true);
-  return type.startsWith("u") ? view.getUint32(at, true) : view.getInt32(at, true);
+  if (SIZES[type] === 2) return type.startsWith("u") ? view.getUint16(at, little) : view.getInt16(at, little);
+  return type.startsWith("u") ? view.getUint32(at, little) : view.getInt32(at, little);
 }

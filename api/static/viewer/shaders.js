@@ -6,18 +6,8 @@
  * compensated for that. Alpha is clamped between 1/255 and 0.99, and slopes are clamped at 1.3 times half the field of
  * view. The determinant is a sum of squares (Cauchy-Binet), so that thin Gaussians cause no cancellation.
  */
+import { EXPRESSIONS } from "./harmonics.js";
 import { harmonicTexels, SCALE_LOW, SCALE_RANGE } from "./packing.js";
-
-/** Products of the view direction, in the order and with the signs of 3DGS files. */
-const BASIS = [
-  "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
-  "1.0925484305920792 * x * y", "-1.0925484305920792 * y * z", "0.31539156525252005 * (2. * z * z - x * x - y * y)",
-  "-1.0925484305920792 * x * z", "0.5462742152960396 * (x * x - y * y)",
-  "-0.5900435899266435 * y * (3. * x * x - y * y)", "2.890611442640554 * x * y * z",
-  "-0.4570457994644658 * y * (4. * z * z - x * x - y * y)", "0.3731763325901154 * z * (2. * z * z - 3. * x * x - 3. * y * y)",
-  "-0.4570457994644658 * x * (4. * z * z - x * x - y * y)", "1.445305721320277 * z * (x * x - y * y)",
-  "-0.5900435899266435 * x * (x * x - 3. * y * y)",
-];
 
 /** @param {number} degree */
 function directional(degree) {
@@ -28,7 +18,7 @@ function directional(degree) {
     for (let c = 0; c < 4; c++) lines.push(`vec2 h${4 * t + c} = unpackHalf2x16(t${t}[${c}]);`);
   }
   const value = (/** @type {number} */ n) => `h${n >> 1}.${"xy"[n & 1]}`;
-  const terms = BASIS.slice(0, kept).map((product, k) => `(${product}) * vec3(${[0, 1, 2].map((c) => value(3 * k + c)).join(", ")})`);
+  const terms = EXPRESSIONS.slice(0, kept).map((product, k) => `(${product}) * vec3(${[0, 1, 2].map((c) => value(3 * k + c)).join(", ")})`);
   return `vec3 directional(int i, vec3 d) {
   float x = d.x, y = d.y, z = d.z;
   ${lines.join("\n  ")}

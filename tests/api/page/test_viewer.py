@@ -112,7 +112,7 @@ def test_antialiased_scenes_are_shown_as_such(visit: Visit, tmp_path: Path, form
     assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=True)
 
 
-def test_filtered_flat_and_text_scenes_are_shown(visit: Visit, tmp_path: Path) -> None:
+def test_filtered_flat_text_and_big_endian_scenes_are_shown(visit: Visit, tmp_path: Path) -> None:
     ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
     watched = visit("/#/jobs")
     with_filter(ply, dust(), torch.linspace(0, 0.02, len(dust())))
@@ -120,8 +120,9 @@ def test_filtered_flat_and_text_scenes_are_shown(visit: Visit, tmp_path: Path) -
     without_thickness(ply, dust())
     assert_shown_like(watched, tmp_path, ply, differs=False)
     write_scene(ply, dust())
-    PlyData(PlyData.read(ply, mmap=False).elements, text=True).write(ply)
-    assert_shown_like(watched, tmp_path, ply, differs=False)
+    for form in ({"text": True}, {"byte_order": ">"}):
+        PlyData(PlyData.read(ply, mmap=False).elements, **form).write(ply)
+        assert_shown_like(watched, tmp_path, ply, differs=False)
 
 
 def test_glb_of_several_sets_and_spz_without_gzip_are_shown(visit: Visit, tmp_path: Path) -> None:
@@ -145,16 +146,21 @@ def test_finest_level_of_a_streamed_sog_is_shown(visit: Visit, tmp_path: Path) -
     assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=False)
 
 
-def test_quantized_and_moved_glb_is_shown(visit: Visit, tmp_path: Path) -> None:
-    ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
-    write_scene(ply, dust(), by_name("glb"))
-    ply.write_bytes(quantized(ply.read_bytes()))
-    assert len(read_scene(ply).scene) == 616
-    assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=False)
+def test_quantized_moved_and_rotated_glb_is_shown(visit: Visit, tmp_path: Path) -> None:
+    scene = replace(dust(), sh_rest=torch.randn(616, 15, 3, generator=torch.Generator().manual_seed(3)))
+    ply, _, _ = write_files(tmp_path, scene, cameras(2, 120, 90))
+    watched = visit("/#/jobs")
+    tipped = {"rotation": [0.1**0.5, 0, 0, 0.9**0.5], "translation": [0, 1.8, 0.6]}  # by 37 degrees, in place
+    matrix = {"matrix": [0, 1, 0, 0, -0.8, 0, 0.6, 0, 0.6, 0, 0.8, 0, -1.8, 0, 0.6, 1]}
+    for nodes in (({}, {}), (tipped, {"rotation": [0, 0, 0.6, 0.8]}), (matrix, {})):
+        write_scene(ply, scene, by_name("glb"))
+        ply.write_bytes(quantized(ply.read_bytes(), *nodes))
+        assert len(read_scene(ply).scene) == 616
+        assert_shown_like(watched, tmp_path, ply, differs=False)
 
 
-def quantized(data: bytes) -> bytes:
-    """Return a GLB with normalized positions of 16 bits, in a node below another one; both move and scale them."""
+def quantized(data: bytes, inner: dict[str, Any], outer: dict[str, Any]) -> bytes:
+    """Return a GLB with normalized positions of 16 bits, in a node below others; two of them move and scale them."""
     size = struct.unpack_from("<I", data, 12)[0]
     document, binary = json.loads(data[20 : 20 + size]), bytearray(data[20 + size + 8 :])
     (primitive,) = document["meshes"][0]["primitives"]
@@ -175,8 +181,13 @@ def quantized(data: bytes) -> bytes:
         values = struct.unpack_from("<3f", binary, start + i * stride)
         struct.pack_into("<3f", binary, start + i * stride, *(value / 8 for value in values))
     mesh = {"mesh": 0, "scale": [4, 4, 4], "translation": [0, 0, 0.25]}
-    document["nodes"] = [{"children": [1], "scale": [2, 2, 2], "translation": [0.5, 0.5, 0]}, mesh]
-    document["scenes"] = [{"nodes": [0]}]
+    document["nodes"] = [
+        {"children": [1], "scale": [2, 2, 2], "translation": [0.5, 0.5, 0]},
+        mesh,
+        {"children": [0]} | inner,
+        {"children": [2]} | outer,
+    ]
+    document["scenes"] = [{"nodes": [3]}]
     return as_glb(document, bytes(binary))
 
 
@@ -372,10 +383,7 @@ def test_lost_graphics_device_comes_back(visit: Visit, tmp_path: Path) -> None:
         (b"NGSP" + bytes(60), "This SPZ version"),
         (b"NGSP\4\0\0\0" + b"\1\0\0\0" + bytes(60), "Couldn't read the scene."),
         (gzip.compress(b"no scene, but text that somebody has packed"), "Not a scene file"),
-        (
-            b"ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234",
-            "Big-endian PLY",
-        ),
+        (b"ply\nformat binary 1.0\nelement vertex 1\nproperty float x\nend_header\n1234", "Not a PLY file."),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no 3D Gaussians"),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234",
