@@ -13,6 +13,7 @@ import { JobStage } from "./job_stage.js";
 import { nameOf } from "./names.js";
 import { planOf } from "./plan.js";
 import { ShareCard } from "./share_card.js";
+import { LIVE } from "./result_stage.js";
 import { actionsOf, titles, UNFINISHED, WORKING } from "./statuses.js";
 import { VideoCard } from "./video_card.js";
 import { time, words } from "./words.js";
@@ -58,7 +59,7 @@ export class JobView {
     /** @type {VideoCard | undefined} */
     this.video = undefined;
     this.sharing = h("div", { hidden: true });
-    this.files = h("section.card");
+    this.files = h("section.card", { hidden: true });
     this.deletion = h("p.deletion");
     this.facts = h("section.card");
     this.curve = h("section.card", h("h2", say.loss), this.chart.element);
@@ -122,6 +123,7 @@ export class JobView {
     } catch (error) {
       if (!(error instanceof Problem) || error.status !== 404) return;
     }
+    this.curve.hidden = !UNFINISHED.has(this.job.status) && !this.chart.points.size;
   }
 
   /** Watch the events of the job. The browser reconnects by itself, and sends the id of the last event. */
@@ -170,7 +172,7 @@ export class JobView {
   /** @param {{name: string}} artifact */
   onArtifact({ name }) {
     if (name.startsWith("previews/")) this.stage.showPreview(name);
-    else if (name.startsWith("live/") && this.stage.live) this.stage.live.refresh();
+    else if (name === LIVE && this.stage.live) this.stage.paint();
     else this.filesLater();
   }
 
@@ -199,10 +201,11 @@ export class JobView {
     put(this.badge, badge(job.status));
     this.planTitle.textContent = UNFINISHED.has(job.status) ? words.plan.decided : words.plan.ran;
     const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
-    this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
+    this.meta.textContent = [say.made(time(job.created_at)), took && job.attempt === 1 && say.took(took), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
     const outcome = job.status === "succeeded" ? outcomeOf(job.result) : "";
     this.outcome.hidden = !outcome;
     put(this.outcome, h("li", outcome));
+    if (UNFINISHED.has(job.status)) this.curve.hidden = false;
     this.error.hidden = !job.error;
     if (job.error) put(this.error, h("strong", say.failed), h("p", job.error.message));
     this.showActions();
@@ -256,10 +259,11 @@ export class JobView {
     const previews = found.map(({ name }) => name).filter((name) => name.startsWith("previews/")).sort();
     if (previews.length) this.stage.showPreview(previews[previews.length - 1]);
     else this.stage.showNoPreview(UNFINISHED.has(this.job.status) ? say.noPreview : "");
+    this.files.hidden = false;
     put(this.files, filesCard(this.id, found.filter(({ name }) => !/^(previews|live)\//.test(name))));
     if (names.has("plan.json") && this.plan.hidden) await this.loadPlan();
     const result = found.find(({ name }) => name === "stylized.ply"), video = found.find(({ name }) => name === "video.mp4");
-    if (names.has("live/colors.f16")) this.stage.showLive(this.job, names.has("live/scene.ply"));
+    this.stage.showLive(this.job, names);
     if (this.job.status !== "succeeded" || !result) return;
     if (installed.video || video) this.offerVideo(video);
     if (this.stage.finishing) return;

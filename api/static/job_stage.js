@@ -3,10 +3,12 @@
 import { artifactPath, get } from "./api.js";
 import { h, put } from "./dom.js";
 import { labels } from "./names.js";
-import { ResultStage } from "./result_stage.js";
+import { LIVE, ResultStage } from "./result_stage.js";
 import { words } from "./words.js";
 
 const say = words.job;
+/** Statuses in which a job has its result, or its scene no longer. */
+const GONE = new Set(["succeeded", "expired"]);
 
 export class JobStage {
   /**
@@ -21,8 +23,10 @@ export class JobStage {
     this.element = h("div.show", this.picture);
     /** Name of the shown preview. */
     this.preview = "";
-    /** @type {ResultStage | undefined} */
+    /** Stage of the unfinished job. @type {ResultStage | undefined} */
     this.live = undefined;
+    /** Function that opens a tab; it does nothing once the user has opened one. @type {(index: number) => void} */
+    this.open = () => {};
     /** @type {ResultStage | undefined} */
     this.result = undefined;
     this.finishing = false;
@@ -40,7 +44,9 @@ export class JobStage {
     this.preview = name;
     const picture = h("img", { alt: say.preview, decoding: "async" });
     picture.onload = () => {
-      if (this.preview === name && !this.result) put(this.picture, picture);
+      if (this.preview !== name || this.result) return;
+      put(this.picture, picture);
+      if (!this.live?.live?.painted) this.open(1); // the first image precedes the first colors in 3D
     };
     picture.src = artifactPath(this.id, name);
   }
@@ -51,19 +57,29 @@ export class JobStage {
   }
 
   /**
-   * Show the scene with its colors so far.
+   * Show the scene of an unfinished job: alone, then beside its colors so far, or those that it continues from.
    *
    * @param {any} job
-   * @param {boolean} ownScene whether its Gaussians are other ones than those of its input
+   * @param {Set<string>} names names of the job's files
    */
-  showLive(job, ownScene) {
-    if (this.live || this.result || job.status === "succeeded") return;
-    const live = new ResultStage([job], { signal: this.leaving, live: { ownScene } });
+  showLive(job, names) {
+    const ownScene = names.has("live/scene.ply"), painted = [LIVE, "colors.f16"].find((name) => names.has(name)) ?? "", { live: before } = this;
+    if (this.result || this.finishing || GONE.has(job.status)) return;
+    if (before?.live?.ownScene === ownScene) return void (painted === LIVE && !before.live.painted && this.paint());
+    const live = new ResultStage([job], { signal: this.leaving, live: { ownScene, painted } });
     if (!live.stage.viewer) return;
+    before?.end();
     this.live = live;
     live.stage.title = this.title;
-    const open = this.showTabs([[say.threeD, live.element], [say.preview, this.picture]]);
-    live.loading.then(() => live.original || open(1)); // this format cannot be shown in a browser
+    this.open = this.showTabs([[say.threeD, h("div", live.element)], [say.preview, this.picture]]);
+    live.loading.then(() => live.original || live !== this.live || put(this.element, this.picture)); // the browser cannot show it
+  }
+
+  /** Show the present colors of the unfinished job. */
+  async paint() {
+    const { live } = this, first = !live?.live?.painted;
+    await live?.refresh();
+    if (first && live?.live?.painted) this.open(0);
   }
 
   /**
@@ -109,7 +125,7 @@ export class JobStage {
    * @returns {(index: number) => void} function that opens a tab
    */
   showTabs(tabs, opened = () => {}, beside) {
-    const inputs = tabs.map((_, i) => h("input", { type: "radio", name: `tab${this.id}`, onchange: () => open(i) }));
+    const inputs = tabs.map((_, i) => h("input", { type: "radio", name: `tab${this.id}`, onchange: () => ((this.open = () => {}), open(i)) }));
     const open = (/** @type {number} */ at) => {
       inputs[at].checked = true;
       tabs.forEach(([, body], i) => (body.hidden = i !== at));

@@ -65,6 +65,7 @@ export class OptionsPart {
     }
     const followStrength = addPictures(/** @type {Control} */ (this.controls.get("content_weight")));
     this.schema = schema;
+    this.controls.get("within")?.element.addEventListener("input", () => this.preset && this.follow(this.preset));
     restore(schema);
     followStrength();
   }
@@ -90,6 +91,7 @@ export class OptionsPart {
   follow(preset) {
     this.preset = preset;
     for (const control of this.controls.values()) control.follow(preset);
+    if (this.controls.get("within")?.value() !== undefined) for (const name of ["resolution", "views"]) this.controls.get(name)?.suggest(say.byTime);
   }
 
   /** Create the element for the estimated time of a preset. @param {string} preset */
@@ -163,5 +165,6 @@ export class OptionsPart {
       if (JSON.stringify(value) !== JSON.stringify(this.schema?.[name]?.default)) this.controls.get(name)?.set(Array.isArray(value) ? value.join(", ") : value);
     }
     if (preset) this.choose(preset);
+    else if (this.preset) this.follow(this.preset);
   }
 }

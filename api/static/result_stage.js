@@ -9,6 +9,7 @@ import { Blend } from "./blend.js";
 import { h, put } from "./dom.js";
 import { labels, nameOf } from "./names.js";
 import { Stage } from "./stage.js";
+import { UPS } from "./upright.js";
 import { requestedRendering } from "./viewer/render_tag.js";
 import { words } from "./words.js";
 
@@ -16,13 +17,15 @@ import { words } from "./words.js";
 /** @typedef {{scene: string, result: (name: string) => string, cameras: () => Promise<{name: string, blob: Blob}[]>}} Files addresses */
 
 const say = words.viewer;
+/** Name of the file with the colors so far of a running job. */
+export const LIVE = "live/colors.f16";
 
 export class ResultStage {
   /**
    * @param {any[]} jobs finished runs; the scene is that of the first one
-   * @param {{signal: AbortSignal, live?: {ownScene: boolean}, files?: (job: any) => Files, blend?: boolean}} how `live`: the
-   *   one run is unfinished; `ownScene`: the rows of its scene are not those of its input; `files`: where the files of a
-   *   job are; `blend`: whether to offer blends
+   * @param {{signal: AbortSignal, live?: {ownScene: boolean, painted: string}, files?: (job: any) => Files, blend?: boolean}} how
+   *   `live`: the one run is unfinished; `ownScene`: the rows of its scene are not those of its input; `painted`: name
+   *   of the file with its colors so far, or ""; `files`: where the files of a job are; `blend`: whether to offer blends
    */
   constructor(jobs, { signal, live, files = (job) => filesOf(job, signal), blend = true }) {
     this.jobs = jobs;
@@ -65,6 +68,7 @@ export class ResultStage {
     viewer.background = first.parameters.background ?? [0, 0, 0];
     viewer.camera.near = first.parameters.near ?? 0.2;
     this.stage.message(words.page.loading);
+    this.stage.up = UPS[first.parameters.up] ?? this.stage.up;
     await this.loadCameras();
     await this.openOriginal(first);
     for (const job of this.jobs) await this.openRun(job).catch((error) => this.tell(error));
@@ -114,8 +118,8 @@ export class ResultStage {
     if (!viewer || this.signal.aborted) return;
     const fade = this.live?.ownScene ? 0 : (job.parameters.sh_attenuation ?? 0);
     if (this.live) {
-      if (!this.original) return;
-      await this.fetchColors(job, "live/colors.f16");
+      if (!this.original || !this.live.painted) return;
+      await this.fetchColors(job, this.live.painted);
       this.choices.set(job.id, { name: say.now, side: { scene: this.original, colors: job.id, fade } });
       return;
     }
@@ -143,7 +147,12 @@ export class ResultStage {
   /** Show the present colors of the unfinished run. Calls while colors are being fetched lead to one more fetch. */
   async refresh() {
     const [job] = this.jobs;
-    if (document.hidden || !this.choices.has(job.id)) return; // `load` fetches the present colors
+    await this.loading;
+    if (document.hidden || !this.original || !this.live) return;
+    if (!this.live.painted) {
+      this.live.painted = LIVE;
+      return (this.loading = this.openRun(job).then(() => this.offer(), () => void (this.live && (this.live.painted = ""))));
+    }
     this.stale = true;
     this.fetching ??= this.fetchWhileStale(job);
     await this.fetching;
@@ -153,7 +162,8 @@ export class ResultStage {
   async fetchWhileStale(job) {
     while (this.stale && this.live) {
       this.stale = false;
-      await this.fetchColors(job, "live/colors.f16").catch(() => {}); // the next colors follow
+      this.live.painted = LIVE;
+      await this.fetchColors(job, LIVE).catch(() => {}); // the next colors follow
     }
     this.fetching = undefined;
   }

@@ -19,7 +19,7 @@ export class ShareCard {
     this.list = h("ul.files");
     this.wrong = h("p.wrong", { hidden: true, role: "alert" });
     this.element = h("section.card.share", h("h2", say.title), h("p.help", say.help),
-      h("div.row", h("button.quiet", { type: "button", onclick: () => this.act(() => this.create()) }, say.create), this.days), h("label.option.inline", this.poster, h("span", say.poster)), this.link, this.list, this.wrong);
+      h("div.row", h("button.quiet", { type: "button", onclick: () => this.act(() => this.create()) }, say.create), this.days), h("label.check", this.poster, h("span", say.poster)), this.link, this.list, this.wrong);
     this.act(() => this.show());
   }
 

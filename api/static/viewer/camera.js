@@ -43,7 +43,7 @@ export class ViewCamera {
     const level = unit(difference(aside, times(this.up, dot(aside, this.up))));
     const from = unit(sum(level, times(this.up, 0.18)));
     this.size = radius;
-    this.eye = sum(center, times(from, 2.6 * radius));
+    this.eye = sum(center, times(from, 3 * radius));
     this.focal = [FOCAL, FOCAL];
     this.shape = 0;
     this.lookAt(center);

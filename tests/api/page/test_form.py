@@ -160,6 +160,8 @@ def test_defaults_are_those_of_the_chosen_preset(visit: Visit) -> None:
     page = watched.page
     resolution = page.locator("[data-name=resolution] input")
     resolution.wait_for()
+    assert resolution.get_attribute("placeholder") == "fits the time"
+    page.locator("[data-name=within] input").fill("")
     assert resolution.get_attribute("placeholder") == "the cameras' own"
     page.get_by_label("preview").check(force=True)
     assert resolution.get_attribute("placeholder") == "640"

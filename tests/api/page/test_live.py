@@ -38,13 +38,23 @@ def names(service: Service, job_id: str) -> set[str]:
     return {entry["name"] for entry in listed}
 
 
-def test_colors_arrive_while_the_job_runs(visit: Visit, service: Service, files: dict[str, Path]) -> None:
-    job_id = submit(service, files, **LONG)
+def test_scene_is_shown_while_the_job_waits_and_its_colors_while_it_runs(
+    visit: Visit, service: Service, files: dict[str, Path]
+) -> None:
+    before, job_id = (submit(service, files, **LONG) for _ in range(2))
+    wanted = rendered(files["scene"], resized(read_cameras(files["cameras"])[1], 384))
+    waiting = visit(f"/#/jobs/{job_id}", width=600, height=700)
+    waiting.page.locator(".state", has_text="queue").wait_for()
+    waiting.page.get_by_label("Camera", exact=True).select_option("1")
+    assert psnr(frame_of(waiting, wanted), wanted) > 38  # the view is larger than the rendered image
+    assert waiting.page.get_by_label("Wipe", exact=True).is_hidden()
+    httpx2.post(f"{service.url}/v1/jobs/{before}/cancel").raise_for_status()
+    waiting.page.locator(".side.right", has_text="So far").wait_for()  # in the open tab
+    waiting.check()
     watched = watch(visit, job_id)
     page = watched.page
     watched.wipe("End")
-    wanted = rendered(files["scene"], resized(read_cameras(files["cameras"])[1], 384))
-    assert psnr(frame_of(watched, wanted), wanted) > 38  # the view is larger than the rendered image
+    assert psnr(frame_of(watched, wanted), wanted) > 38
     watched.wipe("Home")
     first = watched.pixels()
     wait_for(lambda: not np.array_equal(watched.pixels(), first), "other colors", service.said)
@@ -63,8 +73,9 @@ def test_view_of_a_running_job_becomes_its_result(visit: Visit, service: Service
     watched = watch(visit, job_id)
     page = watched.page
     page.locator("canvas.view").evaluate("(canvas) => { canvas.id = 'same'; }")
+    page.get_by_label("Latest preview").check(force=True)
     finish(service, job_id)
-    page.locator(".side.right", has_text="Stylized").wait_for(state="attached")
+    page.locator(".side.right", has_text="Stylized").wait_for()
     assert page.locator("canvas.view").get_attribute("id") == "same"
     page.get_by_label("Amount of style").wait_for()
     result = files["scene"].with_name("result.ply")
@@ -108,4 +119,4 @@ def test_job_that_ended_early_continues(visit: Visit, service: Service, files: d
     steps = [point["step"] for point in points]
     assert steps == sorted(steps), "it continues where it stopped"
     page.locator(".side.right", has_text="Stylized").wait_for(state="attached")
-    watched.check()
+    watched.check("status of 404")  # colors so far are gone once the job has ended

@@ -148,8 +148,8 @@ def test_stages_beside_steps_count_their_own_views(
     [
         (
             {"stopped": "within", "steps": 2, "total": 60, "loss_after": 97.0},
-            "Its time was used up: 2 of 60 steps, 97% of the loss is left. For more, choose “Same with "
-            "changes” and give it more time.",
+            "Its time was used up: 2 of 60 steps, 97% of the loss is left. For the other steps, choose "
+            "“Continue”; for a finer result, “Same with changes” with more time.",
         ),
         (
             {"stopped": "on-request", "steps": 5, "total": 60, "loss_after": 130.0},
