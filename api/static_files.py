@@ -10,7 +10,7 @@ from pathlib import Path
 
 from service.optional import installed_extras
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
-from sgsst_core.files.formats import FORMATS, RESULT_FORMATS
+from sgsst_core.files.formats import DOWNLOADS, FORMATS, RESULT_FORMATS
 from sgsst_core.options import STRENGTHS
 
 FOLDER = Path(__file__).with_name("static")
@@ -22,19 +22,22 @@ _WORKER_START = 'new URL("./scene_worker.js", import.meta.url), { type: "module"
 
 def read_static(folder: Path = FOLDER) -> dict[str, bytes]:
     """Return the content of each file by its path in the folder."""
-    contents = {
-        path.relative_to(folder).as_posix(): path.read_bytes()
+    tables = {f'"{{{{{name}}}}}"'.encode(): json.dumps(table).encode() for name, table in _tables().items()}
+    return {
+        path.relative_to(folder).as_posix(): _filled(path.read_bytes(), tables)
         for path in sorted(folder.rglob("*"))
         if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     }
-    for name, (placeholder, value) in _filled_modules().items():
-        if name in contents:
-            contents[name] = contents[name].replace(placeholder, json.dumps(value).encode())
-    return contents
 
 
-def _filled_modules() -> dict[str, tuple[bytes, object]]:
-    """Return the placeholder in each module that contains a table of the server, with the table as JSON."""
+def _filled(content: bytes, tables: dict[bytes, bytes]) -> bytes:
+    for placeholder, table in tables.items():
+        content = content.replace(placeholder, table)
+    return content
+
+
+def _tables() -> dict[str, object]:
+    """Return the tables of the server that modules contain, by the names of their placeholders."""
     formats = [
         {
             "name": each.name,
@@ -44,16 +47,18 @@ def _filled_modules() -> dict[str, tuple[bytes, object]]:
         }
         for each in FORMATS
     ]
+    downloads = [{"name": name, "title": title} for name, title in DOWNLOADS.items()]
     actions = [
         {"name": name, "title": name.capitalize(), "statuses": action.statuses} for name, action in ACTIONS.items()
     ]
     groups = {"unfinished": UNFINISHED, "working": WORKING, "stepping": STEPPING}
     states = {"titles": TITLES, **groups, "actions": actions}
     return {
-        "scene_formats.js": (b'"{{scene_formats}}"', formats),
-        "installed.js": (b'"{{installed_extras}}"', installed_extras()),
-        "strength.js": (b'"{{strengths}}"', STRENGTHS),
-        "statuses.js": (b'"{{job_states}}"', states),
+        "scene_formats": formats,
+        "downloads": downloads,
+        "installed_extras": installed_extras(),
+        "strengths": STRENGTHS,
+        "job_states": states,
     }
 
 

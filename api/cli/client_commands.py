@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path, PureWindowsPath
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from rich.progress import BarColumn, ProgressColumn, TextColumn
@@ -28,15 +28,24 @@ from api.cli.console import (
 from api.cli.options import with_arguments, with_options
 from api.client.inputs import different_names, path_or_url
 from service.parameters import JobParameters
-from service.states import ACTIONS, STEPPING, Transition
+from service.states import ACTIONS, STEPPING, Transition, WebhookEvent
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.atomic import file_digest
-from sgsst_core.files.formats import EXTRA_FORMATS, RESULT_SUFFIXES, ExtraName, by_name, format_of_name, result_name
+from sgsst_core.files.formats import (
+    DOWNLOAD_SUFFIXES,
+    DOWNLOADS,
+    EXTRA_FORMATS,
+    FORMATS,
+    DownloadName,
+    download_of_name,
+    listed,
+    result_name,
+)
 from sgsst_core.number_format import duration
 from sgsst_core.progress import Progress
 from sgsst_core.stylizing.progress_bar import live_bar, set_total
 from worker.options import ESSENTIALS
-from worker.outputs import check_file, check_folder, check_is_not_input, result_format
+from worker.outputs import check_file, check_folder, check_is_not_input
 from worker.region_requests import RegionOptions, region_requests
 from worker.styles import parse_styles, split_weight
 
@@ -53,6 +62,12 @@ KeyOption = Annotated[str | None, typer.Option("--key", help="API key. [default:
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="ID of a job.", show_default=False)]
 
 
+def _webhook_event(text: str) -> str:
+    if text not in get_args(WebhookEvent):
+        raise SettingsError(f"--webhook-events {text}: is not {listed(get_args(WebhookEvent))}. Give one of them.")
+    return text
+
+
 @with_options(JobParameters)
 @with_arguments(JobInputs)
 def submit(
@@ -61,10 +76,18 @@ def submit(
     options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Additional parameters, as in the REST API.")] = "{}",
     webhook: Annotated[str | None, typer.Option(help="URL to notify when the job ends.")] = None,
+    webhook_events: Annotated[
+        list[str] | None,
+        typer.Option(
+            parser=_webhook_event,
+            metavar="EVENT",
+            help=f"Event to notify it of: {listed(get_args(WebhookEvent))}; may be repeated. [default: completed]",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            help=f"Wait for the job, and write the scene to this file: {RESULT_SUFFIXES}.",
+            help=f"Wait for the job, and write the scene to this file: {DOWNLOAD_SUFFIXES}.",
             callback=file_to_write,
             rich_help_panel=ESSENTIALS,
         ),
@@ -81,8 +104,10 @@ def submit(
     SCENE, --style and --cameras may be URLs, if the service allows their hosts.
     """
     if out is not None:
-        result_format(out)
+        download_of_name(out.name)
         check_is_not_input(out, Path(inputs.scene))
+    if webhook_events and not webhook:
+        raise SettingsError("--webhook-events requires --webhook. Add it, or omit the events.")
     styles, masks, settings = _styles_masks_and_parameters(inputs, options, parameters)
     files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": masks}
     with open_client(url, key) as client:
@@ -92,7 +117,8 @@ def submit(
             out_console.print(json.dumps(plan) if as_json else _plan_text(plan))
             return
         with transfer_bar(error_console, "sending") as progress:
-            job = client.submit(inputs.scene, styles, **files, webhook=webhook, progress=progress, **settings)
+            settings |= {"webhook": webhook, "webhook_events": webhook_events or ()}
+            job = client.submit(inputs.scene, styles, **files, progress=progress, **settings)
         if out is None:
             out_console.print(json.dumps(job.data) if as_json else job.id)
             if not as_json:
@@ -167,8 +193,8 @@ def download(
     ),
     out: Annotated[Path | None, typer.Option(help="File to write, or folder for 'all'. [default: NAME]")] = None,
     format: Annotated[
-        ExtraName | None,
-        typer.Option("--format", help="Compressed format of stylized.ply. [default: from the ending of --out]"),
+        DownloadName | None,
+        typer.Option("--format", help="Format of stylized.ply. [default: from the ending of --out]"),
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace existing files, which may belong to another job.")
@@ -179,9 +205,9 @@ def download(
 ) -> None:
     """Download a job's result or other files; an interrupted download resumes."""
     if format and name not in ("stylized.ply", "all"):
-        raise SettingsError(f"--format {format}: only stylized.ply is compressed. Omit --format for {name}.")
+        raise SettingsError(f"--format {format}: only stylized.ply has other formats. Omit --format for {name}.")
     if format is None and out is not None and name == "stylized.ply":
-        format = _format_of(out)
+        format = download_of_name(out.name)
     if name == "all":
         check_folder(out or Path(job))
     elif out is not None:
@@ -196,7 +222,7 @@ def download(
         for each in names:
             stored = _stored_name(each, format)
             target = (out or Path(job)) / stored if name == "all" else out or Path(Path(stored).name)
-            chosen = format if stored != each else None
+            chosen = format if each == "stylized.ply" else None
             if not (overwrite or (name == "all" and out is None)):  # that folder is named after the job
                 _check_target(target, digests.get(stored))
             with transfer_bar(error_console, each) as progress:
@@ -206,9 +232,9 @@ def download(
     out_console.print(json.dumps(written) if as_json else "\n".join(written))
 
 
-def _stored_name(name: str, format: ExtraName | None) -> str:
-    """Return the name under which the service stores an artifact in a compressed format, which only results have."""
-    return result_name(name, by_name(format)) if format and name == "stylized.ply" else name
+def _stored_name(name: str, format: DownloadName | None) -> str:
+    """Return the name under which the service stores an artifact in another format, which only results have."""
+    return result_name(name, format) if format and name == "stylized.ply" else name
 
 
 def _check_names(names: Sequence[str]) -> None:
@@ -223,12 +249,17 @@ def _check_names(names: Sequence[str]) -> None:
 
 
 def _check_format(out: Path, name: str) -> None:
-    """Raise an OutputError if the name of a file to write is that of another scene format than an artifact's."""
-    format, content = format_of_name(out.name), format_of_name(name)
-    if format and content and format is not content:
+    """Raise an OutputError if the name of a file to write is that of another format than an artifact's."""
+    formats = {*DOWNLOADS, *(each.name for each in FORMATS)}
+
+    def format_of(name: str) -> str:
+        return max((each for each in formats if name.lower().endswith(f".{each}")), key=len, default="")
+
+    given, content = format_of(out.name), format_of(name)
+    if given and content and given != content:
         raise OutputError(
-            f"{out}: ends in {format.suffix}, but the format of the download is {content.title}. "
-            f"Give a name that ends in {content.suffix}."
+            f"{out}: ends in .{given}, but the format of the download is {content}. Give a name that ends in "
+            f".{content}."
         )
 
 
@@ -253,6 +284,22 @@ def _command_of(action: Transition) -> Callable[..., None]:
 
     command.__name__, command.__doc__ = action.value, ACTIONS[action].help
     return command
+
+
+def share(
+    job: JobArgument,
+    days: Annotated[float, typer.Option(help="Lifetime of the link, from a minute (1 / 1440) to 90 days.")] = 7,
+    poster: Annotated[
+        bool, typer.Option("--poster", help="Let sites where the link is posted show an image of the result.")
+    ] = False,
+    as_json: JsonOption = False,
+    url: UrlOption = None,
+    key: KeyOption = None,
+) -> None:
+    """Create a read-only link to a result, for people without a key."""
+    with open_client(url, key) as client:
+        link = client.share(job, days, poster=poster)
+    out_console.print(json.dumps(link) if as_json else link["url"])
 
 
 def delete(job: JobArgument, url: UrlOption = None, key: KeyOption = None) -> None:
@@ -300,6 +347,7 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     watch,
     download,
     *map(_command_of, ACTIONS),
+    share,
     delete,
     jobs,
     mcp,
@@ -409,27 +457,21 @@ def conclude(client: Client, job: Job, out: Path, as_json: bool) -> None:
             f"Steps: {_step_count_text(result)}; loss {loss_text(result['loss_before'], result['loss_after'])}"
         )
     with transfer_bar(error_console, out.name) as progress:
-        client.download(job.id, out, progress=progress, format=_format_of(out))
+        client.download(job.id, out, progress=progress)
     if not as_json:
-        _print_compression_loss(client, job.id, _format_of(out))
+        _print_compression_loss(client, job.id, download_of_name(out.name))
     out_console.print(json.dumps({"job": job.id, "result": str(out)}) if as_json else str(out))
 
 
-def _print_compression_loss(client: Client, job_id: str, format: ExtraName | None) -> None:
-    """Print the quality loss of a compressed result."""
-    if format is None:
+def _print_compression_loss(client: Client, job_id: str, format: DownloadName | None) -> None:
+    """Print the quality loss of a compressed result; nothing for other formats."""
+    if format not in [each.name for each in EXTRA_FORMATS]:
         return
     with tempfile.TemporaryDirectory() as folder:
-        name = f"{result_name('stylized.ply', by_name(format))}.json"
+        name = f"{result_name('stylized.ply', format)}.json"
         loss = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
     psnr = "renders identical to" if loss["psnr_db"] is None else f"{loss['psnr_db']:.1f} dB PSNR against"
     error_console.print(f"{format}, {loss['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
-
-
-def _format_of(out: Path) -> ExtraName | None:
-    """Return the compressed format of a file name, by its suffix; None if it has no such suffix."""
-    format = format_of_name(out.name)
-    return format.name if format in EXTRA_FORMATS else None
 
 
 def _print_job(job: Job, as_json: bool) -> None:

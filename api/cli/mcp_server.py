@@ -23,7 +23,7 @@ from api.client import AsyncClient
 from api.client.answers import Job
 from service.parameters import JobParameters
 from sgsst_core.errors import SgsstError
-from sgsst_core.files.formats import RESULT_SUFFIXES, ResultName, format_of_name
+from sgsst_core.files.formats import DOWNLOAD_SUFFIXES, RESULT_SUFFIXES, ResultName, download_of_name, format_of_name
 from sgsst_core.files.formats.ply import PLY
 
 _INSTRUCTIONS = """
@@ -54,7 +54,7 @@ Options = Annotated[
 JobId = Annotated[str, Field(description="ID of a job, from `submit`.")]
 Out = Annotated[
     str | None,
-    Field(description=f"File to write the scene to, which must not exist: {RESULT_SUFFIXES}. Null writes none."),
+    Field(description=f"File to write the scene to, which must not exist: {DOWNLOAD_SUFFIXES}. Null writes none."),
 ]
 
 
@@ -99,6 +99,14 @@ class Blended(BaseModel):
     path: str | None
 
 
+class Link(BaseModel):
+    """Link to a result."""
+
+    url: str
+    embed_url: str | None
+    expires_at: str
+
+
 class Tools:
     """Tools of the MCP server. Expected errors become messages to the model."""
 
@@ -130,9 +138,11 @@ class Tools:
     async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, JobResult]:
         """Show the newest image of a job and the addresses of its files, and write its scene to a file."""
         with _messages():
+            if out:
+                download_of_name(out)
             job = await self._client.job(job_id)
             artifacts = await self._client.artifacts(job_id)
-            path = await self._write(job_id, _RESULT, out, _format(out)) if out else None
+            path = await self._write(job_id, _RESULT, out) if out else None
             preview = job.data["preview"]
             image = None
             if preview:
@@ -160,6 +170,19 @@ class Tools:
             path = await self._write(job_id, name, out) if out else None
         return Blended(url=self._address(job_id, name), path=path)
 
+    async def share(
+        self,
+        job_id: JobId,
+        days: Annotated[float, Field(description="Lifetime of the link, from a minute to 90 days.")] = 7.0,
+        poster: Annotated[
+            bool, Field(description="Whether sites where the link is posted can show an image of the result.")
+        ] = False,
+    ) -> Link:
+        """Create a read-only link to the result of a job, for people without a key."""
+        with _messages():
+            link = await self._client.share(job_id, days, poster=poster)
+        return Link(**{name: link[name] for name in Link.model_fields})
+
     def _address(self, job_id: str, name: str) -> str:
         return f"{self._client.url}/v1/jobs/{job_id}/artifacts/{name}"
 
@@ -178,10 +201,10 @@ class Tools:
             page=f"{self._client.url}/#/jobs/{job.id}",
         )
 
-    async def _write(self, job_id: str, name: str, out: str, format: ResultName | None = None) -> str:
+    async def _write(self, job_id: str, name: str, out: str) -> str:
         """Download an artifact to a new file, and return the file's absolute path."""
         target = await anyio.to_thread.run_sync(_new_file, out)
-        return str(await self._client.download(job_id, target, name, format=None if format == PLY.name else format))
+        return str(await self._client.download(job_id, target, name))
 
 
 def _new_file(out: str) -> Path:
@@ -230,6 +253,7 @@ def make_server(client: AsyncClient) -> MCPServer[None]:
     server.add_tool(tools.status, annotations=_READS)
     server.add_tool(tools.result, annotations=_CREATES)
     server.add_tool(tools.blend, annotations=_CREATES)
+    server.add_tool(tools.share, annotations=_CREATES)
     return server
 
 

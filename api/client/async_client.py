@@ -18,6 +18,8 @@ from api.client.transport import TRIES, Download, Progress, Transport, in_thread
 from service.states import Transition
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.formats import download_of_name
+from sgsst_core.files.formats.ply import PLY
 
 #: Jobs per page of a list.
 _PAGE = 200
@@ -204,18 +206,21 @@ class AsyncClient:
         """Download a file of a job, and check its SHA-256. If part of it was downloaded before, resume from there.
 
         Args:
-            format: Format of stylized.ply, such as "spz"; None for PLY. The service converts the file on the
-                first request.
+            format: Format of stylized.ply, such as "spz"; None for that of the target's name. The service converts
+                the file on the first request.
 
         Raises:
             RequestError: If the file does not exist, or does not exist yet.
-            OutputError: If the target is a folder, or its folder cannot be written or created.
+            OutputError: If the target is a folder, its folder cannot be written or created, or stylized.ply cannot be
+                saved with its suffix.
         """
         target = Path(target)
+        if format is None and name == "stylized.ply":
+            format = download_of_name(target.name)
         if target.is_dir():
             raise OutputError(f"{target}: is a folder. Name the file to write.")
         await in_thread(ensure_writable_folder, target.parent)
-        query = f"?format={format}" if format else ""
+        query = f"?format={format}" if format and format != PLY.name else ""
         await self._transport.fetch(Download(f"{_job_path(job_id)}/artifacts/{quote(name)}{query}", target, progress))
         return target
 

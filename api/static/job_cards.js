@@ -3,7 +3,7 @@
 import { artifactPath } from "./api.js";
 import { h, icon } from "./dom.js";
 import { titleOf, valueText } from "./options.js";
-import { resultFormats } from "./scene_formats.js";
+import { downloads } from "./scene_formats.js";
 import { size, words } from "./words.js";
 
 const say = words.job;
@@ -15,9 +15,9 @@ const say = words.job;
 export function downloadCard(id, bytes) {
   const link = h("a.button.primary", { download: "" }, icon("down"), h("span", say.download)), note = h("p.help");
   const chooser = h("select", { "aria-label": say.format, onchange: () => choose() },
-    [...resultFormats, { name: "html", title: say.page }].map(({ name, title }, i) => h("option", { value: name }, i ? title : `${title} · ${size(bytes)}`)));
+    downloads.map(({ name, title }, i) => h("option", { value: name }, i ? title : `${title} · ${size(bytes)}`)));
   const choose = () => {
-    const path = artifactPath(id, "stylized.ply"), first = chooser.value === resultFormats[0].name;
+    const path = artifactPath(id, "stylized.ply"), first = chooser.value === downloads[0].name;
     link.href = first ? path : `${path}?format=${encodeURIComponent(chooser.value)}`;
     note.textContent = first ? "" : say.converting;
   };

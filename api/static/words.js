@@ -193,7 +193,7 @@ export const words = {
     early: /** @type {Record<string, string>} */ ({ within: "Its time was used up", "on-request": "This job was stopped early", converged: "The loss no longer fell", "target-loss": "The target loss was reached" }),
     onward: /** @type {Record<string, string>} */ ({ within: "For the other steps, choose “Continue”; for a finer result, “Same with changes” with more time.", "on-request": "For all steps, choose “Continue”." }),
     risen: "The loss has risen: choose “Same with changes” and give it more steps.",
-    threeD: "3D", sheet: "Before and after", result: "Result", download: "Download", format: "Format", page: "HTML page, opened without a server", converting: "Converted on the first download, which takes about 10 seconds for a million Gaussians.", files: "Files", settings: "Settings", inputs: "Inputs", openReport: "Open the report", noFiles: "Nothing yet.", noScene: "This scene can't be shown here.", view3d: "Result", compare: "Compare with", compareWith: "Another job of this scene",
+    threeD: "3D", sheet: "Before and after", result: "Result", download: "Download", format: "Format", converting: "Converted on the first download, which takes about 10 seconds for a million Gaussians.", files: "Files", settings: "Settings", inputs: "Inputs", openReport: "Open the report", noFiles: "Nothing yet.", noScene: "This scene can't be shown here.", view3d: "Result", compare: "Compare with", compareWith: "Another job of this scene",
     sheetOf: (/** @type {string} */ name) => `Views of ${name} before and after`, failed: "The job failed", anotherPainting: "Try another painting", changed: "Same with changes",
   },
   video: {

@@ -57,7 +57,7 @@ _PAGE_SIZE = 2
 #: Maximum number of blends that are stored with a job.
 MOST_BLENDS = 20
 #: Names of the HTML page that shows the result, and of the video, among a job's artifacts.
-PAGE, VIDEO = "stylized.html", "video.mp4"
+PAGE, VIDEO = result_name(RESULT, "html"), "video.mp4"
 #: Limits per frame of a video: CPU seconds per byte of the result and per pixel, of which a fifth is needed, and bytes
 #: of the file per pixel, which H.264 does not reach even for noise. Videos take an eighth of them at most.
 _VIDEO_SECONDS_PER_BYTE, _VIDEO_SECONDS_PER_PIXEL, _VIDEO_BYTES_PER_PIXEL, _USUAL_BYTES = 4e-8, 1e-6, 1.5, 1 / 8
@@ -138,7 +138,7 @@ class DerivedFiles:
             QUOTA_EXCEEDED: If the files exceed the owner's quota of stored bytes.
             BUSY, NoSpaceError: If the result cannot be compressed now.
         """
-        name = result_name(RESULT, format)
+        name = result_name(RESULT, format.name)
         return await self._existing(job, name) or await self._derived(
             job, name, lambda: self._compress(job, name, quotas)
         )

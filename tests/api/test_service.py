@@ -25,6 +25,7 @@ import torch
 from plyfile import PlyData
 
 from api.client import AsyncClient, Client, Job
+from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import EXTRA_FORMATS, by_name
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
@@ -243,6 +244,11 @@ def test_compressed_scene_and_results_in_other_formats(
         with Client(service.url) as user:
             user.download(job_id, tmp_path / "mine", format="spz")
             assert (tmp_path / "mine").read_bytes() == client.get(where, params={"format": "spz"}).content
+            assert user.download(job_id, tmp_path / "scene.html").read_text() == page.text
+            assert read_scene(user.download(job_id, tmp_path / "scene.sog")).format == "sog"
+            assert user.download(job_id, tmp_path / "plain").read_bytes() == client.get(where).content
+            with pytest.raises(OutputError, match="does not end in"):
+                user.download(job_id, tmp_path / "scene.usdz")
         command = [sys.executable, "-m", "api.cli", "download", job_id, "--url", service.url]
         command += ["--out", str(tmp_path / "other.compressed.ply")]
         ended = subprocess.run(command, check=True, env=service.environment, cwd=ROOT, capture_output=True, text=True)

@@ -6,7 +6,7 @@ import asyncio
 import re
 from functools import partial
 from pathlib import PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
@@ -25,7 +25,7 @@ from service.files.artifacts import media_type
 from service.files.staging import RESULT
 from service.inspection.derived import PAGE, Blend
 from service.store.tables import ArtifactRow, JobRow
-from sgsst_core.files.formats import EXTRA_FORMATS, ResultName, by_name, listed, result_name
+from sgsst_core.files.formats import EXTRA_FORMATS, DownloadName, by_name, listed, result_name
 from sgsst_core.files.formats.ply import PLY
 from worker.options import JobVideo
 
@@ -97,12 +97,12 @@ async def get_artifact(
     caller: CallerDep,
     conditions: ConditionsDep,
     format_: Annotated[
-        ResultName | Literal["html"] | None,
+        DownloadName | None,
         Query(
             alias="format",
             description="Format of `stylized.ply`. The file is converted at the first request, which takes about ten "
             "seconds for a million Gaussians, and stored beside the PLY; "
-            f"{listed([f'`{result_name(RESULT, each)}.json`' for each in EXTRA_FORMATS])} then has its loss as PSNR in "
+            f"{listed([f'`{result_name(RESULT, each.name)}.json`' for each in EXTRA_FORMATS])} then has its loss as PSNR in "
             "the job's views. `html` is a page that shows the result in 3D without a server, beside the scene if both "
             "have the same Gaussians.",
             examples=["spz"],

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgsst_core.errors import SceneError
+from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import SCENES, refuse_known, refuse_scene_folder
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.glb import GLB
@@ -27,14 +27,17 @@ FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_3, STREAMED_SO
 #: Formats of results: PLY, and those that can be written in addition to it.
 RESULT_FORMATS = tuple(each for each in FORMATS if each.write)
 EXTRA_FORMATS = tuple(each for each in RESULT_FORMATS if each is not PLY)
+#: Everything that a result of the service can be downloaded as: file name suffixes without their first dot, and titles.
+#: The page shows the result in 3D.
+DOWNLOADS = {each.name: each.title for each in RESULT_FORMATS} | {"html": "HTML page, opened without a server"}
 
 if TYPE_CHECKING:
     ResultName = str
-    ExtraName = str
+    DownloadName = str
 else:
-    #: Names of `RESULT_FORMATS` and `EXTRA_FORMATS`, as choices of options and query parameters.
+    #: Names of `RESULT_FORMATS`, and of `DOWNLOADS`, as choices of options and query parameters.
     ResultName = Literal[tuple(each.name for each in RESULT_FORMATS)]
-    ExtraName = Literal[tuple(each.name for each in EXTRA_FORMATS)]
+    DownloadName = Literal[tuple(DOWNLOADS)]
 
 #: Number of leading bytes that are used to detect the format.
 HEAD_BYTES = 8192
@@ -50,6 +53,7 @@ TITLES = listed([each.title for each in FORMATS])
 SUFFIXES = listed([each.suffix for each in FORMATS])
 RESULT_SUFFIXES = listed([each.suffix for each in RESULT_FORMATS])
 EXTRA_SUFFIXES = listed([each.suffix for each in EXTRA_FORMATS])
+DOWNLOAD_SUFFIXES = listed([f".{name}" for name in DOWNLOADS])
 
 
 def format_of_name(name: str) -> SceneFormat | None:
@@ -63,9 +67,21 @@ def by_name(name: str) -> SceneFormat:
     return next(each for each in FORMATS if each.name == name)
 
 
-def result_name(ply: str, format: SceneFormat) -> str:
-    """Return the name of a result in another format, given the name of its PLY."""
-    return ply.removesuffix(PLY.suffix) + format.suffix
+def result_name(ply: str, format: str) -> str:
+    """Return the name of a result in one of `DOWNLOADS`, given the name of its PLY."""
+    return f"{ply.removesuffix(PLY.suffix)}.{format}"
+
+
+def download_of_name(name: str) -> str:
+    """Return the one of `DOWNLOADS` that a result is saved as, by the name of its file; PLY if that has no suffix.
+
+    Raises:
+        OutputError: If a result cannot be saved with the suffix.
+    """
+    fitting = [each for each in DOWNLOADS if name.lower().endswith(f".{each}")]
+    if not fitting and Path(name).suffix:
+        raise OutputError(f"{name}: does not end in {DOWNLOAD_SUFFIXES}. Name the file to write.")
+    return max(fitting, key=len, default=PLY.name)
 
 
 def scene_path(path: Path) -> Path:

@@ -239,6 +239,39 @@ def test_outputs_are_checked_before_a_job_is_queued(
     assert len(httpx2.get(f"{service.url}/v1/jobs").json()["jobs"]) == before
 
 
+def test_names_of_results_are_checked_before_any_request(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, message in (
+        (["--out", "x.usdz"], "x.usdz: does not end in .ply"),
+        (["--out", "x.zip"], "x.zip: does not end in .ply"),
+        (["--format", "html", "--out", "x.ply"], "ends in .ply, but the format of the download is html"),
+        (["--format", "spz", "--out", "x.zip"], "Give a name that ends in .spz"),
+        (["report.html", "--out", "x.ply"], "Give a name that ends in .html"),
+    ):
+        assert main(["download", MISSING, *arguments, "--url", "http://127.0.0.1:1"]) == 2
+        assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_webhook_events_are_checked_before_files_are_sent(files: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    for event, message in (("ended", "is not started, progress or completed"), ("started", "requires --webhook")):
+        assert main(["submit", *files, "--webhook-events", event, "--url", "http://127.0.0.1:1"]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_share_prints_the_link(
+    files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
+) -> None:
+    job_id = submit(files, capsys)
+    assert main(["share", job_id]) == 4
+    assert "only results can be shared" in capsys.readouterr().err
+    finish(service, job_id, b"result", tmp_path)
+    assert main(["share", job_id, "--poster", "--days", "1"]) == 0
+    link = capsys.readouterr().out.strip()
+    assert link.startswith(f"{service.url}/shared/shr_")
+    assert httpx2.get(link).status_code == 200
+    assert main(["share", job_id, "--days", "91"]) == 2
+    assert "days" in capsys.readouterr().err
+
+
 def test_download_to_a_full_disk_leaves_nothing(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:

@@ -66,7 +66,7 @@ def test_tools_describe_themselves(service: Service) -> None:
         async with tools(service.url) as client:
             listed = {tool.name: tool for tool in (await client.list_tools()).tools}
             assert "estimate" in (client.instructions or "")
-        assert listed.keys() == {"estimate", "submit", "status", "result", "blend"}
+        assert listed.keys() == {"estimate", "submit", "status", "result", "blend", "share"}
         for tool in listed.values():
             assert tool.description
             assert tool.output_schema
@@ -100,6 +100,12 @@ def test_scene_is_estimated_stylized_and_blended(service: Service, files: dict[s
             expected = await direct.download(job_id, tmp_path / "expected.ply")
             assert Path(result["path"]).read_bytes() == expected.read_bytes()
             assert result["urls"]["stylized.ply"] == f"{service.url}/v1/jobs/{job_id}/artifacts/stylized.ply"
+
+            page = await call(client, "result", job_id=job_id, out=str(tmp_path / "scene.html"))
+            assert Path(page["path"]).read_bytes().startswith(b"<!doctype html>")
+            assert "does not end in" in await refusal(client, "result", job_id=job_id, out="a.usdz")
+            link = await call(client, "share", job_id=job_id, poster=True)
+            assert link["url"].startswith(f"{service.url}/shared/shr_")
 
             blend = await call(client, "blend", job_id=job_id, weight=0.5, out=str(tmp_path / "half.spz"))
             name = await direct.blend(job_id, 0.5, format="spz")

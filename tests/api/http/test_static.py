@@ -14,7 +14,7 @@ import pytest
 from api.http.static import DOCS_POLICY, POLICY, StaticFiles, static_files
 from api.static_files import FOLDER
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
-from sgsst_core.files.formats import FORMATS
+from sgsst_core.files.formats import DOWNLOADS, FORMATS
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.options import STRENGTHS
 from tests.api.conftest import KEYED, Services
@@ -88,6 +88,11 @@ def test_page_knows_the_registered_scene_formats(client: httpx2.Client, files: S
     match = re.search(r"sceneFormats = .*\((\[.*\])\);", module)
     assert match
     assert [entry["suffix"] for entry in json.loads(match[1])] == [format.suffix for format in FORMATS]
+    offered = re.search(r"downloads = .*\((\[.*\])\);", module)
+    assert offered
+    parameters = client.get("/openapi.json").json()["paths"]["/v1/jobs/{job_id}/artifacts/{name}"]["get"]["parameters"]
+    (choices,) = [each["schema"]["anyOf"][0]["enum"] for each in parameters if each["name"] == "format"]
+    assert [entry["name"] for entry in json.loads(offered[1])] == choices == [*DOWNLOADS]
 
 
 def test_page_knows_what_is_installed(client: httpx2.Client, files: StaticFiles) -> None:

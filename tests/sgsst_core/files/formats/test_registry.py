@@ -9,9 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from sgsst_core.errors import SceneError
+from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.camera_files import read_cameras
-from sgsst_core.files.formats import EXTRA_FORMATS, FORMATS, RESULT_FORMATS, TITLES, format_of_name, read_scene_header
+from sgsst_core.files.formats import (
+    DOWNLOADS,
+    EXTRA_FORMATS,
+    FORMATS,
+    RESULT_FORMATS,
+    TITLES,
+    download_of_name,
+    format_of_name,
+    read_scene_header,
+)
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat
@@ -140,6 +149,17 @@ def test_suffix_determines_the_format() -> None:
     assert format_of_name("a.v3.spz") is SPZ_3
     assert format_of_name("a.splat") is SPLAT
     assert format_of_name("ply") is None
+
+
+def test_suffix_determines_what_a_result_is_saved_as() -> None:
+    names = ["a.ply", "a.b.PLY", "a.compressed.ply", "a.v3.spz", "a.spz", "a.Sog", "a.glb", "a.html", "a"]
+    assert [download_of_name(name) for name in names] == [
+        *("ply", "ply", "compressed.ply", "v3.spz", "spz", "sog", "glb", "html", "ply")
+    ]
+    assert {download_of_name(f"a.{name}") for name in DOWNLOADS} == set(DOWNLOADS)
+    for name in ("a.splat", "a.zip", "a.usdz", "a.htm", "a.ply.part"):
+        with pytest.raises(OutputError, match=re.escape(f"{name}: does not end in .ply, .compressed.ply")):
+            download_of_name(name)
 
 
 @pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
