@@ -12,6 +12,7 @@ import secrets
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -22,7 +23,7 @@ from typing import Any
 
 import psutil
 
-from sgsst_core.errors import ClusterAwayError, RanksFailedError
+from sgsst_core.errors import ClusterAwayError, RanksFailedError, SettingsError
 from worker.ranks import sweeper
 from worker.ranks.failure_policy import first_line
 from worker.ranks.memory import memory_beside_gpus
@@ -78,6 +79,7 @@ class Cluster:
 
         Raises:
             RanksFailedError: If the local instance cannot be started.
+            SettingsError: If no local instance can be started on this system.
             ClusterAwayError: If the cluster cannot be joined.
         """
         if threading.current_thread() is not threading.main_thread():
@@ -106,6 +108,10 @@ class Cluster:
             ) from error
 
     def _start(self) -> None:
+        if sys.platform == "win32":  # under Wine, Ray's processes do not start; it was not tried on Windows itself
+            raise SettingsError(
+                "--workers requires Linux or macOS. Omit it, or run the command in WSL2 (`wsl --install`)."
+            )
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ["RAY_AUTH_TOKEN"] = _SECRET
         # Makes Ray bind all its ports to 127.0.0.1. Without it, Ray on Linux replaces that address by one that other
@@ -117,8 +123,8 @@ class Cluster:
 
         _silence_ray()
         parent = tempfile.gettempdir()
-        too_long = len(parent) >= _LONGEST_PARENT and os.name == "posix"  # elsewhere Ray has no sockets with paths
-        self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir="/tmp" if too_long else parent))
+        short = "/tmp" if len(parent) >= _LONGEST_PARENT else parent
+        self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir=short))
         self._sweeper = sweeper.beside(self._folder)
         earlier = set(psutil.Process().children())
         try:

@@ -150,6 +150,16 @@ def test_client_reaches_a_service(windows: Windows, whole_service: Service) -> N
     assert len(read_scene(windows.folder / "from_service.ply").scene) == len(wall())
 
 
+def test_ranks_are_refused_before_any_work(windows: Windows) -> None:
+    inputs = ["scene.ply", "--cameras", "cameras.json", "--style", "style.png"]
+    code, output = windows.python("-m", "api.cli", "stylize", *inputs, *OPTIONS, "--workers", "2", "--out", "ranks.ply")
+    assert code == 2
+    assert output.splitlines() == [
+        "error: --workers requires Linux or macOS. Omit it, or run the command in WSL2 (`wsl --install`)."
+    ]
+    assert not list(windows.folder.glob("ranks*"))
+
+
 def test_service_names_the_ways_to_run_it(windows: Windows) -> None:
     code, output = windows.python("-m", "api.cli", "serve")
     assert code == 2
