@@ -24,6 +24,7 @@ from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import SUFFIXES, scene_path
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
+from worker.outputs import check_is_not_input
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -153,11 +154,14 @@ def batch(
     """
     results = _Batch(out)
     jobs = {}
-    for (scene_name, scene), (style_name, image) in product(_named(scenes).items(), _named(style).items()):
+    pairs = list(product(zip(_names(scenes), scenes, strict=True), zip(_names(style), style, strict=True)))
+    names = different_names([Path(f"{scene_name}_{style_name}") for (scene_name, _), (style_name, _) in pairs])
+    for name, ((_, scene), (_, image)) in zip(names, pairs, strict=True):
         beside = cameras or (None if options.orbit else scene_path(scene).parent)
         inputs = JobInputs(str(scene), [str(image)], str(beside) if beside else None)
-        name = f"{scene_name}_{style_name}"
         jobs[name] = inputs.request(options, results.result(name))
+        for each in scenes:
+            check_is_not_input(results.result(name), scene_path(each), "scene of another result")
     invocation: Invocation = context.obj
     if url is not None:
         _make_by_service(results, jobs, options, url, key)
@@ -175,10 +179,10 @@ def batch(
         raise typer.Exit(FAILURE)
 
 
-def _named(paths: Sequence[Path]) -> dict[str, Path]:
-    """Return files by the parts that they have in the names of results."""
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return the parts that files have in the names of results."""
     plain = [scene_path(path).parent if scene_path(path) != path else path.with_suffix("") for path in paths]
-    return dict(zip(different_names(plain), paths, strict=True))
+    return different_names(plain)
 
 
 def _make(

@@ -77,8 +77,10 @@ def different_names(paths: Sequence[Path]) -> list[str]:
     """Return a unique name for each file: its own, prefixed by a number if an earlier file has the same name."""
     names: list[str] = []
     for number, path in enumerate(paths, 1):
-        taken = {name.lower() for name in names}
-        names.append(path.name if path.name.lower() not in taken else f"{number}_{path.name}")
+        taken, name = {name.lower() for name in names}, path.name
+        while name.lower() in taken:
+            name = f"{number}_{name}"
+        names.append(name)
     return names
 
 

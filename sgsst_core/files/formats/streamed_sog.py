@@ -175,10 +175,12 @@ def _levels(index: dict[str, Any]) -> dict[str, tuple[int | None, list[tuple[int
             if not all(type(value) is int and value >= 0 for value in numbers) or not 0 <= int(level) < most:
                 raise ValueError(f"level {level} of {most}: {range_}")
             ranges[_folder(names[file]), int(level)].append((offset, count))
-    for level, count in enumerate(index.get("counts", [])):
-        total = sum(size for (_, own), spans in ranges.items() if own == level for _, size in spans)
-        if total != count:
-            raise ValueError(f"level {level} has {total} Gaussians in place of {count}")
+    totals: dict[int, int] = defaultdict(int)
+    for (_, own), spans in ranges.items():
+        totals[own] += sum(size for _, size in spans)
+    for own, count in enumerate(index.get("counts", [])):
+        if totals[own] != count:
+            raise ValueError(f"level {own} has {totals[own]} Gaussians in place of {count}")
     order = {name: number for number, name in enumerate(map(_folder, names))}
     parts: dict[str, tuple[int | None, list[tuple[int, int]]]] = {
         folder: (level, spans) for (folder, level), spans in sorted(ranges.items(), key=lambda item: order[item[0][0]])

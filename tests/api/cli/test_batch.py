@@ -93,3 +93,24 @@ def test_missing_scenes_and_foreign_records_are_named(
     assert main(arguments) == 2
     assert "is no record of a batch" in capsys.readouterr().err
     assert record.read_text() == "[1]"
+
+
+def test_results_have_different_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a.ply", "a_b.ply", "b_c.png", "c.png"):
+        (tmp_path / name).write_bytes(b"neither scene nor image")
+    scenes, styles = (
+        [str(tmp_path / name) for name in names] for names in (("a.ply", "a_b.ply"), ("b_c.png", "c.png"))
+    )
+    options = [text for style in styles for text in ("--style", style)]
+    assert main(["batch", *scenes, *options, "--orbit", "3", "--out", str(tmp_path / "out")]) == 1
+    assert "4 of 4 results could not be made: a_b_c, a_c, a_b_b_c, 4_a_b_c" in " ".join(capsys.readouterr().err.split())
+
+
+def test_no_result_replaces_another_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ply, _, _ = write_files(tmp_path, wall())
+    other = tmp_path / "scene_style.ply"
+    other.write_bytes(ply.read_bytes())
+    batch = ["batch", str(ply), str(other), "--style", str(tmp_path / "style.png"), "--out", str(tmp_path)]
+    assert main(batch) == 2
+    assert "is the scene of another result, which would be overwritten" in capsys.readouterr().err
+    assert other.read_bytes() == ply.read_bytes()
