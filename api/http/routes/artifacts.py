@@ -102,9 +102,9 @@ async def get_artifact(
             alias="format",
             description="Format of `stylized.ply`. The file is converted at the first request, which takes about ten "
             "seconds for a million Gaussians, and stored beside the PLY; "
-            f"{listed([f'`{result_name(RESULT, each.name)}.json`' for each in EXTRA_FORMATS])} then has its loss as PSNR in "
-            "the job's views. `html` is a page that shows the result in 3D without a server, beside the scene if both "
-            "have the same Gaussians.",
+            f"{listed([f'`{result_name(RESULT, each.name)}.json`' for each in EXTRA_FORMATS])} then has its loss as "
+            "PSNR in the job's views. `html` is a page that shows the result in 3D without a server, beside the scene "
+            "if both have the same Gaussians.",
             examples=["spz"],
         ),
     ] = None,
