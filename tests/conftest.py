@@ -25,8 +25,7 @@ from tests import networks, triton_interpreter
 from tests.pretend_cuda.counts import Counts
 
 if os.environ.get("TRITON_INTERPRET") == "1" and importlib.util.find_spec("triton"):
-    triton_interpreter.cache_names_of_builtins()
-    triton_interpreter.compute_in_bfloat16()
+    triton_interpreter.prepare()
 
 
 def pytest_make_parametrize_id(val: object) -> str | None:

@@ -27,8 +27,9 @@ from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.runtime import pretend_cuda
 from tests.small_scenes import ball, cameras, style, wall, write_files
 from worker.execute import execute
+from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume, SceneRequest
-from worker.prepare import Job, prepare
+from worker.prepare import Job, dry_run, prepare
 from worker.region_requests import region_options, region_requests
 from worker.styles import StyleFile
 
@@ -140,9 +141,11 @@ def test_steady_step_synchronizes_once_and_copies_scalars(
 @pytest.mark.slow
 def test_loop_reads_a_step_after_it_has_queued_the_next(tmp_path: Path) -> None:
     """The losses, the colors and what a checkpoint has are those of steps that are read at once."""
-    asked = request_(tmp_path, scan=False, gray=False, size=(64, 48), steps_coarse=1, steps_sos=4)
+    asked, plan = request_(tmp_path, size=(64, 48), steps_coarse=1, steps_sos=4), tmp_path / "plan"
+    plan.touch()
     with pretend_cuda():
-        expected, stylizer = prepare(asked).stylizer, prepare(asked).stylizer
+        dry_run(asked, read_inputs(asked), hand_over=plan)
+        expected, stylizer, other = (prepare(asked, plan_file=plan).stylizer for _ in range(3))
         for _ in range(expected.job.total_steps):
             expected.run_step()
         seen, saved, reported = list[tuple[int, int]](), list[int](), list[int]()
@@ -163,7 +166,6 @@ def test_loop_reads_a_step_after_it_has_queued_the_next(tmp_path: Path) -> None:
         assert reported == [1, 2, 3, 5], "the last two are read together"
         assert [record.loss for record in stylizer.history] == [record.loss for record in expected.history]
         assert torch.equal(stylizer.sh_dc.detach().cpu(), expected.sh_dc.detach().cpu())
-        other = prepare(asked).stylizer
         callbacks = replace(callbacks, stop=lambda: other.step == 2)
         assert run(other, callbacks) == "interrupted"
         assert saved == [2]
