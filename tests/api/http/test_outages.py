@@ -222,13 +222,15 @@ def test_locked_database_is_busy_but_readable(tmp_path: Path, files: dict[str, b
         with service.client(key) as client, contextlib.closing(sqlite3.connect(service.data / "sgsst.db")) as other:
             other.isolation_level = None
             other.execute("BEGIN EXCLUSIVE")
-            with at_once(lambda: create_upload(client)):
+            with at_once(lambda: create_upload(client)), ThreadPoolExecutor(2) as pool:
+                upload = pool.submit(create_upload, client)
+                origin = {"Origin": service.url}
+                sign_in = pool.submit(client.post, "/v1/session", json={"key": key}, headers=origin)
                 for _ in range(3):
                     check_health(service, 200)
-            refused(create_upload(client), 503, "database-busy")
-            assert client.get(f"/v1/jobs/{job_id}").status_code == 200
-            sign_in = client.post("/v1/session", json={"key": key}, headers={"Origin": service.url})
-            refused(sign_in, 503, "database-busy")
+                assert client.get(f"/v1/jobs/{job_id}").status_code == 200
+            refused(upload.result(), 503, "database-busy")
+            refused(sign_in.result(), 503, "database-busy")
             other.execute("ROLLBACK")
             assert create_upload(client).status_code == 201
             assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200

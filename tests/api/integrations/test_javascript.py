@@ -27,7 +27,17 @@ def package() -> Path:
         pytest.skip("npm is missing: apt-get install npm")
     shutil.copytree(FOLDER, folder, dirs_exist_ok=True)
     if not (folder / "node_modules" / "openapi-fetch").exists():
-        command = [npm, "install", "--silent", "--no-save", "--prefix", str(folder)]
+        command = [
+            npm,
+            "install",
+            "--silent",
+            "--no-save",
+            "--no-audit",
+            "--no-fund",
+            "--prefer-offline",
+            "--prefix",
+            str(folder),
+        ]
         try:
             subprocess.run(command, check=True, timeout=240)
         except (subprocess.TimeoutExpired, subprocess.CalledProcessError):
