@@ -31,6 +31,7 @@ import torch
 
 from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.machine import RESULTS, write_result
+from tests import triton_interpreter
 
 #: Time limit of each part in seconds, 895 in total, the most telling parts first. The first parts load the libraries
 #: from disk and compile the kernels and the CPU rasterizer.
@@ -60,6 +61,8 @@ def main() -> int:
     if not torch.cuda.is_available():
         os.environ["TRITON_INTERPRET"] = "1"  # read when a part's process first imports the kernels
     if arguments.findings:
+        if not torch.cuda.is_available():
+            triton_interpreter.prepare()
         return run_part(arguments.only[0], arguments)
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
     parts = {}

@@ -53,7 +53,7 @@ QUICK = Sizes(
     parity=(120, 40, 33),
     network=48,
     bits=2,
-    curve=(2, 48),
+    curve=(2, 32),
     repeats=1,
 )
 

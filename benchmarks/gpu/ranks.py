@@ -21,6 +21,7 @@ from sgsst_core.bench.synthetic import surface_scene, texture, views
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests import triton_interpreter
 from worker.ranks.process_group import ProcessGroupCollectives
 
 RANKS = 2
@@ -74,6 +75,7 @@ def run_rank(rank: int, address: str, folder: str, sizes: Sizes) -> None:
     """Run one rank and save its results."""
     if device().type == "cpu":
         torch.set_num_threads(1)
+        triton_interpreter.prepare()
     dist.init_process_group("gloo", init_method=f"tcp://{address}", rank=rank, world_size=RANKS)
     collectives = ProcessGroupCollectives(dist.group.WORLD, device(), timedelta(seconds=60))
     try:

@@ -93,7 +93,8 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
 
 def test_job_runs_on_a_simulated_gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     code = (
-        "import sys; from tests.pretend_cuda.runtime import pretend_cuda; from api.cli.main import main\n"
+        "import sys; from tests import triton_interpreter; from tests.pretend_cuda.runtime import pretend_cuda\n"
+        "from api.cli.main import main\ntriton_interpreter.prepare()\n"
         "with pretend_cuda(): sys.exit(main(sys.argv[1:]))"
     )
     monkeypatch.setattr(job, "PROGRAM", (sys.executable, "-c", code))
