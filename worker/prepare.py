@@ -24,7 +24,7 @@ from sgsst_core.errors import CheckpointError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.context import common_device, rasterizer_problem
+from sgsst_core.planning.context import Networks, common_device, rasterizer_problem
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice
@@ -125,10 +125,10 @@ def prepare(
     known: Checkpoint | _HandedOver | None = resumed
     if plan_file and not resumed:
         known = collectives.broadcast(lambda: _handed_over(plan_file, fingerprint, inputs, settings))
-    chosen = known.plan.time_choice if known else None
+    chosen, networks = known.plan.time_choice if known else None, Networks()
     if not known:
         with timer("planning"):
-            chosen = _choose(inputs, settings, left, weights, collectives, show_planning)
+            chosen = _choose(inputs, settings, left, weights, collectives, show_planning, networks)
     asked, settings = settings, chosen.applied(settings) if chosen else settings
     inputs = inputs.chosen(chosen, settings) if chosen else inputs
     refinement, scene_file = known.plan.refinement if known else None, inputs.scene_file
@@ -149,6 +149,7 @@ def prepare(
         show=show_planning,
         timer=timer,
         left=None if known else left,
+        networks=networks,
     )
     with timer("preparing"):
         stylizer = Stylizer(stylization)
@@ -180,12 +181,13 @@ def dry_run(
         InvalidInputError: If the job cannot be planned.
     """
     settings, weights = request.settings, load_network_weights(request.backbone)
-    chosen, of_job = _choose(inputs, settings, left, weights, ALONE, show), inputs
+    networks, of_job = Networks(), inputs
+    chosen = _choose(inputs, settings, left, weights, ALONE, show, networks)
     applied = chosen.applied(settings) if chosen else settings
     inputs = inputs.chosen(chosen, applied) if chosen else inputs
     refinement = _refine(inputs, applied, weights, ALONE, show)
     scene = refined(inputs.scene_file.scene, refinement)
-    plan = _planner(inputs, settings, weights, scene, refinement, chosen)(show=show, left=left).plan
+    plan = _planner(inputs, settings, weights, scene, refinement, chosen)(show=show, left=left, networks=networks).plan
     if hand_over:
         job = fingerprint_of(of_job, settings, weights.sha256, ALONE)
         with contextlib.suppress(OSError):  # a job without this file plans again
@@ -235,6 +237,7 @@ def _choose(
     weights: BackboneWeights,
     collectives: Collectives,
     show: ShowPlanning | None,
+    networks: Networks,
 ) -> TimeChoice | None:
     """Return the choice of the time budget; None without one."""
     return left and choose_within(
@@ -247,6 +250,7 @@ def _choose(
         collectives=collectives,
         regions=inputs.regions,
         show=show,
+        networks=networks,
     )
 
 

@@ -268,6 +268,27 @@ def weight_cost(rasterizer: Rasterizer, cameras: Sequence[Camera], settings: Set
     return WeightCost(total, half, Saving(recomputed, applied, caching))
 
 
+@dataclass
+class Networks:
+    """Feature networks that the plans of one job share, and the comparison of their precisions, which is made once.
+
+    Attributes:
+        precisions: Comparison of each precision; None if there was none yet.
+        created: Networks by precision.
+    """
+
+    precisions: Mapping[PlannedPrecision, Comparison] | None = None
+    created: dict[PlannedPrecision, FeatureNetwork] = field(default_factory=dict)
+
+    def get(
+        self, precision: PlannedPrecision, weights: BackboneWeights, settings: Settings, device: Device
+    ) -> FeatureNetwork:
+        """Return the network in a precision, and create it if it is needed for the first time."""
+        if precision not in self.created:
+            self.created[precision] = make_network(weights, settings, precision, device)
+        return self.created[precision]
+
+
 @dataclass(frozen=True)
 class PlanningContext:
     """Objects that are created for measuring before the job, and that the job continues to use.
@@ -278,9 +299,10 @@ class PlanningContext:
         settings: Settings of the job.
         machine: Facts about the machine.
         weights: Weights of the network.
-        network: Network, in float32 until the precision is chosen.
+        network: Network; in float32 if no precision was chosen yet.
         rasterizer: Rasterizer of the whole scene that computes blend weights.
         sh_degree: SH degree of the original scene.
+        networks: Networks of all plans of the job.
     """
 
     scene: Scene
@@ -291,6 +313,7 @@ class PlanningContext:
     network: FeatureNetwork
     rasterizer: Rasterizer
     sh_degree: int
+    networks: Networks
 
 
 def equip(
@@ -300,6 +323,7 @@ def equip(
     weights: BackboneWeights,
     collectives: Collectives,
     rasterizer: str | None = None,
+    networks: Networks | None = None,
 ) -> PlanningContext:
     """Create the planning context. Every rank must call this, and gets the same result up to rounding.
 
@@ -310,11 +334,13 @@ def equip(
         weights: Weights of the network.
         collectives: Ranks of the job.
         rasterizer: Rasterizer that computes blend weights; None to choose one.
+        networks: Networks of earlier plans of the same job; None if this is the first plan.
     """
+    networks = networks or Networks()
     sh_degree, scene = scene.sh_degree, scene.attenuated(settings.sh_attenuation)
     device = common_device(collectives)
     problems = gpu_problems(collectives) if device == "cuda" else {}
-    network = make_network(weights, settings, "float32", device)
+    network = next(iter(networks.created.values()), None) or networks.get("float32", weights, settings, device)
     limit = settings.memory_limit or default_memory_limit(network.device)
     machine = Hardware(
         device,
@@ -327,7 +353,7 @@ def equip(
     name = rasterizer or rasterizer_for(device, problems)
     memory = memory_for("rasterizer", machine.memory)
     of_scene = make_rasterizer(name, scene, background=settings.background, near=settings.near, memory=memory)
-    return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, of_scene, sh_degree)
+    return PlanningContext(scene, tuple(cameras), settings, machine, weights, network, of_scene, sh_degree, networks)
 
 
 def common_device(collectives: Collectives) -> Device:
@@ -457,7 +483,7 @@ def compare_precisions(
     for name in precisions:
         result[name] = Comparison(ratios[name])
         if name in faster:
-            network = make_network(context.weights, context.settings, name, device)
+            network = context.networks.get(name, context.weights, context.settings, device)
             gradient, own = compared_gradient(context, network, image)
             error = Difference.of(gradient[seen], exact[seen])
             result[name] = Comparison(ratios[name], seconds / max(own, _TICK), error)

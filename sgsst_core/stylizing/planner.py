@@ -20,12 +20,12 @@ from sgsst_core.planning import choices
 from sgsst_core.planning.context import (
     Facts,
     NetworkPixels,
+    Networks,
     PlanningContext,
     available_precisions,
     common_device,
     compare_precisions,
     equip,
-    make_network,
     weight_cost,
 )
 from sgsst_core.planning.plan import Device, Plan, Shape
@@ -81,6 +81,7 @@ def plan_job(
     refinement: Refinement | None = None,
     chosen: TimeChoice | None = None,
     left: SecondsLeft | None = None,
+    networks: Networks | None = None,
 ) -> StylizationJob:
     """Plan and prepare a job. Every rank must call this with the same arguments, and gets the same plan.
 
@@ -108,6 +109,7 @@ def plan_job(
         refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
         chosen: Choice of the time budget, to which `cameras` and `photos` belong (`choose_within`); None without one.
         left: Seconds left of the time budget, for which the trial corrects the number of steps; None to leave it.
+        networks: Networks of earlier plans of the same job, to reuse and to replace; None if this is the first plan.
 
     Raises:
         CameraError: If there are no cameras, or none sees a Gaussian.
@@ -134,7 +136,7 @@ def plan_job(
         fitted = fit_cameras(cameras, settings)
         check_scales(settings.scales, fitted, settings.coarsest_side)
         check_stroke_depth(settings, fitted, regions=regions is not None)
-        context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
+        context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer, networks)
         if survey is None:
             with timer("survey"):
                 survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
@@ -143,9 +145,9 @@ def plan_job(
         precisions = available_precisions(settings, context.machine.device, collectives)
         facts = collectives.broadcast(lambda: _facts(context, survey, regions, precisions))
         draft = choices.draft_plan(facts, settings, measured=measured)
-        if draft.precision != "float32":
-            network = make_network(context.weights, settings, draft.precision, draft.device)
-            context = replace(context, network=network)
+        network = context.networks.get(draft.precision, context.weights, settings, draft.device)
+        context.networks.created, context.networks.precisions = {draft.precision: network}, facts.precisions
+        context = replace(context, network=network)
         activations = memory_for("activations", context.machine.memory)
         pixels = NetworkPixels.of(draft, facts.sizes, make_loss(context.network, settings, activations).tiling)
         of_a_view = int(pixels.held * context.network.held_bytes_per_pixel())
@@ -193,6 +195,7 @@ def choose_within(
     collectives: Collectives = ALONE,
     regions: Regions | None = None,
     show: ShowPlanning | None = None,
+    networks: Networks | None = None,
 ) -> TimeChoice | None:
     """Choose what fits a time budget, from trials of a few small views. Every rank must call this function.
 
@@ -200,6 +203,7 @@ def choose_within(
 
     Args:
         left: Seconds left of the budget.
+        networks: Networks to create for the trials, which `plan_job` can reuse; None if it does not.
 
     Returns:
         The choice; None if the settings give everything.
@@ -211,13 +215,13 @@ def choose_within(
     weights, fitted = weights or load_network_weights("auto"), fit_cameras(cameras, settings)
     views, costs = spread(fitted, _TRIED_VIEWS * collectives.size), list[ViewCost]()
     side = min(_TRIED_SIDE[common_device(collectives)], max(camera.side for camera in fitted))
-    ending = ending_seconds(len(scene))
+    ending, networks = ending_seconds(len(scene)), networks or Networks()
     while True:
         small, timer = [resized(camera, min(side, camera.side)) for camera in views], Timer()
         own = {"max_resolution": side, "rebalance": False, "scales": (), "stroke_depth": False, "refine": 1.0}
         tried = plan_job(
             scene, small, style, settings.model_copy(update=own), weights=weights, rasterizer=rasterizer,
-            collectives=collectives, regions=regions, timer=timer, show=show,
+            collectives=collectives, regions=regions, timer=timer, show=show, networks=networks,
         ).plan.prediction  # fmt: skip
         assert tried is not None
         # The trial visits up to half of the views, so the prediction has half of the first visits.
@@ -305,7 +309,9 @@ def _facts(
     views = [context.cameras[index] for index in survey.covered]
     budget = memory_for("rasterizer", context.machine.memory)
     sizes = tuple((camera.height, camera.width) for camera in context.cameras)
-    compares = choices.compares_precisions(sizes, settings)
+    compared = context.networks.precisions
+    if compared is None and choices.compares_precisions(sizes, settings):
+        compared = compare_precisions(context, views[0], precisions)
     return Facts(
         gaussians=len(scene),
         sh_degree=context.sh_degree,
@@ -318,7 +324,7 @@ def _facts(
         weights=weight_cost(context.rasterizer, views, settings, budget),
         frozen=None if regions is None else regions.resolved(survey.total_blend_weights).frozen,
         deepest=max(context.network.layers),
-        precisions=compare_precisions(context, views[0], precisions) if compares else None,
+        precisions=compared,
     )
 
 

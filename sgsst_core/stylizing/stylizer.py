@@ -23,6 +23,7 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
 from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
+from sgsst_core.planning.context import Networks
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft, seconds_left
 from sgsst_core.regions.definition import Regions
@@ -167,7 +168,7 @@ class Stylizer:
         style, regions = Style.given(style), regions and regions.with_checked_styles()
         scene, cameras = checked_scene(scene), checked_cameras(cameras)
         weights = weights or load_network_weights("auto")
-        left = left or seconds_left(settings.within)
+        left, networks = left or seconds_left(settings.within), Networks()
         chosen = left and choose_within(
             scene,
             cameras,
@@ -179,6 +180,7 @@ class Stylizer:
             collectives=collectives,
             regions=regions,
             show=show,
+            networks=networks,
         )
         views = chosen.views if chosen else range(len(cameras))
         cameras = [cameras[index] for index in views]
@@ -207,6 +209,7 @@ class Stylizer:
             show=show,
             chosen=chosen,
             left=left,
+            networks=networks,
         )
         return cls(job)
 

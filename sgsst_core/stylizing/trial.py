@@ -121,18 +121,22 @@ class _Visitor:
         different = min(len(job.views.covered), job.total_steps * job.settings.views_per_step)
         visits = 2 if 2 * groups <= different else 1
         order = list(islice(drawn_views(job.views.covered, job.settings.seed), visits * groups))
-        costs: list[list[StepCost]] = [[] for _ in job.schedule]
+        # A view with one scale is visited in one phase, because both evaluate the same.
+        alike = all(len(job.scales(index)) == 1 for index in job.views.covered)
+        phases = job.schedule[:1] if alike else job.schedule
+        costs: list[list[StepCost]] = [[] for _ in phases]
         with _peak_of_process() as process:
             for index in order[job.team.own_group :: groups]:
                 self._visited.append(index)
-                for own, phase in zip(costs, job.schedule, strict=True):
+                for own, phase in zip(costs, phases, strict=True):
                     self._show(sum(map(len, costs)), visits * len(costs))
                     own.append(self._cost(index, phase))
                 if job.collectives.broadcast(lambda: costs[-1][0].seconds > _SLOW):
                     break
             camera = job.views.cameras[self._visited[0]]
             render = with_second_attempt(job, lambda: rasterizer.uncached.step_seconds(camera, 2)[1])
-        coarse, sos = map(_mean, costs)
+        coarse, *later = map(_mean, costs)
+        sos = later[0] if later else replace(coarse, first=0.0)
         if not job.plan.steps_coarse:
             sos = replace(sos, first=coarse.first + sos.first)
         on_device = device_peak(device)
@@ -159,7 +163,7 @@ class _Visitor:
         )
 
     def _cost(self, index: int, phase: Phase) -> StepCost:
-        """Visit a view, and again if that is fast. The first phase warms up the kernels, so it is always repeated."""
+        """Visit a view, and again if that is fast. The first visit warms up the kernels, so it is always repeated."""
         job, before = self._job, {name: len(cache.costs) for name, cache in self._job.caches.items()}
         first = self._visit(index, phase)
         fresh = {
@@ -168,8 +172,8 @@ class _Visitor:
         }
         prepared, forecast = sum(fresh.values()), self._forecast()
         later = {**first, "total": first["total"] - prepared, "prepare": max(first["prepare"] - prepared, 0.0)}
-        fast, warms_up = later["total"] <= _SLOW, phase.scale is not None
-        repetitions = _REPETITIONS if later["total"] < _FAST or (warms_up and fast) else int(fast or warms_up)
+        fast, warms_up = later["total"] <= _SLOW, phase.scale is not None and len(self._visited) == 1
+        repetitions = _REPETITIONS if later["total"] < _FAST else int(fast or warms_up)
         again = [self._visit(index, phase) for _ in range(job.collectives.broadcast(lambda: repetitions))]
         if again:
             later = min(again, key=lambda visit: visit["total"])

@@ -26,6 +26,7 @@ from sgsst_core.planning.context import (
 from sgsst_core.planning.plan import Device
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import PlannedPrecision, make_settings
+from sgsst_core.stylizing import planner
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToFloat16, RoundedToTf32, to_tf32
 from tests.sgsst_core.stylizing.test_trial import facts
@@ -219,6 +220,23 @@ def test_measured_precision_is_used_said_and_repeatable(
         assert "a view's loss 1.4 times, with an error of 0.12" in line.reason
         assert auto.run_step().loss == asked.run_step().loss
         assert torch.equal(auto.sh_dc, asked.sh_dc)
+
+
+def test_plans_of_a_time_budget_share_networks_and_their_comparison(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
+    monkeypatch.setattr("sgsst_core.planning.choices._COMPARED_PIXELS", 0)
+    monkeypatch.setattr(module, "convolution_ratio", lambda *_: 1.5)
+    created, create, plans, equip_plan = list[str](), module.make_network, list[object](), planner.equip
+    monkeypatch.setattr(module, "make_network", lambda *given: created.append(given[2]) or create(*given))
+    monkeypatch.setattr(planner, "equip", lambda *given: plans.append(given) or equip_plan(*given))
+    job = Stylizer.planned(ball(300), cameras(3), style(), make_settings(within=60), weights=tiny_weights).job
+    assert len(plans) > 1
+    assert sorted(created) == ["bfloat16", "float32", "winograd"]
+    assert job.network.precision == job.plan.precision == "winograd"
+    line = next(decision for decision in job.plan.decisions if decision.item == "precision")
+    assert "convolutions in bfloat16 are 1.5 times as fast" in line.reason
 
 
 def test_short_job_is_not_measured(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:

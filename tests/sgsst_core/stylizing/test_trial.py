@@ -83,6 +83,18 @@ def test_trial_measures_steps_and_memory(tiny_weights: BackboneWeights) -> None:
     assert again.growth == pytest.approx(sum(sizes[name] for name in ("weights", "content", "colors")) / 2, rel=0.6)
 
 
+@pytest.mark.parametrize(("coarsest_side", "phases"), [(24, 2), (511, 1)])
+def test_phases_that_evaluate_the_same_scale_are_tried_once(
+    tiny_weights: BackboneWeights, coarsest_side: int, phases: int
+) -> None:
+    settings = make_settings("paper", steps_coarse=3, steps_sos=14, coarsest_side=coarsest_side)
+    job = plan_job(wall(), cameras(3), Style.of(style()), settings, weights=tiny_weights)
+    shown: list[tuple[int, int]] = []
+    trial = run_trial(job, lambda done, total: shown.append((done, total)))
+    assert shown[0] == (0, 2 * phases)
+    assert (trial.coarse.seconds == trial.sos.seconds) == (phases == 1)
+
+
 # --- the plan ------------------------------------------------------------------------------------------------------
 
 
