@@ -1,4 +1,7 @@
-"""States of a job, and the table of all transitions between them, from which API, clients and page derive theirs."""
+"""States of a job, and the table of all transitions between them, from which API, clients and page derive theirs.
+
+In addition, what the process of an attempt reports, because this module imports no database.
+"""
 
 from __future__ import annotations
 
@@ -34,6 +37,20 @@ class AttemptOutcome(StrEnum):
     LOST = "lost"
 
 
+class Cause(StrEnum):
+    """Cause of an attempt's end without a result."""
+
+    #: The job itself: its files or settings, an error of the method, or a crash of its process.
+    JOB = "job"
+    STORE = "store"
+    DISK = "disk"
+    DATABASE = "database"
+    #: A machine or the network between machines.
+    MACHINE = "machine"
+    #: The dispatcher's process has ended, or its machine.
+    DISPATCHER = "dispatcher"
+
+
 class Transition(StrEnum):
     """Transition of a job from one state to another."""
 
@@ -56,6 +73,17 @@ class Transition(StrEnum):
     RETRY = "retry"
     #: The retention time of the results is over.
     EXPIRE = "expire"
+
+
+@dataclass(frozen=True)
+class Published:
+    """File in the file store that is or will be published by a database row; `step` is set for checkpoints."""
+
+    name: str
+    location: str
+    size: int
+    sha256: str
+    step: int | None = None
 
 
 #: Event of a job about which its webhook can get a message.

@@ -14,10 +14,9 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from service.states import AttemptOutcome, JobStatus
+from service.states import AttemptOutcome, Cause, JobStatus
 from service.store import Store
 from service.store.database import BUCKETS
-from service.store.retries import Cause
 
 #: Time limit in seconds for all checks together.
 _SECONDS = 0.8

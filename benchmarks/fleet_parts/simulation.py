@@ -27,9 +27,10 @@ from service.scheduling.machine import Machine
 from service.scheduling.packing import Capacity, Grant, estimated_seconds
 from service.scheduling.selection import Holding, JobSelector
 from service.settings import ServiceSettings
+from service.states import Published
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from service.store.leases import Lease, Published
+from service.store.leases import Lease
 from service.store.tables import ReservationRow
 
 LEASE_SECONDS, CHECKPOINT_SECONDS, POLL_SECONDS = 30.0, 60.0, 0.5

@@ -15,7 +15,7 @@ from pathlib import Path
 from service import problems
 from service.files.blobs import disk_errors
 from service.files.objects import ObjectStore
-from service.store.leases import Published
+from service.states import Published
 from sgsst_core.files.atomic import atomic_path, file_digest
 from sgsst_core.files.formats import RESULT_FORMATS
 

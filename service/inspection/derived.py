@@ -37,8 +37,8 @@ from service.inspection.lanes import Lanes
 from service.inspection.work import WorkRequest
 from service.parameters import stored_parameters
 from service.settings import ServiceSettings
+from service.states import Published
 from service.store import Store
-from service.store.leases import Published
 from service.store.quotas import Quotas
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import result_name

@@ -22,8 +22,7 @@ from pydantic import BaseModel
 from service.files.staging import PLAN
 from service.scheduling.endings import OUTAGE, Ending, Report, cause_of_error, outage
 from service.scheduling.store_workplace import StoreWorkplace
-from service.states import AttemptOutcome
-from service.store.retries import Cause
+from service.states import AttemptOutcome, Cause
 from sgsst_core.progress import Progress
 from worker.job import JobSpec
 from worker.processes import die_with_parent, process_start

@@ -12,9 +12,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from service.errors import DatabaseUnavailableError, NoSpaceError, StoreError
-from service.states import AttemptOutcome
-from service.store.leases import Published
-from service.store.retries import Cause
+from service.states import AttemptOutcome, Cause, Published
 from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
 from sgsst_core.progress import Progress
 from worker.job import Result

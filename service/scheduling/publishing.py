@@ -17,8 +17,9 @@ from service.errors import NoSpaceError, ServiceError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.blobs import disk_errors
 from service.files.staging import CHECKPOINT, RESULT
+from service.states import Published
 from service.store import Store
-from service.store.leases import LIVE, Lease, Published
+from service.store.leases import LIVE, Lease
 
 #: Length of the log's end in the error of a crash, in bytes.
 _LOG_TAIL = 2000

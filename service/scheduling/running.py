@@ -31,10 +31,10 @@ from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
 from service.scheduling.selection import Holding
 from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
-from service.states import AttemptOutcome, JobStatus
+from service.states import AttemptOutcome, Cause, JobStatus
 from service.store import Store
 from service.store.leases import Lease
-from service.store.retries import Cause, cause_of
+from service.store.retries import cause_of
 from sgsst_core.errors import SettingsError
 from sgsst_core.progress import Progress
 

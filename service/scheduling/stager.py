@@ -13,7 +13,8 @@ from service.inspection.inspector import stored_plan
 from service.parameters import stored_parameters
 from service.scheduling.attempt_process import Task
 from service.scheduling.packing import Grant
-from service.scheduling.store_workplace import StoredFile, StoreWorkplace, store_weights
+from service.scheduling.rank_folder import store_weights
+from service.scheduling.store_workplace import StoredFile, StoreWorkplace
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.leases import Lease

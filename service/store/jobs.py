@@ -11,13 +11,22 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service import problems
-from service.states import ACTIONS, ENDED, UNFINISHED, JobStatus, Transition, WebhookEvent, allowed, next_status
+from service.states import (
+    ACTIONS,
+    ENDED,
+    UNFINISHED,
+    JobStatus,
+    Published,
+    Transition,
+    WebhookEvent,
+    allowed,
+    next_status,
+)
 from service.store import job_inputs
 from service.store.changes import add_status_event, end, forget, holder_name, job_of_owner, move
 from service.store.database import Database, count, idempotency_row, new_id
 from service.store.history import points
 from service.store.inputs import close_receipt
-from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job, lock_owner
 from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
 

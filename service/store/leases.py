@@ -18,13 +18,13 @@ from sqlalchemy.orm import Session
 
 from service import problems
 from service.errors import ServiceError
-from service.states import ACTIVE, AttemptOutcome, JobStatus, Transition
+from service.states import ACTIVE, AttemptOutcome, Cause, JobStatus, Published, Transition
 from service.store.changes import add_event, end, move, send_webhook
 from service.store.database import Database, count, observe, upsert
 from service.store.history import add_point
 from service.store.queue import LOST, WAITING, next_jobs, reserve, reserved_by
 from service.store.quotas import count_gpu_seconds
-from service.store.retries import DISPATCHER_LOST, MAX_LOSSES, Cause, FailureCount, RetryPolicy, Verdict, cause_of
+from service.store.retries import DISPATCHER_LOST, MAX_LOSSES, FailureCount, RetryPolicy, Verdict, cause_of
 from service.store.tables import (
     ArtifactRow,
     AttemptRow,
@@ -73,17 +73,6 @@ class Lease:
     def log_fields(self) -> dict[str, Any]:
         """Fields of log records about the attempt."""
         return {"job": self.job.id, "attempt": self.job.attempt}
-
-
-@dataclass(frozen=True)
-class Published:
-    """File in the file store that is or will be published by a database row; `step` is set for checkpoints."""
-
-    name: str
-    location: str
-    size: int
-    sha256: str
-    step: int | None = None
 
 
 class Leases:
@@ -295,7 +284,7 @@ class Leases:
         An error with the code of `InfrastructureError` is never permanent.
 
         Args:
-            error: `code` and `message`, and the `cause` of an outage (`retries.Cause`).
+            error: `code` and `message`, and the `cause` of an outage (`states.Cause`).
             permanent: Whether another attempt would fail in the same way.
 
         Returns:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any
 
-from service.states import AttemptOutcome, JobStatus, Transition
+from service.states import AttemptOutcome, Cause, JobStatus, Transition
 from sgsst_core.errors import InfrastructureError
 
 #: Maximum delay between attempts in seconds; the delay doubles up to this limit.
@@ -22,20 +21,6 @@ MAX_RETRY_SECONDS = 300.0
 MAX_LOSSES = 10
 #: Code of the error of an attempt that was lost with its dispatcher.
 DISPATCHER_LOST = "dispatcher-lost"
-
-
-class Cause(StrEnum):
-    """Cause of an attempt's end without a result."""
-
-    #: The job itself: its files or settings, an error of the method, or a crash of its process.
-    JOB = "job"
-    STORE = "store"
-    DISK = "disk"
-    DATABASE = "database"
-    #: A machine or the network between machines.
-    MACHINE = "machine"
-    #: The dispatcher's process has ended, or its machine.
-    DISPATCHER = "dispatcher"
 
 
 def cause_of(error: Mapping[str, Any] | None) -> Cause:

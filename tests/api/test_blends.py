@@ -12,8 +12,8 @@ from api.client import Client
 from api.client.answers import RequestError
 from service.inspection.derived import MOST_BLENDS
 from service.settings import ServiceSettings
+from service.states import Published
 from service.store import open_store
-from service.store.leases import Published
 from sgsst_core.files.blending import blend_scenes
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene, write_scene

@@ -16,10 +16,9 @@ from sqlalchemy import text
 
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
-from service.states import JobStatus
+from service.states import JobStatus, Published
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from service.store.leases import Published
 from tests.api.service import Service
 from tests.postgres import fresh_database, is_installed, server
 from tests.small_scenes import wall, write_files

@@ -24,9 +24,9 @@ from service.inspection.work import WorkRequest
 from service.parameters import JobParameters
 from service.request import job_spec
 from service.settings import ServiceSettings
+from service.states import Published
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from service.store.leases import Published
 from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import JobRow
 from sgsst_core.files.formats import by_name

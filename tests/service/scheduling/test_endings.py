@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import signal
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -11,8 +13,8 @@ import pytest
 from service import problems
 from service.scheduling.attempt_process import failure
 from service.scheduling.endings import Ending, StopRequest, attempt_ending, cause_of_error, outage
-from service.states import AttemptOutcome
-from service.store.retries import Cause, cause_of
+from service.states import AttemptOutcome, Cause
+from service.store.retries import cause_of
 from sgsst_core.errors import (
     ClusterAwayError,
     ImageError,
@@ -118,3 +120,12 @@ def test_cause_of_each_error(error: Exception, cause: Cause) -> None:
     assert (str(error) in (reported.detail or "")) == (not its_own), "for the operator"
     assert reported.outcome == AttemptOutcome.FAILED
     assert its_own or not reported.permanent
+
+
+def test_process_of_an_attempt_starts_without_libraries_of_the_service() -> None:
+    code = (
+        "import sys, worker.run, service.scheduling.attempt_process; "
+        "print(*{'sqlalchemy', 'httpx2', 'fsspec', 'pydantic_settings', 'torch'} & set(sys.modules))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == ""

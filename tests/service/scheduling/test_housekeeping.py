@@ -9,8 +9,8 @@ import pytest
 from service.files.artifacts import Artifacts
 from service.scheduling import housekeeping
 from service.settings import ServiceSettings
+from service.states import Published
 from service.store import open_store
-from service.store.leases import Published
 from tests.service.scheduling.conftest import new_lease
 from tests.service.store.helpers import SHA
 

@@ -21,9 +21,9 @@ from safetensors.numpy import save_file
 from service.errors import LostFileError, StoreError
 from service.files.artifacts import Artifacts
 from service.files.staging import CHECKPOINT
-from service.scheduling import publishing, store_workplace
-from service.scheduling.store_workplace import StoredFile, StoreWorkplace, store_weights
-from service.store.leases import Published
+from service.scheduling import publishing, rank_folder
+from service.scheduling.store_workplace import StoredFile, StoreWorkplace
+from service.states import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.atomic import file_digest
@@ -45,8 +45,8 @@ def s3(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("SGSST_DATA", str(tmp_path / "node"))
     monkeypatch.setenv("SGSST_CACHE", os.environ.get("SGSST_CACHE", ""))
-    monkeypatch.setattr(store_workplace, "_SCAN_SECONDS", 0.05)
-    monkeypatch.setattr(store_workplace, "_RETRY_SECONDS", 0.1)
+    monkeypatch.setattr(rank_folder, "_SCAN_SECONDS", 0.05)
+    monkeypatch.setattr(rank_folder, "_RETRY_SECONDS", 0.1)
     monkeypatch.setattr(publishing, "_RETRY_SECONDS", 0.1)
     yield faulty
     faulty.heal()
@@ -179,9 +179,9 @@ def test_weights_are_fetched_by_digest(
 ) -> None:
     monkeypatch.setenv("SGSST_CACHE", str(tiny_cache))
     expected = load_network_weights("vgg16").sha256
-    weights = store_weights(Artifacts(job.url).objects)
+    weights = rank_folder.store_weights(Artifacts(job.url).objects)
     assert "vgg16.safetensors" in weights
-    assert store_weights(Artifacts(job.url).objects) == weights
+    assert rank_folder.store_weights(Artifacts(job.url).objects) == weights
     monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "nothing is installed here"))
     rank = replace(job, weights=weights).open(1, Recorder())
     assert os.environ["SGSST_CACHE"] != str(tiny_cache)

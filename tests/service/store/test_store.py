@@ -23,12 +23,12 @@ from service.errors import (
     LeaseLostError,
     NotFoundError,
 )
-from service.states import ACTIVE, FINISHED
+from service.states import ACTIVE, FINISHED, Published
 from service.store import Store, open_store
 from service.store.history import GROWTH, add_point
 from service.store.inputs import GRACE_SECONDS
 from service.store.jobs import Idempotency
-from service.store.leases import MAX_PROGRESS_EVENTS, Lease, Published
+from service.store.leases import MAX_PROGRESS_EVENTS, Lease
 from service.store.retries import MAX_LOSSES
 from service.store.tables import Base, JobRow, ProgressPointRow, ShareRow
 from sgsst_core.progress import Progress
