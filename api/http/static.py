@@ -121,9 +121,9 @@ class ExampleScene:
 
     async def file(self, name: str) -> StaticFile | None:
         """Return a file; None if there is no such file."""
-        async with self._lock:
-            if not self._files:
-                with suspended():
+        with suspended():
+            async with self._lock:
+                if not self._files:
                     self._files = await asyncio.to_thread(_built_example)
         return self._files.get(name)
 

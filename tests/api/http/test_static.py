@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import hashlib
 import json
@@ -11,8 +12,9 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from api.http.static import DOCS_POLICY, POLICY, StaticFiles, static_files
+from api.http.static import DOCS_POLICY, POLICY, ExampleScene, StaticFiles, static_files
 from api.static_files import FOLDER
+from service.deadlines import Deadline
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import DOWNLOADS, FORMATS
 from sgsst_core.files.scene_file import read_scene
@@ -68,6 +70,24 @@ def test_example_is_built_at_the_first_request(client: httpx2.Client, files: Sta
     assert client.get(f"/static/{files.digest}/example/..%2F..%2Fapp.py").status_code == 404
     assert client.get(f"/static/{files.digest}/example/none").status_code == 404
     assert client.get("/static/0/example/cameras.json").status_code == 404
+
+
+@pytest.mark.slow
+def test_no_request_for_the_example_is_given_up_while_it_is_built() -> None:
+    given_up: list[str] = []
+
+    async def serve(example: ExampleScene, name: str) -> bool:
+        deadline = Deadline(0.5, lambda: given_up.append(name))
+        found = await example.file(name)
+        deadline.close()
+        return found is not None
+
+    async def serve_both() -> list[bool]:
+        example = ExampleScene()
+        return await asyncio.gather(*(serve(example, name) for name in ("motorcycle.sog", "cameras.json")))
+
+    assert asyncio.run(serve_both()) == [True, True]
+    assert not given_up
 
 
 def test_files_are_cached_by_digest(client: httpx2.Client, files: StaticFiles) -> None:
