@@ -152,9 +152,11 @@ def test_quantized_moved_and_rotated_glb_is_shown(visit: Visit, tmp_path: Path) 
     watched = visit("/#/jobs")
     tipped = {"rotation": [0.1**0.5, 0, 0, 0.9**0.5], "translation": [0, 1.8, 0.6]}  # by 37 degrees, in place
     matrix = {"matrix": [0, 1, 0, 0, -0.8, 0, 0.6, 0, 0.6, 0, 0.8, 0, -1.8, 0, 0.6, 1]}
-    for nodes in (({}, {}), (tipped, {"rotation": [0, 0, 0.6, 0.8]}), (matrix, {})):
+    poses: list[tuple[dict[str, Any], dict[str, Any]]]
+    poses = [({}, {}), (tipped, {"rotation": [0, 0, 0.6, 0.8]}), (matrix, {})]
+    for inner, outer in poses:
         write_scene(ply, scene, by_name("glb"))
-        ply.write_bytes(quantized(ply.read_bytes(), *nodes))
+        ply.write_bytes(quantized(ply.read_bytes(), inner, outer))
         assert len(read_scene(ply).scene) == 616
         assert_shown_like(watched, tmp_path, ply, differs=False)
 
