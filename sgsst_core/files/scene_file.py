@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import tempfile
 import warnings
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -233,32 +234,31 @@ def write_levels(target: Path, scene: Scene, original: Path) -> int:
         SceneError: If `original` is no streamed SOG, or cannot be read.
         OutputError: If the scene has other Gaussians than it, or a file cannot be written.
     """
-    original, size = scene_path(original), 0
+    original = scene_path(original)
     header = read_scene_header(original)
     if not isinstance(header, StreamedHeader):
         raise SceneError(f"{original}: is no streamed SOG. Give the {INDEX_NAME} or the archive of one.")
-
-    def put(name: str, data: bytes) -> None:
-        nonlocal size
-        size += len(data)
-        if archive is not None:
-            archive.writestr(zipfile.ZipInfo(name), data)
-            return
-        file = target.parent / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(file) as temporary:
-            temporary.write_bytes(data)
-
     arrays = arrays_of(scene)
     with ExitStack() as stack:
-        archive = None
-        if target.name != INDEX_NAME:
-            archive = stack.enter_context(zipfile.ZipFile(stack.enter_context(atomic_path(target)), "w"))
-        try:
-            write_recolored(original, header, arrays["means"], arrays["sh_dc"], put)
-        except OutputError as error:
-            raise OutputError(f"{target}: {error}") from error
-    return size
+        # a folder gets its files when the last part of the original has been read
+        to_folder = target.name == INDEX_NAME
+        if to_folder:
+            output = Path(stack.enter_context(tempfile.TemporaryDirectory()), "levels.zip")
+        else:
+            output = stack.enter_context(atomic_path(target))
+        with zipfile.ZipFile(output, "w") as archive:
+            try:
+                write_recolored(original, header, arrays["means"], arrays["sh_dc"], archive)
+            except OutputError as error:
+                raise OutputError(f"{target}: {error}") from error
+        if to_folder:
+            with zipfile.ZipFile(output) as archive:
+                for info in archive.infolist():
+                    file = target.parent / info.filename
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    with atomic_path(file) as temporary:
+                        temporary.write_bytes(archive.read(info))
+    return sum(info.file_size for info in archive.infolist())
 
 
 def write_sog_folder(folder: Path, scene: Scene) -> int:

@@ -13,7 +13,7 @@ import re
 import struct
 import zipfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
@@ -250,9 +250,9 @@ def write_recolored(
     header: StreamedHeader,
     means: NDArray[np.float32],
     colors: NDArray[np.float32],
-    put: Callable[[str, bytes], None],
+    archive: zipfile.ZipFile,
 ) -> None:
-    """Write a streamed SOG with the colors of a scene that is its finest level with other colors.
+    """Archive a streamed SOG with the colors of a scene that is its finest level with other colors.
 
     A Gaussian of a coarser level takes the change of the nearest one of the finest level. All but colors keeps its
     bytes, and everything does in parts in which none changes.
@@ -261,7 +261,7 @@ def write_recolored(
         original: Streamed SOG: its index or an archive.
         header: Its header.
         means, colors: Positions and SH coefficients of degree 0 of the scene, [n, 3].
-        put: Function that writes a file, given its path in the folder; the index comes last.
+        archive: Open archive that gets the files; the index comes last.
 
     Raises:
         SceneError: If `original` cannot be read.
@@ -290,8 +290,8 @@ def write_recolored(
                 read_positions(files, part.header, positions)
                 changed = change[tree.query(np.nan_to_num(positions))[1]]
             for name, data in recolored(files, part.header, changed).items():
-                put(part.folder + name, data)
-        put(INDEX_NAME, opened.index)
+                archive.writestr(zipfile.ZipInfo(part.folder + name), data)
+        archive.writestr(zipfile.ZipInfo(INDEX_NAME), opened.index)
 
 
 STREAMED_SOG = SceneFormat("zip", "streamed SOG", 14, _matches, _read_header, _read, media_type="application/zip")

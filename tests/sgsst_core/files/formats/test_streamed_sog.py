@@ -98,6 +98,18 @@ def test_other_gaussians_are_refused_and_nothing_is_written(tmp_path: Path) -> N
     assert not out.exists()
 
 
+@pytest.mark.parametrize("target", ["lod-meta.json", "out.zip"])
+def test_nothing_is_written_if_a_coarse_level_is_damaged(tmp_path: Path, target: str) -> None:
+    files = three_levels()
+    files["2_0/means_u.webp"] = files["2_0/means_u.webp"][:40]
+    original = unpacked(tmp_path / "scene", files)
+    scene = read_scene(original).scene
+    (tmp_path / "out").mkdir()
+    with pytest.raises(SceneError, match="is not a readable WebP image"):
+        write_levels(tmp_path / "out" / target, replace(scene, sh_dc=scene.sh_dc + 1), original)
+    assert list((tmp_path / "out").iterdir()) == []
+
+
 def deeper(index: dict[str, Any]) -> None:
     """Nest the tree more deeply than Python's parser goes."""
     index["tree"] = "DEEP"
