@@ -78,9 +78,9 @@ def test_no_request_for_the_example_is_given_up_while_it_is_built() -> None:
 
     async def serve(example: ExampleScene, name: str) -> bool:
         deadline = Deadline(0.5, lambda: given_up.append(name))
-        found = await example.file(name)
+        file = await example.file(name)
         deadline.close()
-        return found is not None
+        return file is not None
 
     async def serve_both() -> list[bool]:
         example = ExampleScene()
