@@ -366,29 +366,6 @@ def test_queued_job_is_canceled_immediately(service: Service, files: dict[str, P
 
 
 @pytest.mark.slow
-def test_jobs_survive_killed_processes(service: Service, files: dict[str, Path], expected: bytes) -> None:
-    with service.client() as client:
-        job_id = submit(client, files)
-        wait_for_step(service, client, job_id, 5)
-        job_process, api = service.process("service.scheduling.attempt_process"), service.process("api.http.server")
-        assert job_process is not None
-        assert api is not None
-        assert job_process.nice() > api.nice()  # requests do not wait for a job that uses all cores
-        service.kill("service.scheduling.attempt_process")
-        wait_for_step(service, client, job_id, 15, attempt=2)
-        service.kill("api.http.server")
-        wait_for(service.ready, "the API", service.said)
-        service.kill("service.scheduling.dispatcher")
-        wait_for_step(service, client, job_id, 20, attempt=3)
-        ended = wait_until(service, client, job_id, "succeeded", "failed")
-        assert [attempt["outcome"] for attempt in ended["attempts"]] == ["failed", "lost", "succeeded"]
-        assert ended["attempts"][0]["error"]["code"] == "crashed"
-        assert result(client, job_id) == expected
-        places = list((service.data / "artifacts" / job_id).rglob("stylized.ply"))
-        assert len(places) == 1, "published twice"
-
-
-@pytest.mark.slow
 def test_restart_resumes_running_jobs(files: dict[str, Path], expected: bytes, tmp_path: Path) -> None:
     with Service(tmp_path / "data") as service, service.client() as client:
         job_id = submit(client, files)

@@ -112,8 +112,14 @@ def test_job_survives_kills_of_all_its_processes(service: Service, files: dict[s
     wait_for(lambda: look(service, job_id)["attempt"] == 1, "the first attempt", service.said)
     service.kill(DISPATCHER)  # while the attempt reads its inputs
     at_step(service, job_id, 5, attempt=2)
+    attempt, api = service.process(ATTEMPT), service.process(API)
+    assert attempt is not None
+    assert api is not None
+    assert attempt.nice() > api.nice()  # requests do not wait for a job that uses all cores
     service.kill(ATTEMPT)
     at_step(service, job_id, 15, attempt=3)
+    service.kill(API)  # while the job runs
+    wait_for(service.ready, "the API", service.said)
     service.stop(signal.SIGKILL)
     wait_for(lambda: not service.survivors(), "everything that it had started to end")
     service.start()
@@ -125,6 +131,7 @@ def test_job_survives_kills_of_all_its_processes(service: Service, files: dict[s
     job = ended(service, job_id)
     outcomes = [attempt["outcome"] for attempt in job["attempts"]]
     assert outcomes[:3] == ["lost", "failed", "lost"]
+    assert job["attempts"][1]["error"]["code"] == "crashed"
     assert outcomes[-1] == "succeeded"
     assert check_published_once(service, job_id) == expected.read_bytes()
 
