@@ -137,17 +137,6 @@ def test_web_page_and_its_assets_are_installed(installed: Path, tmp_path: Path) 
     assert {"index.html", "docs.html", "vendor/swagger-ui/swagger-ui-bundle.js"} <= set(names)
 
 
-def test_installed_command_stylizes_and_reports(
-    installed: Path, vgg16_weights: BackboneWeights, tmp_path: Path
-) -> None:
-    ply, cameras, style = write_files(tmp_path, wall())
-    out = tmp_path / "new" / "stylized.ply"
-    options: list[str | Path] = ["--cameras", cameras, "--style", style, "--out", out, "--backbone", "vgg16"]
-    run([installed / "sgsst", "stylize", ply, *options, "--steps-sos", "2"], tmp_path, OMP_NUM_THREADS="1")
-    assert out.stat().st_size == ply.stat().st_size
-    assert "</html>" in out.with_name("stylized.report.html").read_text()
-
-
 SERVICE = ("ray", "fastapi", "sqlalchemy", "alembic", "uvicorn", "prometheus_client", "pydantic_settings")
 
 
@@ -156,11 +145,16 @@ def test_core_installs_no_service_packages(core: Path, tmp_path: Path) -> None:
     assert run([core / "python", "-c", code], tmp_path).split() == []
 
 
-def test_core_stylizes_by_command_and_library(core: Path, vgg16_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_core_stylizes_and_reports_by_command_and_library(
+    core: Path, vgg16_weights: BackboneWeights, tmp_path: Path
+) -> None:
     ply, cameras, style = write_files(tmp_path, wall())
+    out = tmp_path / "new" / "stylized.ply"
     command: list[str | Path] = [core / "sgsst", "stylize", ply, "--style", style, "--cameras", cameras]
-    command += ["--backbone", "vgg16", "--steps-sos", "2", "--out", tmp_path / "command.ply"]
+    command += ["--backbone", "vgg16", "--steps-sos", "2", "--out", out]
     run(command, tmp_path, OMP_NUM_THREADS="1")
+    assert out.stat().st_size == ply.stat().st_size
+    assert "</html>" in out.with_name("stylized.report.html").read_text()
     code = """
 from sgsst_core import load_cameras, load_image, load_scene, save, stylize
 from sgsst_core.features.network_weights import load_network_weights
@@ -169,7 +163,7 @@ result = stylize(load_scene("scene.ply"), load_cameras("cameras.json"), style, w
 save("library.ply", result)
 """
     run([core / "python", "-c", code], tmp_path, OMP_NUM_THREADS="1")
-    assert (tmp_path / "library.ply").read_bytes() == (tmp_path / "command.ply").read_bytes()
+    assert (tmp_path / "library.ply").read_bytes() == out.read_bytes()
     assert (tmp_path / "library.ply").read_bytes() != ply.read_bytes()
 
 
