@@ -12,6 +12,7 @@ from typing import Any
 
 import numba
 import numba.core.caching
+import numba.core.registry
 import torch
 from numba.core.event import Listener, install_listener
 
@@ -41,6 +42,15 @@ def cache_in_memory(report: Callable[[], None]) -> None:
         report: Callback, called for each kernel that is compiled because the cache folders do not contain it.
     """
     numba.core.caching.Cache.save_overload = lambda self, sig, data: report()  # type: ignore[method-assign]
+
+
+def load_registries() -> None:
+    """Load Numba's registries, as the first kernel would, without compiling one or starting threads.
+
+    A process that forks for each task calls this once, because it takes longer than loading the kernels of a task.
+    """
+    numba.core.registry.cpu_target.typing_context.refresh()
+    numba.core.registry.cpu_target.target_context.refresh()
 
 
 class _Compilations(Listener):

@@ -387,6 +387,8 @@ def together(collectives: Collectives, make: Callable[[], T]) -> T:
 
 def same_weights(backbone: str, collectives: Collectives) -> BackboneWeights:
     """Load the weights of the feature network on every rank. Rank 0 chooses the network."""
+    if collectives.size == 1:
+        return load_network_weights(backbone)
     name = collectives.broadcast(lambda: load_network_weights(backbone).name)
     return together(collectives, lambda: load_network_weights(name))
 

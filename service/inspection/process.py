@@ -38,7 +38,7 @@ from service.optional import install_command
 from service.parameters import JobParameters
 from service.request import job_spec
 from sgsst_core.budget import default_memory_limit
-from sgsst_core.compiled import cache_in_memory, kernel_folders
+from sgsst_core.compiled import cache_in_memory, kernel_folders, load_registries
 from sgsst_core.decision import warnings_of
 from sgsst_core.errors import InvalidInputError, SceneError, SettingsError, SgsstError, WeightsError
 from sgsst_core.features import pooling_kernels, winograd_kernels  # noqa: F401  # see `_confine`
@@ -67,6 +67,7 @@ from worker.video import VideoRequest, render_video
 with contextlib.suppress(ImportError):
     import av  # noqa: F401  # before the first fork, so that every child has it
 
+load_registries()  # before the first fork too
 #: Time at which all modules were imported.
 _ready_at = time.time()
 #: Maximum size of a response in bytes.

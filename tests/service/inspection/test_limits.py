@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -164,3 +166,13 @@ def test_sizes_of_many_frames_are_checked_in_a_file_of_many_values(tmp_path: Pat
         path.write_text(json.dumps({"frames": [frame]}))
         with pytest.raises(CameraError, match="gives no size"):
             check_frames_have_sizes(path)
+
+
+def test_registries_of_kernels_are_loaded_before_a_request() -> None:
+    """Otherwise, each confined child would load them again."""
+    code = (
+        "import sys, service.inspection.process; from sgsst_core.compiled import load_registries; "
+        "before = set(sys.modules); load_registries(); print(*set(sys.modules) - before)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == ""
