@@ -43,14 +43,14 @@ pytestmark = pytest.mark.slow
 
 def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
     """Drop files, view them, plan, start, watch and wipe: the pixels on each side are those of `sgsst render`."""
-    before = _jobs(service)
+    earlier = _jobs(service)
     watched = visit(width=600, height=500)
     page = watched.page
     drop(watched, files)
     page.get_by_text("616 Gaussians · SH degree 1").wait_for()
     watched.settled()
     page.get_by_text("3 cameras shown in the scene").wait_for()
-    assert _jobs(service) == before, "nothing is sent for the preview"
+    assert _jobs(service) == earlier, "nothing is sent for the preview"
 
     set_options(watched, **STEPS)
     page.get_by_role("button", name="Estimate time").click()
