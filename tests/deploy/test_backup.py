@@ -18,7 +18,7 @@ import httpx2
 import psutil
 import pytest
 
-from tests.api.service import ROOT, Service, wait_for
+from tests.api.service import ROOT, Service, undisturbed, wait_for
 from tests.postgres import fresh_database
 from tests.service.conftest import postgres  # noqa: F401 (a fixture)
 from tests.service.files.s3 import environment_of, s3_server
@@ -31,6 +31,7 @@ PARAMETERS = {
     "early_stop": False,
     "steps_coarse": 0,
     "backbone": "vgg16",
+    "precision": "float32",
     "seed": 3,
 }
 
@@ -53,9 +54,19 @@ def backup(environment: dict[str, str], *words: str | Path) -> subprocess.Comple
     return subprocess.run(command, env=own, capture_output=True, text=True)
 
 
-def submit(client: httpx2.Client, folder: Path, **parameters: Any) -> str:
-    files = zip(("scene", "cameras", "style"), write_files(folder, wall()), strict=True)
-    body = {role: (path.name, path.read_bytes()) for role, path in files}
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return dict(zip(("scene", "cameras", "style"), write_files(tmp_path_factory.mktemp("in"), wall()), strict=True))
+
+
+@pytest.fixture(scope="module")
+def expected(files: dict[str, Path], tiny_installed: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Return the result of a job that nothing interrupts."""
+    return undisturbed(files, PARAMETERS, tmp_path_factory.mktemp("expected")).read_bytes()
+
+
+def submit(client: httpx2.Client, files: dict[str, Path], **parameters: Any) -> str:
+    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(PARAMETERS | parameters)})
     assert answer.status_code == 202, answer.text
     return str(answer.json()["id"])
@@ -78,7 +89,9 @@ def lose(service: Service) -> None:
 
 
 @pytest.mark.parametrize("kind", ["local", "servers"])
-def test_jobs_continue_after_a_restore(kind: str, tmp_path: Path, tiny_installed: Path, request: Any) -> None:
+def test_jobs_continue_after_a_restore(
+    kind: str, tmp_path: Path, files: dict[str, Path], expected: bytes, request: pytest.FixtureRequest
+) -> None:
     before: dict[str, Any] = {}
     after: dict[str, Any] = {}
     if kind == "servers":
@@ -89,11 +102,11 @@ def test_jobs_continue_after_a_restore(kind: str, tmp_path: Path, tiny_installed
         after = {**bucket(s3, "new"), "SGSST_DATABASE": fresh_database(server)}
     saved = tmp_path / "backup"
     with Service(tmp_path / "before", **before) as service, service.client() as client:
-        done = submit(client, tmp_path)
+        done = submit(client, files, steps_sos=20)
         wait_for(lambda: job(client, done)["status"] == "succeeded", "the first job", service.said)
-        expected = client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content
-        running = submit(client, tmp_path)
-        waiting = submit(client, tmp_path, steps_sos=20)
+        first = client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content
+        running = submit(client, files)
+        waiting = submit(client, files, steps_sos=20)
         wait_for(lambda: (job(client, running)["progress"] or {}).get("step", 0) > 300, "steps", service.said)
         for _ in range(2):  # the second backup adds to the first
             ended = backup({"SGSST_DATA": str(service.data), **before}, "save", saved)
@@ -108,7 +121,7 @@ def test_jobs_continue_after_a_restore(kind: str, tmp_path: Path, tiny_installed
     assert "; 0 files are missing" in ended.stdout
     assert "Restore into an empty one" in backup(restored, "restore", saved).stderr
     with Service(tmp_path / "after", **after) as service, service.client() as client:
-        assert client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content == expected
+        assert client.get(f"/v1/jobs/{done}/artifacts/stylized.ply").content == first
         for job_id in (running, waiting):
             wait_for(partial(has_ended, client, job_id), "its end", service.said)
             assert job(client, job_id)["status"] == "succeeded", job(client, job_id)
