@@ -270,7 +270,7 @@ def weight_cost(rasterizer: Rasterizer, cameras: Sequence[Camera], settings: Set
 
 @dataclass
 class Networks:
-    """Feature networks that the plans of one job share, and the comparison of their precisions, which is made once.
+    """Feature networks that the plans of one job share, and the comparison of their precisions, made once on a CPU.
 
     Attributes:
         precisions: Comparison of each precision; None if there was none yet.

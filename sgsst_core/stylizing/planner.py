@@ -309,7 +309,8 @@ def _facts(
     views = [context.cameras[index] for index in survey.covered]
     budget = memory_for("rasterizer", context.machine.memory)
     sizes = tuple((camera.height, camera.width) for camera in context.cameras)
-    compared = context.networks.precisions
+    # A CPU compares on an image as small as the first trial's; on a GPU, speeds depend on the size of views.
+    compared = context.networks.precisions if context.machine.device == "cpu" else None
     if compared is None and choices.compares_precisions(sizes, settings):
         compared = compare_precisions(context, views[0], precisions)
     return Facts(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -26,7 +27,6 @@ from sgsst_core.planning.context import (
 from sgsst_core.planning.plan import Device
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import PlannedPrecision, make_settings
-from sgsst_core.stylizing import planner
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToFloat16, RoundedToTf32, to_tf32
 from tests.sgsst_core.stylizing.test_trial import facts
@@ -228,12 +228,12 @@ def test_plans_of_a_time_budget_share_networks_and_their_comparison(
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
     monkeypatch.setattr("sgsst_core.planning.choices._COMPARED_PIXELS", 0)
     monkeypatch.setattr(module, "convolution_ratio", lambda *_: 1.5)
-    created, create, plans, equip_plan = list[str](), module.make_network, list[object](), planner.equip
-    monkeypatch.setattr(module, "make_network", lambda *given: created.append(given[2]) or create(*given))
-    monkeypatch.setattr(planner, "equip", lambda *given: plans.append(given) or equip_plan(*given))
+    make, equipped = Mock(wraps=module.make_network), Mock(wraps=equip)
+    monkeypatch.setattr(module, "make_network", make)
+    monkeypatch.setattr("sgsst_core.stylizing.planner.equip", equipped)
     job = Stylizer.planned(ball(300), cameras(3), style(), make_settings(within=60), weights=tiny_weights).job
-    assert len(plans) > 1
-    assert sorted(created) == ["bfloat16", "float32", "winograd"]
+    assert equipped.call_count > 1
+    assert sorted(call.args[2] for call in make.call_args_list) == ["bfloat16", "float32", "winograd"]
     assert job.network.precision == job.plan.precision == "winograd"
     line = next(decision for decision in job.plan.decisions if decision.item == "precision")
     assert "convolutions in bfloat16 are 1.5 times as fast" in line.reason
