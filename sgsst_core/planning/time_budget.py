@@ -25,7 +25,7 @@ T = TypeVar("T")
 _STEP, _LEAST_SIDE = 32, 96
 #: Longer side below which steps are left out before the resolution is lowered further, and the least fraction of them
 #: that remains before it is.
-_ENOUGH_SIDE, _LEAST_STEPS = 256, 0.5
+_ENOUGH_SIDE, _LEAST_STEPS = 256, 0.2
 #: Steps that a trial takes, and portion of the time that is left for what no measurement predicts.
 _TRIAL_STEPS, _MARGIN = 6, 0.1
 #: Time of a step of phase 1 relative to one on all scales, if there are several.
