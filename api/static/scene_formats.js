@@ -12,7 +12,7 @@
 /** @type {SceneFormat[]} */
 export const sceneFormats = /** @type {any} */ ("{{scene_formats}}");
 
-/** What a job's result can be downloaded as, PLY first. @type {{ name: string, title: string }[]} */
+/** Formats of a downloaded result, PLY first. @type {{ name: string, title: string }[]} */
 export const downloads = /** @type {any} */ ("{{downloads}}");
 
 /** Formats of results, PLY first. */

@@ -478,7 +478,8 @@ def compare_precisions(
     image = downscale(image, min(max(0, math.ceil(math.log2(longer))), shorter.bit_length() - 1))
     # The gradient of background depends on which of equal values a pooling window chooses, and changes no Gaussian.
     seen = (image != torch.tensor(context.settings.background).to(image)).any(dim=-1)
-    exact, seconds = compared_gradient(context, context.network, image)
+    reference = context.networks.get("float32", context.weights, context.settings, device)
+    exact, seconds = compared_gradient(context, reference, image)
     result = {}
     for name in precisions:
         result[name] = Comparison(ratios[name])

@@ -27,7 +27,7 @@ FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_3, STREAMED_SO
 #: Formats of results: PLY, and those that can be written in addition to it.
 RESULT_FORMATS = tuple(each for each in FORMATS if each.write)
 EXTRA_FORMATS = tuple(each for each in RESULT_FORMATS if each is not PLY)
-#: Everything that a result of the service can be downloaded as: file name suffixes without their first dot, and titles.
+#: Formats of a downloaded result of the service: file name suffixes without their first dot, and titles.
 #: The page shows the result in 3D.
 DOWNLOADS = {each.name: each.title for each in RESULT_FORMATS} | {"html": "HTML page, opened without a server"}
 

@@ -239,6 +239,22 @@ def test_plans_of_a_time_budget_share_networks_and_their_comparison(
     assert "convolutions in bfloat16 are 1.5 times as fast" in line.reason
 
 
+def test_precisions_are_compared_with_float32_after_another_was_chosen(
+    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A later plan of a time budget has the network of the trial."""
+    monkeypatch.setattr(module, "convolution_ratio", lambda *_: 1.5)
+    first = context_of(tiny_weights)
+    chosen = module.make_network(tiny_weights, first.settings, "bfloat16", "cpu")
+    networks = module.Networks(created={"bfloat16": chosen})
+    later = equip(first.scene, first.cameras, first.settings, tiny_weights, ALONE, "cpu", networks)
+    assert later.network is chosen
+    errors = [compare_precisions(each, cameras(1)[0], ["bfloat16"])["bfloat16"].error for each in (first, later)]
+    assert errors[0] == errors[1]
+    assert errors[0] is not None
+    assert errors[0].relative_error > 1e-3
+
+
 def test_short_job_is_not_measured(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "convolution_ratio", lambda *_: pytest.fail("measured"))
     job = Stylizer.planned(ball(300), cameras(2), style(), make_settings(), weights=tiny_weights).job
