@@ -66,16 +66,10 @@ class ViewCost:
     survey: float
     scales: int = 1
 
-    def at(self, pixels: float, smaller: ViewCost | None) -> ViewCost:
-        """Return the cost of views with more pixels: in proportion to them, or on a line with that of smaller views."""
-
-        def scaled(name: str) -> float:
-            own, other = getattr(self, name), getattr(smaller, name) if smaller else 0.0
-            distance = self.pixels - (smaller.pixels if smaller else 0.0)
-            slope = min(max(own - other, 0.0) / distance, own / self.pixels) if distance > 0 else own / self.pixels
-            return float(max(own + slope * (pixels - self.pixels), 0.0))
-
-        return ViewCost(pixels, scaled("seconds"), scaled("first"), scaled("survey"))
+    def at(self, pixels: float, scales: int) -> ViewCost:
+        """Return the cost of views with other pixels and scales, in proportion to the pixels."""
+        more = pixels / self.pixels
+        return ViewCost(pixels, more * self.seconds, more * self.first, more * self.survey, scales)
 
 
 @dataclass(frozen=True)
@@ -143,19 +137,17 @@ def choosable(settings: Settings) -> bool:
     return settings.within is not None and not {"max_resolution", "steps_sos"} <= {*settings.fixed}
 
 
-def choose(
-    cameras: Sequence[Camera], settings: Settings, costs: Sequence[ViewCost], left: float, ending: float
-) -> TimeChoice:
+def choose(cameras: Sequence[Camera], settings: Settings, cost: ViewCost, left: float, ending: float) -> TimeChoice:
     """Choose what fits a time budget, and tell what more time would bring.
 
     Args:
         cameras: All cameras at the resolution of the settings.
         settings: Settings of the job with all steps.
-        costs: Costs of one or two resolutions, the smaller one first.
+        cost: Cost of small views.
         left: Seconds that are left.
         ending: Seconds from the last step to the last file.
     """
-    estimate = _Estimate(cameras, settings, costs, ending)
+    estimate = _Estimate(cameras, settings, cost, ending)
     chosen, longer = estimate.best(left), estimate.best(left + (_MORE - 1) * (settings.within or 0.0))
     gains = [f"{longer.resolution} px"] if longer.resolution > chosen.resolution else []
     more = longer.steps_coarse + longer.steps_sos
@@ -167,8 +159,8 @@ def choose(
 class _Estimate:
     """Estimator of the seconds of a job by resolution and steps."""
 
-    def __init__(self, cameras: Sequence[Camera], settings: Settings, costs: Sequence[ViewCost], ending: float) -> None:
-        self._cameras, self._settings, self._costs, self._ending = spread(cameras, 16), settings, costs, ending
+    def __init__(self, cameras: Sequence[Camera], settings: Settings, cost: ViewCost, ending: float) -> None:
+        self._cameras, self._settings, self._small, self._ending = spread(cameras, 16), settings, cost, ending
         self._count, self._known = len(cameras), dict[int, ViewCost]()
         self._side = max(camera.side for camera in cameras)
 
@@ -207,9 +199,7 @@ class _Estimate:
     def _cost(self, side: int) -> ViewCost:
         """Return the expected cost of views of a resolution."""
         if side not in self._known:
-            *others, largest = self._costs
-            pixels, scales = pixels_of(self._cameras, side, self._settings)
-            self._known[side] = replace(largest.at(pixels, others[0] if others else None), scales=scales)
+            self._known[side] = self._small.at(*pixels_of(self._cameras, side, self._settings))
         return self._known[side]
 
 

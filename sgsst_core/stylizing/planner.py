@@ -53,10 +53,11 @@ from sgsst_core.stylizing.prediction import (
 from sgsst_core.stylizing.trial import Trial, launch_cost, run_trial
 from sgsst_core.timing import Timer
 
-#: Longer side in pixels of the first views that a time budget is chosen from, their number for each rank, and the
-#: factor from which on larger ones are tried too. Small views hide how much a GPU can do at once.
-_TRIED_SIDE: dict[Device, int] = {"cpu": 160, "cuda": 640}
-_TRIED_VIEWS, _MUCH_LARGER = 4, 1.25
+#: Longer side in pixels of the views that a time budget is chosen from, and their number for each rank. The time of
+#: larger views is in proportion to their pixels: within a tenth on CPUs, where smaller ones take a third more for each
+#: pixel. Small views hide how much a GPU can do at once.
+_TRIED_SIDE: dict[Device, int] = {"cpu": 256, "cuda": 1280}
+_TRIED_VIEWS = 4
 
 
 def plan_job(
@@ -197,13 +198,11 @@ def choose_within(
     show: ShowPlanning | None = None,
     networks: Networks | None = None,
 ) -> TimeChoice | None:
-    """Choose what fits a time budget, from trials of a few small views. Every rank must call this function.
-
-    The first trial is small enough to be cheap. If it leads to a much larger resolution, half of that is tried too.
+    """Choose what fits a time budget, from a trial of a few small views. Every rank must call this function.
 
     Args:
         left: Seconds left of the budget.
-        networks: Networks to create for the trials, which `plan_job` can reuse; None if it does not.
+        networks: Networks to create for the trial, which `plan_job` can reuse; None if it does not.
 
     Returns:
         The choice; None if the settings give everything.
@@ -212,25 +211,18 @@ def choose_within(
         return None
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
-    weights, fitted = weights or load_network_weights("auto"), fit_cameras(cameras, settings)
-    views, costs = spread(fitted, _TRIED_VIEWS * collectives.size), list[ViewCost]()
-    side = min(_TRIED_SIDE[common_device(collectives)], max(camera.side for camera in fitted))
-    ending, networks = ending_seconds(len(scene)), networks or Networks()
-    while True:
-        small, timer = [resized(camera, min(side, camera.side)) for camera in views], Timer()
-        own = {"max_resolution": side, "rebalance": False, "scales": (), "stroke_depth": False, "refine": 1.0}
-        tried = plan_job(
-            scene, small, style, settings.model_copy(update=own), weights=weights, rasterizer=rasterizer,
-            collectives=collectives, regions=regions, timer=timer, show=show, networks=networks,
-        ).plan.prediction  # fmt: skip
-        assert tried is not None
-        # The trial visits up to half of the views, so the prediction has half of the first visits.
-        first, survey = 2 * tried.first_visit, timer.seconds.get("survey", 0.0) / len(small)
-        costs.append(ViewCost(pixels_of(small, side, settings)[0], tried.seconds, first, survey))
-        chosen = collectives.broadcast(lambda: choose(fitted, settings, costs, left(), ending))
-        before, side = side, chosen.resolution // 2
-        if len(costs) > 1 or side < _MUCH_LARGER * before:
-            return chosen
+    fitted, side, timer = fit_cameras(cameras, settings), _TRIED_SIDE[common_device(collectives)], Timer()
+    small = [resized(each, min(side, each.side)) for each in spread(fitted, _TRIED_VIEWS * collectives.size)]
+    own = {"max_resolution": side, "rebalance": False, "scales": (), "stroke_depth": False, "refine": 1.0}
+    tried = plan_job(
+        scene, small, style, settings.model_copy(update=own), weights=weights, rasterizer=rasterizer,
+        collectives=collectives, regions=regions, timer=timer, show=show, networks=networks,
+    ).plan.prediction  # fmt: skip
+    assert tried is not None
+    # The trial visits up to half of the views, so the prediction has half of the first visits.
+    first, survey = 2 * tried.first_visit, timer.seconds.get("survey", 0.0) / len(small)
+    cost = ViewCost(pixels_of(small, side, settings)[0], tried.seconds, first, survey)
+    return collectives.broadcast(lambda: choose(fitted, settings, cost, left(), ending_seconds(len(scene))))
 
 
 def _corrected(
