@@ -1,6 +1,21 @@
-"""Run the `sgsst` command by `python -m api.cli`."""
+"""Entry point of the `sgsst` command and of `python -m api.cli`."""
 
-from api.cli.main import main
+from __future__ import annotations
+
+import sys
+
+from api.cli import ABORTED, INTERRUPTED
+
+
+def run() -> int:
+    """Run the command line, and return its exit code. Ctrl-C ends it in one line, also while its imports run."""
+    try:
+        from api.cli.main import main
+    except KeyboardInterrupt:
+        print(ABORTED, file=sys.stderr)
+        return INTERRUPTED
+    return main()
+
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run())

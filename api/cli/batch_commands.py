@@ -17,12 +17,13 @@ import typer
 from api.cli.arguments import JobInputs, folder_to_write, local_path
 from api.cli.client_commands import KeyOption, conclude, follow, open_client
 from api.cli.console import FAILURE, JOB_FAILED, Invocation, error_console, print_field, transfer_bar
-from api.cli.options import with_options
+from api.cli.options import flags, with_options
 from api.cli.stylize_commands import run_job
 from api.client.inputs import camera_files, different_names
-from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
+from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import SUFFIXES, scene_path
+from sgsst_core.options import declared
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 from worker.outputs import check_is_not_input
 
@@ -152,6 +153,11 @@ def batch(
 
     With --url, a service makes the results. Exit with 1 if any could not be made.
     """
+    if url is None and key is not None:
+        raise SettingsError("--key requires --url. Add it, or omit --key.")
+    if url is not None and run.model_fields_set:
+        option = flags(declared(RunOptions)[min(run.model_fields_set)])
+        raise SettingsError(f"{option}: is for results that this machine makes. Omit it, or --url.")
     results = _Batch(out)
     jobs = {}
     pairs = list(product(zip(_names(scenes), scenes, strict=True), zip(_names(style), style, strict=True)))

@@ -14,10 +14,10 @@ import typer
 from rich.progress import BarColumn, ProgressColumn, TextColumn
 from rich.table import Table
 
-from api.cli.arguments import JobInputs, JsonOption, file_to_write
+from api.cli import INTERRUPTED
+from api.cli.arguments import JobInputs, JsonOption, file_to_write, path_to_write
 from api.cli.console import (
     EARLY_ENDS,
-    INTERRUPTED,
     JOB_FAILED,
     PlainConsole,
     error_console,
@@ -191,7 +191,10 @@ def download(
     name: Annotated[str, typer.Argument(metavar="[NAME]", help="File to download; 'all' downloads every file.")] = (
         "stylized.ply"
     ),
-    out: Annotated[Path | None, typer.Option(help="File to write, or folder for 'all'. [default: NAME]")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File to write, or folder for 'all'. [default: NAME]", callback=path_to_write),
+    ] = None,
     format: Annotated[
         DownloadName | None,
         typer.Option("--format", help="Format of stylized.ply. [default: from the ending of --out]"),

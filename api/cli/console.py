@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
@@ -25,8 +27,6 @@ EARLY_ENDS = {
     "target-loss": "the loss has reached --target-loss",
     "converged": "the loss no longer falls (use --no-early-stop to run all steps)",
 }
-#: Exit code after Ctrl-C, as in shells.
-INTERRUPTED = 130
 
 #: Characters that are not printed: control characters, which terminals obey, and marks that reorder a line.
 _CONTROLS = dict.fromkeys({*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A)} - {9, 10})
@@ -39,10 +39,23 @@ class Invocation:
     Attributes:
         arguments: Arguments of the command line.
         started: Start of the process, or of the call of `main` in another program, in seconds since the epoch.
+        missing: Paths to write and their folders, inner ones first, that did not exist when their options were read.
     """
 
     arguments: list[str]
     started: float
+    missing: list[Path] = field(default_factory=list)
+
+    def expect(self, output: Path) -> None:
+        """Note what is missing of the path of a file or a folder that the command will write."""
+        final = Path(os.path.realpath(output))
+        self.missing.extend(path for path in (final, *final.parents) if not path.exists())
+
+    def remove_empty_folders(self) -> None:
+        """Remove the folders that the command has created and left empty."""
+        for path in self.missing:
+            with suppress(OSError):  # never created, a file, or not empty
+                path.rmdir()
 
 
 class PlainConsole(Console):

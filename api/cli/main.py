@@ -14,14 +14,13 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli import client_commands, operator_commands
+from api.cli import ABORTED, INTERRUPTED, client_commands, operator_commands
 from api.cli.batch_commands import batch
 from api.cli.bench_commands import bench_app
 from api.cli.console import (
     BAD_INPUT,
     CONFLICT,
     FAILURE,
-    INTERRUPTED,
     NOT_FOUND,
     Invocation,
     error_console,
@@ -113,14 +112,26 @@ def program(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Expected errors become one message on stderr and an exit code, without a traceback."""
+    """Run the command line, and return its exit code. A command that fails leaves no empty folders for its outputs."""
     started = process_start() if arguments is None else time.time()
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    invocation = Invocation(sys.argv[1:] if arguments is None else list(arguments), started)
+    code = FAILURE
+    try:
+        code = _run(invocation)
+    finally:
+        if code:
+            invocation.remove_empty_folders()
+    return code
+
+
+def _run(invocation: Invocation) -> int:
+    """Run a command. Expected errors become one message on stderr and an exit code, without a traceback."""
+    arguments = invocation.arguments
     warnings.formatwarning = _format_warning
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":  # file names hold any characters
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        code = app(args=arguments, prog_name="sgsst", obj=Invocation(arguments, started), standalone_mode=False)
+        code = app(args=arguments, prog_name="sgsst", obj=invocation, standalone_mode=False)
         return code if isinstance(code, int) else 0
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -142,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _print_error(arguments, "missing-extra", problem)
         return BAD_INPUT
     except (KeyboardInterrupt, typer.Abort):
-        error_console.print("Aborted. Output files are complete or were not written.")
+        error_console.print(ABORTED)
         return INTERRUPTED
     except BrokenPipeError:  # for example `sgsst weights list | head`
         return FAILURE

@@ -20,6 +20,7 @@ from api.cli.arguments import (
     file_to_write,
     folder_to_write,
     local_path,
+    path_to_write,
 )
 from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
@@ -115,6 +116,7 @@ def render(
         typer.Option(
             help="Video to write instead: a .mp4 file (H.264), a .webm file (VP9), a folder or a pattern such as "
             "frame_%04d.png for PNG images.",
+            callback=path_to_write,
             rich_help_panel=ESSENTIALS,
         ),
     ] = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from api.cli.main import main
+from tests.api.service import ROOT
 from tests.full_disk import full_disk
 from tests.small_scenes import wall, write_files
 
@@ -62,7 +64,7 @@ def test_ctrl_c_while_writing_leaves_no_file(command: str, tmp_path: Path, capsy
     assert main(arguments) == 130
     assert not INTERRUPTED_AT
     assert capsys.readouterr().err.splitlines()[-1] == "Aborted. Output files are complete or were not written."
-    assert list(out.iterdir()) == []
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(
@@ -73,7 +75,7 @@ def test_full_disk_is_one_message_and_leaves_no_file(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene, views, style = map(str, write_files(tmp_path, wall()))
-    out = tmp_path / "out"
+    out = tmp_path / "new" / "out"
     seen = ["--cameras", views]
     arguments = {
         "convert": ["convert", scene, str(out / "scene.ply")],
@@ -91,7 +93,27 @@ def test_full_disk_is_one_message_and_leaves_no_file(
     assert len(errors) == 1
     assert errors[0].startswith(f"error: {out}")
     assert "cannot be written: File too large. Free some space" in errors[0]
-    assert not out.exists() or list(out.iterdir()) == []
+    assert not out.parent.exists()
+
+
+def test_failed_command_leaves_folders_that_existed(tmp_path: Path) -> None:
+    scene = str(write_files(tmp_path, wall())[0])
+    (tmp_path / "empty").mkdir()
+    with full_disk(1000):
+        assert main(["convert", scene, str(tmp_path / "empty" / "new" / "scene.ply")]) == 2
+    assert list((tmp_path / "empty").iterdir()) == []
+
+
+def test_ctrl_c_during_imports_is_announced(tmp_path: Path) -> None:
+    (tmp_path / "typer.py").write_text("import signal\n\nsignal.raise_signal(signal.SIGINT)\n")
+    ended = subprocess.run(
+        [sys.executable, "-m", "api.cli", "--help"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (130, "Aborted. Output files are complete or were not written.\n")
 
 
 def test_full_standard_output_is_one_message() -> None:
