@@ -22,7 +22,7 @@ import httpx2
 
 from benchmarks.machine import write_result
 from tests.api.page.browser import Watched, chromium, open_browser
-from tests.api.service import Service
+from tests.api.service import SETTINGS, Service
 
 #: Aims in seconds on two quiet cores; that of a result is its time budget and a tenth.
 _AIMS = {"colors": 10.0, "strokes": 60.0}
@@ -48,7 +48,10 @@ def time_page(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
     given = {"Scene": arguments.scene, "Style": arguments.style}
     given |= {"Cameras": arguments.cameras} if arguments.cameras else {}
     times: dict[str, float] = {}
-    with Service(folder / "data") as service, open_browser() as browser:
+    service = Service(folder / "data")
+    for name in SETTINGS:  # one thread, and short intervals
+        service.environment.pop(name)
+    with service, open_browser() as browser:
         page: Any = Watched(browser, service.url, width=1280, height=800).page
         page.goto(service.url)
         page.locator(".presets input").first.wait_for()

@@ -22,6 +22,8 @@ from worker.inputs import Inputs
 
 #: Minimum time between two previews, as a fraction of the job's elapsed time. It limits the number of previews.
 _SHARE = 0.05
+#: Minimum time between a job's first previews, which differ most, in seconds and as a fraction of the elapsed time.
+_FIRST_SECONDS, _FIRST_SHARE = 2.0, 0.25
 #: Maximum length of a preview's longer side in pixels.
 _SIDE = 960
 #: Maximum length of the thumbnail's longer side in pixels.
@@ -44,7 +46,7 @@ class Previews:
     Args:
         folder: Folder of the JPEGs (`step_0000123.jpg`). It is created with the first preview. Colors are written to
             the folder `live` beside it.
-        seconds: Minimum seconds between two previews.
+        seconds: Minimum seconds between two previews, except for the first ones.
         warn: Callback that receives the reason why a preview is missing. A missing preview does not fail the job.
 
     Attributes:
@@ -74,7 +76,8 @@ class Previews:
         """Write a preview and the colors, each if enough time has passed since the last time."""
         self.live(stylizer)
         now, last = time.monotonic(), self._last
-        wait = max(self._seconds, _SHARE * (now - self._started))
+        elapsed = now - self._started
+        wait = max(min(self._seconds, max(_FIRST_SECONDS, _FIRST_SHARE * elapsed)), _SHARE * elapsed)
         if last is not None and (not stylizer.step or now - last < wait):
             return
         self._write(stylizer.step, lambda: _rendered(stylizer, _colors(stylizer), _SIDE))

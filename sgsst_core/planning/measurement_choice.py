@@ -48,11 +48,12 @@ class Level:
         return sorted({0, *later} if self.start else later)
 
 
-#: Levels from the most to the least expensive. The last measures nothing, and the one before it only the end.
+#: Levels from the most to the least expensive. The last measures nothing, and the one before it only the end. None
+#: measures the first tenth of the steps, in which the first strokes appear.
 LEVELS = (
-    Level(4, (0, 1, 2, 3, 4, 5)),
-    Level(4, (0, 2, 4)),
-    Level(2, (0, 2, 4)),
+    Level(4, (0, 1, 2, 3)),
+    Level(4, (0, 2)),
+    Level(2, (0, 2)),
     Level(2, (0,)),
     Level(1, (0,)),
     Level(1, (0,), start=False),

@@ -18,7 +18,10 @@ from worker import previews as previews_module
 from worker.previews import LiveColors, Previews
 
 
-def test_first_preview_shows_warm_start_colors(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
+def test_first_preview_shows_warm_start_colors(
+    tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(previews_module, "_FIRST_SECONDS", 3600)
     settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
     style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.5, 0.1])
     scene = wall()
@@ -40,6 +43,23 @@ def test_first_preview_shows_warm_start_colors(tiny_weights: BackboneWeights, tm
     actual, expected = (np.asarray(Image.open(path)) for path in (written, tmp_path / "wanted.jpg"))
     np.testing.assert_array_equal(actual, expected)
     assert actual.std() > 1
+
+
+def test_first_previews_follow_each_other_sooner(
+    tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps take one second each, so that the number of a step is the time of its preview."""
+    settings = make_settings("standard", steps_coarse=0, steps_sos=72, coarsest_side=24)
+    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    stylizer = Stylizer.planned(wall(), cameras(), style, settings, weights=tiny_weights)
+    previews = Previews(tmp_path / "previews", 10, pytest.fail)
+    previews._started = 0.0
+    for second in range(73):
+        stylizer.step = second
+        monkeypatch.setattr(previews_module.time, "monotonic", lambda now=second: float(now))
+        previews(stylizer)
+    shown = [int(path.stem.removeprefix("step_")) for path in sorted((tmp_path / "previews").iterdir())]
+    assert shown == [0, 2, 4, 6, 8, 11, 15, 20, 27, 36, 46, 56, 66]
 
 
 def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(

@@ -36,7 +36,7 @@ def test_levels_measure_the_end_and_decrease_in_cost(total: int) -> None:
 def test_first_allowed_level_is_chosen() -> None:
     """Over 300 steps, a view costs 1 s to prepare and 0.5 s per moment and for the judgment, and a moment 0.25 s."""
     prices = Prices(1.0, 0.5, 0.25)
-    costs = [21.75, 15.0, 8.0, 5.5, 3.0, 2.25, 0.0]
+    costs = [17.25, 12.75, 6.75, 5.5, 3.0, 2.25, 0.0]
     assert [prices.of(level, len(level.moments(300))) for level in LEVELS] == costs
     for level, cost in enumerate(costs):
         assert choose_level(prices, cost, 300) == level
