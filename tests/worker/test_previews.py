@@ -56,7 +56,7 @@ def test_first_previews_follow_each_other_sooner(
     previews._started = 0.0
     for second in range(73):
         stylizer.step = second
-        monkeypatch.setattr(previews_module.time, "monotonic", lambda now=second: float(now))
+        monkeypatch.setattr("time.monotonic", lambda now=second: float(now))
         previews(stylizer)
     shown = [int(path.stem.removeprefix("step_")) for path in sorted((tmp_path / "previews").iterdir())]
     assert shown == [0, 2, 4, 6, 8, 11, 15, 20, 27, 36, 46, 56, 66]
