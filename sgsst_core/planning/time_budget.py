@@ -26,7 +26,7 @@ _STEP, _LEAST_SIDE = 32, 96
 #: Longer side below which steps are left out before the resolution is lowered further, and the least fraction of them
 #: that remains before it is.
 _ENOUGH_SIDE, _LEAST_STEPS = 256, 0.2
-#: Steps that a trial takes, and portion of the time that is left for what no measurement predicts.
+#: Steps that a trial takes, and portion of the time after it that is left for what no measurement predicts.
 _TRIAL_STEPS, _MARGIN = 6, 0.1
 #: Time of a step of phase 1 relative to one on all scales, if there are several.
 _COARSE = 0.5
@@ -193,7 +193,7 @@ class _Estimate:
         coarse_seconds = _COARSE * cost.seconds if cost.scales > 1 else 0.0
         steps = coarse * coarse_seconds + sos * cost.seconds + min(visits, count) * cost.first
         steps *= 1 + settings.measure
-        seconds = (steps + count * cost.survey + _TRIAL_STEPS * cost.seconds + self._ending) * (1 + _MARGIN)
+        seconds = steps + count * cost.survey + _TRIAL_STEPS * cost.seconds + self._ending
         return TimeChoice(side, tuple(spread(range(self._count), count)), coarse, sos, seconds)
 
     def _cost(self, side: int) -> ViewCost:
