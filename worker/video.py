@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import CameraError, SettingsError
@@ -14,7 +15,7 @@ from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit.cameras import ELEVATION, turntable
-from sgsst_core.orbit.subject import find_subject, find_up
+from sgsst_core.orbit.choice import find_upright_subject
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.video import Layer, write_frames
 from sgsst_core.scene.camera import Camera
@@ -25,6 +26,7 @@ from worker.inputs import check_something_in_view, read_job_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import DEFAULT_SIDE, VideoOptions
 from worker.outputs import check_folder, check_is_not_input
+from worker.selecting import cropped
 
 
 @dataclass(frozen=True)
@@ -101,11 +103,15 @@ def render_video(
     scene, before = file.scene, None
     if request.unstylized is not None:
         before = _read(source.model_copy(update={"scene": request.unstylized}))[0].scene
-    through = None
+    through = remaining = None
     if request.along_cameras:
         capture = _read_views(request, file).checked(scene, source.near)
         through, decisions = capture.cameras, [*decisions, *capture.decisions]
-    cameras = video_cameras(scene, source, through, request.options, source.resolution, even=is_encoded(request.out))
+    elif request.job is not None and request.job.regions:
+        file, _ = _read(request.job.source)  # regions select its Gaussians, which may have been split since
+        remaining = cropped(request.job.regions, file, source.near)
+    even, side = is_encoded(request.out), source.resolution
+    cameras = video_cameras(file.scene, source, through, request.options, side, remaining, even=even)
     check_something_in_view(scene, cameras, source.near)
     for line in warnings_of(decisions):
         warn(line)
@@ -143,6 +149,7 @@ def video_cameras(
     through: Sequence[Camera] | None,
     options: VideoOptions,
     side: int | None,
+    remaining: Tensor | None = None,
     *,
     even: bool,
 ) -> list[Camera]:
@@ -154,6 +161,7 @@ def video_cameras(
         through: Cameras that the path leads through; None for a turntable.
         options: Options of the video.
         side: Longer side in pixels; None for the cameras' own, but at most `DEFAULT_SIDE`.
+        remaining: [N] bool, Gaussians of a cropped scene that a turntable surrounds; None for all.
         even: Whether sides must be even.
 
     Raises:
@@ -165,11 +173,12 @@ def video_cameras(
         path = CameraPath(in_path_order(through)).evenly(options.frames)
         side = side or min(DEFAULT_SIDE, max(path[0].width, path[0].height))
         return [framed(camera, side, even=even) for camera in path]
-    request, subject = orbit_request(source), find_subject(scene)
+    request = orbit_request(source)
+    subject, up = find_upright_subject(scene, request.up, remaining)
     cameras = turntable(
         subject,
         options.frames,
-        up=request.up or find_up(subject).direction.tolist(),
+        up=up.direction.tolist(),
         elevation=ELEVATION if request.elevation is None else request.elevation,
         radius=request.radius,
         side=side or DEFAULT_SIDE,

@@ -96,15 +96,7 @@ def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = N
     Raises:
         SettingsError: If an option is out of range; see `cameras.orbit`.
     """
-    subject = whole = find_subject(scene)
-    if remaining is not None:
-        subject = find_subject(scene.subset(remaining))
-    if request.up is None:
-        up = find_up(subject)
-        up = up if up.sure or subject is whole else find_up(whole)
-    else:
-        axis = torch.tensor(request.up, dtype=torch.float64)
-        up = Up(axis / axis.norm().clamp_min(1e-300), "requested")
+    subject, up = find_upright_subject(scene, request.up, remaining)
     first = ELEVATION if request.elevation is None else request.elevation
     rings = request.count // _MIN_VIEWS if request.count is not None else 1 + len(_ABOVE + _BELOW)
     tried = [first]
@@ -133,6 +125,25 @@ def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = N
         sum(hidden) / len(hidden),
         trial.hidden_fraction(areas),
     )
+
+
+def find_upright_subject(
+    scene: Scene, requested: tuple[float, float, float] | None, remaining: Tensor | None = None
+) -> tuple[Subject, Up]:
+    """Return the subject of a scene and its up direction.
+
+    Args:
+        requested: Up direction; None to estimate it.
+        remaining: See `make_orbit`.
+    """
+    subject = whole = find_subject(scene)
+    if remaining is not None:
+        subject = find_subject(scene.subset(remaining))
+    if requested is not None:
+        axis = torch.tensor(requested, dtype=torch.float64)
+        return subject, Up(axis / axis.norm().clamp_min(1e-300), "requested")
+    up = find_up(subject)
+    return subject, up if up.sure or subject is whole else find_up(whole)
 
 
 def orbit_decisions(orbit: Orbit, cameras: Sequence[Camera], uncovered: Sequence[float] | None) -> list[Decision]:

@@ -7,6 +7,7 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import av
 import numpy as np
@@ -170,17 +171,21 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
     assert '"background": [1.0, 1.0, 1.0]' in text
 
 
-def test_video_leads_through_the_views_of_a_cropped_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("path", ["cameras", "orbit"])
+def test_video_shows_what_the_crop_of_a_job_leaves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: Literal["cameras", "orbit"]
+) -> None:
     """A mask selects rows of the job's scene; the result has others, as after Gaussians were split."""
     monkeypatch.chdir(tmp_path)
     write_scene(Path("scene.ply"), wall())
     write_scene(Path(RESULT), wall(30))
     Path("mask").mkdir()
-    np.save("mask/left.npy", (wall().means[:, :2] < -0.5).all(dim=1).numpy())
+    left = (wall().means[:, :2] < -0.5).all(dim=1)
+    np.save("mask/left.npy", left.numpy())
     crop = [{"name": "left", "select": "mask=left.npy"}, {"name": "rest", "freeze": True}]
     parameters = JobParameters.model_validate({"orbit": 3, "up": "-y", "elevation": 0, "regions": crop})
     staged = Staged(scene=Path("scene.ply"), styles=(), cameras=None, photos=None)
-    video = JobVideo(path="cameras", fps=1, seconds=1, resolution=64)
+    video = JobVideo(path=path, fps=1, seconds=1, resolution=64)
     request = WorkRequest(
         work="video",
         folder=tmp_path,
@@ -198,8 +203,9 @@ def test_video_leads_through_the_views_of_a_cropped_job(tmp_path: Path, monkeypa
 
     def error(parameters: JobParameters) -> float:
         job = job_spec(staged, parameters)
-        views = read_job_capture(job, file).cameras
-        (camera,) = video_cameras(result, job.source, views, video, 64, even=True)
+        views = read_job_capture(job, file).cameras if path == "cameras" else None
+        surrounded = file.scene.subset(left) if parameters.regions else result
+        (camera,) = video_cameras(surrounded, job.source, views, video, 64, even=True)
         image = make_rasterizer("cpu", result).render(scene_colors(result, camera), camera)
         return float(np.abs(frame - 255 * image.clamp(0, 1).double().numpy()).mean())
 
