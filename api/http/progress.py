@@ -87,14 +87,18 @@ async def answer_work(
         task = asyncio.create_task(work(reports.put_nowait))
         task.add_done_callback(lambda _: reports.put_nowait(None))
         if checked is not None:
-            waiting = asyncio.create_task(checked.wait())
+            waiting = [asyncio.create_task(wait) for wait in (checked.wait(), _wait_for_disconnect(request))]
             try:
-                await asyncio.wait((task, waiting), return_when=asyncio.FIRST_COMPLETED)
+                done, _ = await asyncio.wait((task, *waiting), return_when=asyncio.FIRST_COMPLETED)
             except asyncio.CancelledError:
                 task.cancel()
                 raise
             finally:
-                waiting.cancel()
+                for each in waiting:
+                    each.cancel()
+            if waiting[1] in done:
+                task.cancel()
+                return Response(status_code=_CLIENT_CLOSED)
             if not checked.is_set():
                 await task  # raises its error
         return StreamingResponse(_events(task, reports, progress, result), 200, response_headers, _EVENTS)

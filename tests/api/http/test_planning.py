@@ -12,7 +12,11 @@ import httpx2
 import pytest
 import torch
 from PIL import Image
+from starlette.requests import Request
+from starlette.types import Message
 
+from api.http.progress import answer_work
+from api.http.schemas import PlanView
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.small_scenes import cameras
 
@@ -182,6 +186,30 @@ def test_disconnect_cancels_planning_without_events(service: Service, files: dic
     wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
     with service.client() as client:
         assert client.post("/v1/jobs", **request(files, resolution=96)).status_code == 200
+
+
+def test_disconnect_while_files_are_read_ends_the_work() -> None:
+    ended = asyncio.Event()
+
+    async def read_files(show: Any) -> PlanView:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.set()
+        raise AssertionError
+
+    async def leave() -> Message:
+        return {"type": "http.disconnect"}
+
+    async def ask() -> int:
+        streamed = Request({"type": "http", "headers": [(b"accept", b"text/event-stream")]}, leave)
+        answer = await asyncio.wait_for(
+            answer_work(streamed, read_files, "planning", "plan", asyncio.Event()), PATIENCE
+        )
+        await ended.wait()
+        return answer.status_code
+
+    assert asyncio.run(ask()) == 499
 
 
 def with_many_views(files: dict[str, bytes]) -> dict[str, bytes]:
