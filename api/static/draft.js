@@ -62,7 +62,7 @@ export async function startFrom(job, { painting = true } = {}) {
   const { style_weights: weights, regions, orbit, preset, name: _, ...others } = job.parameters, inputs = await allInputs(job);
   const taken = new Set((regions ?? []).flatMap(paintingsOf)), own = inputs.style.filter(({ name }) => !taken.has(name));
   if (!painting) inputs.style = inputs.style.filter((file) => !own.includes(file));
-  const values = Object.fromEntries(Object.entries({ ...others, orbit }).filter(([, value]) => value !== null));
+  const values = Object.fromEntries(Object.entries({ ...others, orbit: orbit && (others.views ?? orbit) }).filter(([, value]) => value !== null));
   if (values.content_weight !== undefined) values.content_weight = strengthName(values.content_weight);
   for (const color of ["background", "style_background"]) if (Array.isArray(values[color])) values[color] = values[color].map((/** @type {number} */ part) => Math.round(255 * part));
   const gone = job.status === "expired", nothing = { scene: [], style: [], cameras: [], photos: [] };

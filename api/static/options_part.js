@@ -144,14 +144,19 @@ export class OptionsPart {
     }
   }
 
-  /** Return the values that are not left to the preset, by name. @returns {Record<string, any>} */
-  values() {
-    return Object.fromEntries([...this.controls].map(([name, control]) => [name, control.value()]).filter(([, value]) => value !== undefined));
+  /** Return the values that are not left to the preset, by name. @param {Control[]} [controls] @returns {Record<string, any>} */
+  values(controls = [...this.controls.values()]) {
+    return Object.fromEntries(controls.map((control) => [control.name, control.value()]).filter(([, value]) => value !== undefined));
   }
 
   /** Return the controls that apply. @param {boolean} orbiting whether the job orbits the scene */
   applying(orbiting) {
-    return [...this.controls.values()].filter(({ name }) => orbiting || !this.groups.Views.includes(name));
+    return [...this.controls.values()].filter(({ name }) => (orbiting ? name !== "views" : !this.groups.Views.includes(name)));
+  }
+
+  /** Return the parameters of a job. @param {boolean} orbiting whether it orbits the scene */
+  parameters(orbiting) {
+    return { ...(orbiting ? { orbit: "auto" } : {}), ...this.values(this.applying(orbiting)), ...(this.preset ? { preset: this.preset } : {}) };
   }
 
   /** Fill in the time budget that suits the service's machine. */

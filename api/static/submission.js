@@ -26,10 +26,15 @@ export class Submission {
     this.stopping = new AbortController();
   }
 
+  /** Stop planning, or don't start it. */
+  stopPlanning() {
+    this.stopping.abort();
+  }
+
   /** Stop sending and planning; the form stays as it is. */
   stop() {
     this.stopped = true;
-    this.stopping.abort();
+    this.stopPlanning();
     this.card.stop();
   }
 
@@ -49,9 +54,18 @@ export class Submission {
    * Return the plan of a job.
    *
    * @param {any} body
-   * @returns {Promise<any>} undefined if the service did not send one
+   * @returns {Promise<any>} undefined if the service did not send one, or if `stopPlanning` was called
    */
   async plan(body) {
+    try {
+      return await this.readPlan(body);
+    } catch (error) {
+      if (this.stopped || !this.stopping.signal.aborted) throw error;
+    }
+  }
+
+  /** @param {any} body @returns {Promise<any>} */
+  async readPlan(body) {
     this.card.tell(say.planning);
     const answer = await ask("POST", "v1/jobs?dry_run=true", { json: body, headers: { Accept: "text/event-stream" }, signal: AbortSignal.any([this.leaving, this.stopping.signal]) });
     if (!answer.headers.get("content-type")?.includes("event-stream")) return answer.json();

@@ -43,7 +43,8 @@ export class SubmitView {
     this.draft = keptDraft();
     this.unfinished = new UnfinishedNotice(() => Object.values(this.slots).flatMap(({ files }) => files));
     this.leaving = new AbortController();
-    this.created = false;
+    /** Ids of the jobs that were created. */
+    this.created = "";
     /** Request that the service has not answered yet. @type {false | "planning" | "starting"} */
     this.busy = false;
     /** Scene that the masks of the regions belong to. @type {Chosen | undefined} */
@@ -105,8 +106,8 @@ export class SubmitView {
     if (draft) {
       options.restore(draft.values, draft.preset);
       if (draft.orbiting) this.views.restore();
-      this.views.show();
     } else options.useBudget();
+    this.views.show();
     this.form.addEventListener("input", (/** @type {Event} */ event) => {
       this.saveDraft();
       if (!options.presets.contains(event.target)) options.forgetTimes();
@@ -199,18 +200,6 @@ export class SubmitView {
     this.paintings.clearWrong();
   }
 
-  parameters() {
-    const { orbiting } = this.views, { preset } = this.options, regions = this.regions.value(), shares = this.paintings.shareValues();
-    /** @type {Record<string, any>} */
-    const values = {};
-    for (const control of this.options.applying(orbiting)) {
-      const value = control.value();
-      if (value !== undefined) values[control.name] = value;
-    }
-    if (orbiting) values.orbit ??= "auto";
-    return { ...values, ...(preset ? { preset } : {}), ...(regions.length ? { regions } : {}), ...(shares ? { style_weights: shares } : {}) };
-  }
-
   /** Mark the slots of missing inputs, and inputs whose text is not what they ask for, as far as the page can check them. */
   markWrong() {
     const { scene, style, cameras } = this.slots, { orbiting } = this.views, needStyle = style.files.length ? say.needOwnStyle : say.needStyle;
@@ -222,18 +211,28 @@ export class SubmitView {
     this.paintings.markInvalid();
   }
 
-  /** @param {boolean} dry whether to plan only */
+  /** Plan the job, or start it, which ends a plan that is being made. @param {boolean} dry whether to plan only */
   async act(dry) {
-    if (this.busy) return;
+    if (this.busy === "starting" || (dry && this.busy)) return;
     this.clearWrong();
     this.markWrong();
     if (this.refusals.reveal()) return;
+    this.options.forgetTimes();
+    const planning = !!this.busy;
     this.setBusy(dry ? "planning" : "starting");
+    if (planning) this.submission.stopPlanning();
+    else await this.request(dry);
+  }
+
+  /** @param {boolean} dry whether to plan first; the job is started nevertheless if the user wants that meanwhile */
+  async request(dry) {
     this.submission.restart();
     try {
-      const bodies = await this.bodies();
-      if (dry) this.showPlan(bodies[0], await this.submission.plan(bodies[0]));
-      else this.enter(await this.submission.create(bodies));
+      if (dry) {
+        const [body] = await this.bodies();
+        this.showPlan(body, await this.submission.plan(body));
+      }
+      if (this.busy === "starting") this.enter(await this.submission.create(await this.bodies()));
     } catch (error) {
       if (!this.leaving.signal.aborted && !this.submission.stopped) this.refuse(error);
     } finally {
@@ -245,14 +244,15 @@ export class SubmitView {
   async bodies() {
     const { scene, style, cameras, photos } = this.slots, { orbiting } = this.views;
     const files = { scene: scene.files, style: style.files, cameras: orbiting ? [] : cameras.files, photos: orbiting ? [] : photos.files, mask: this.regions.maskFiles() };
-    const sent = await this.submission.send(files);
-    return this.paintings.bodies({ ...sent, scene: sent.scene[0], parameters: this.parameters() });
+    const sent = await this.submission.send(files), regions = this.regions.value(), shares = this.paintings.shareValues();
+    const parameters = { ...this.options.parameters(orbiting), ...(regions.length ? { regions } : {}), ...(shares ? { style_weights: shares } : {}) };
+    return this.paintings.bodies({ ...sent, scene: sent.scene[0], parameters });
   }
 
   /** @param {false | "planning" | "starting"} busy */
   setBusy(busy) {
     this.busy = busy;
-    for (const button of [this.costButton, this.startButton]) button.disabled = !!busy;
+    [this.costButton.disabled, this.startButton.disabled] = [!!busy, busy === "starting"];
     this.nameStart();
     this.submission.card.element.hidden = !busy;
     if (busy) put(this.result);
@@ -260,8 +260,9 @@ export class SubmitView {
 
   /** @param {any} body @param {any} plan */
   showPlan(body, plan) {
-    if (!plan) return;
+    if (!plan || this.busy === "starting") return;
     const { jobs } = this.paintings;
+    if (plan.up) this.views.showUp(plan.up.direction);
     this.options.showTimes(body, plan);
     if (plan.up?.sure === false) return this.askUp(plan.up.candidates, true);
     put(this.result, costCard(plan, this.options.controls.has("within") ? () => (this.options.useBudget(), this.act(true)) : null), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
@@ -277,9 +278,10 @@ export class SubmitView {
   /** Open the view of created jobs. @param {any[]} jobs */
   enter(jobs) {
     if (this.leaving.signal.aborted) return announce(say.created(jobs.map(({ name }) => name).join(", ")));
-    this.created = true;
+    this.selecting.close(null);
+    this.created = jobs.map(({ id }) => id).join("/");
     forgetDraft();
-    location.hash = jobs.length > 1 ? `#/compare/${jobs.map(({ id }) => id).join("/")}` : `#/jobs/${jobs[0].id}`;
+    location.hash = `#/${jobs.length > 1 ? "compare" : "jobs"}/${this.created}`;
   }
 
   /** @param {unknown} error */

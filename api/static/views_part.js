@@ -3,7 +3,7 @@
 import { readCameras, ringCameras } from "./cameras.js";
 import { h, put } from "./dom.js";
 import { contentOf } from "./stored.js";
-import { UPS, uprightButtons } from "./upright.js";
+import { directionOf, UPS, uprightButtons } from "./upright.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./slots.js").Slot} Slot */
@@ -59,9 +59,13 @@ export class ViewsPart {
   /** Choose the up direction. @param {string} up value of the option `up` */
   standUp(up) {
     this.options.controls.get("up")?.set(up);
+    this.showUp(up);
+  }
+
+  /** Turn the scene and its orbit to an up direction. @param {string} up */
+  showUp(up) {
+    this.stage.standUp(directionOf(up) ?? this.stage.up);
     this.showCameras();
-    this.stage.up = UPS[up];
-    this.stage.home();
   }
 
   choose() {
@@ -79,6 +83,7 @@ export class ViewsPart {
   show() {
     const { scene, cameras, photos } = this.slots, { ring } = this.options, orbits = !this.chosen && scene.files.length > 0 && !cameras.files.length;
     if (!this.chosen) (orbits ? this.around : this.fromFiles).input.checked = true;
+    this.options.controls.get("views")?.element.toggleAttribute("hidden", this.orbiting); // an orbit has a number of views of its own
     put(this.body, orbits ? [this.automatic, cameras.element, ring] : this.orbiting ? [ring] : [cameras.element, photos.element]);
     this.upright.hidden = !this.orbiting || !scene.files.length;
     this.showCameras();
@@ -109,7 +114,7 @@ export class ViewsPart {
     const count = controls.get("orbit")?.value(), number = typeof count === "number" && count >= 1 ? Math.min(count, 400) : 0;
     const told = number ? words.cameras.ring(number) : words.cameras.ringAuto;
     if (!middle) return [[], told];
-    const up = UPS[controls.get("up")?.value()] ?? [0, -1, 0];
+    const up = UPS[controls.get("up")?.value()] ?? this.stage.up;
     return [ringCameras(middle, { count: number || 24, up, elevation: controls.get("elevation")?.value() ?? 10, radius: controls.get("radius")?.value() }), told];
   }
 
