@@ -34,8 +34,8 @@ const reopen = () => void dispatchEvent(new HashChangeEvent("hashchange"));
 export const badge = (status) => h(`span.badge.${status}${WORKING.has(status) ? ".working" : ""}`, titles[status] ?? status);
 
 export class JobView {
-  /** @param {string} id */
-  constructor(id) {
+  /** @param {string} id @param {import("./stage.js").Stage} [before] stage of the form that has created the job */
+  constructor(id, before) {
     this.id = id;
     this.title = words.page.jobs;
     this.leaving = new AbortController();
@@ -44,7 +44,7 @@ export class JobView {
     this.chart = new LossChart();
     this.lastEvent = "";
     this.name = new JobName(id, (job) => this.use(job), (error) => this.tellError(error));
-    this.stage = new JobStage(id, this.leaving.signal);
+    this.stage = new JobStage(id, this.leaving.signal, before);
     this.state = new JobProgress();
     this.badge = h("span");
     this.meta = h("p.meta");

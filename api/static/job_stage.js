@@ -4,6 +4,7 @@ import { artifactPath, get } from "./api.js";
 import { h, put } from "./dom.js";
 import { labels } from "./names.js";
 import { LIVE, ResultStage } from "./result_stage.js";
+import { Stage } from "./stage.js";
 import { words } from "./words.js";
 
 const say = words.job;
@@ -14,13 +15,16 @@ export class JobStage {
   /**
    * @param {string} id id of the job
    * @param {AbortSignal} leaving aborted when the view ends
+   * @param {Stage} [before] stage that has shown the scene before the job was created
    */
-  constructor(id, leaving) {
+  constructor(id, leaving, before) {
     this.id = id;
     this.leaving = leaving;
     this.title = "";
     this.picture = h("figure.preview");
-    this.element = h("div.show", this.picture);
+    /** Stage that shows the scene until the job's files are known. @type {Stage | undefined} */
+    this.first = before?.viewer?.sides ? new Stage(before) : undefined;
+    this.element = h("div.show", this.first?.element ?? this.picture);
     /** Name of the shown preview. */
     this.preview = "";
     /** Stage of the unfinished job. @type {ResultStage | undefined} */
@@ -65,14 +69,23 @@ export class JobStage {
   showLive(job, names) {
     const ownScene = names.has("live/scene.ply"), painted = [LIVE, "colors.f16"].find((name) => names.has(name)) ?? "", { live: before } = this;
     if (this.result || this.finishing || GONE.has(job.status)) return;
+    if (names.has("plan.json")) before?.standUp();
     if (before?.live?.ownScene === ownScene) return void (painted === LIVE && !before.live.painted && this.paint());
-    const live = new ResultStage([job], { signal: this.leaving, live: { ownScene, painted } });
+    const live = new ResultStage([job], { signal: this.leaving, live: { ownScene, painted }, stage: this.takeFirst() });
     if (!live.stage.viewer) return;
     before?.end();
     this.live = live;
     live.stage.title = this.title;
     this.open = this.showTabs([[say.threeD, h("div", live.element)], [say.preview, this.picture]]);
+    if (names.has("plan.json")) live.standUp();
     live.loading.then(() => live.original || live !== this.live || put(this.element, this.picture)); // the browser cannot show it
+  }
+
+  /** Return the stage that shows the scene already, once. */
+  takeFirst() {
+    const { first } = this;
+    this.first = undefined;
+    return first;
   }
 
   /** Show the present colors of the unfinished job. */
@@ -105,7 +118,7 @@ export class JobStage {
    * @param {ResultStage} [kept] stage that has shown the job while it ran
    */
   showResult(job, hasSheet, kept) {
-    this.result = kept ?? new ResultStage([job], { signal: this.leaving });
+    this.result = kept ?? new ResultStage([job], { signal: this.leaving, stage: this.takeFirst() });
     this.result.stage.title = this.title;
     const stage = h("div", this.result.element), sheet = h("figure.sheet", { hidden: true });
     /** @type {[string, HTMLElement][]} */
@@ -151,6 +164,7 @@ export class JobStage {
   }
 
   end() {
+    this.first?.end();
     this.live?.end();
     this.result?.end();
   }

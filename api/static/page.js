@@ -32,7 +32,7 @@ function viewOf() {
   const known = ids.length > 0 && ids.every((id) => /^job_[0-9a-f]+$/.test(id));
   if (name === "") return new SubmitView();
   if (name === "jobs" && !ids.length) return new JobsView();
-  if (name === "jobs" && known && ids.length === 1) return new JobView(ids[0]);
+  if (name === "jobs" && known && ids.length === 1) return new JobView(ids[0], view instanceof SubmitView && view.created === ids[0] ? view.stage : undefined);
   if (name === "compare" && known && ids.length >= 2 && ids.length <= 20) return new CompareView(ids);
   return { title: "", element: h("div.empty", h("h1", say.missing), h("a.button.primary", { href: "#/" }, say.toNew)), end: () => {} };
 }

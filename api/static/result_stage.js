@@ -9,7 +9,7 @@ import { Blend } from "./blend.js";
 import { h, put } from "./dom.js";
 import { labels, nameOf } from "./names.js";
 import { Stage } from "./stage.js";
-import { UPS } from "./upright.js";
+import { directionOf, UPS } from "./upright.js";
 import { requestedRendering } from "./viewer/render_tag.js";
 import { words } from "./words.js";
 
@@ -23,11 +23,12 @@ export const LIVE = "live/colors.f16";
 export class ResultStage {
   /**
    * @param {any[]} jobs finished runs; the scene is that of the first one
-   * @param {{signal: AbortSignal, live?: {ownScene: boolean, painted: string}, files?: (job: any) => Files, blend?: boolean}} how
+   * @param {{signal: AbortSignal, live?: {ownScene: boolean, painted: string}, files?: (job: any) => Files, blend?: boolean, stage?: Stage}} how
    *   `live`: the one run is unfinished; `ownScene`: the rows of its scene are not those of its input; `painted`: name
-   *   of the file with its colors so far, or ""; `files`: where the files of a job are; `blend`: whether to offer blends
+   *   of the file with its colors so far, or ""; `files`: where the files of a job are; `blend`: whether to offer
+   *   blends; `stage`: stage that shows the scene already
    */
-  constructor(jobs, { signal, live, files = (job) => filesOf(job, signal), blend = true }) {
+  constructor(jobs, { signal, live, files = (job) => filesOf(job, signal), blend = true, stage = new Stage() }) {
     this.jobs = jobs;
     this.files = files;
     this.signal = signal;
@@ -36,12 +37,14 @@ export class ResultStage {
     this.loading = Promise.resolve();
     /** @type {Promise<void> | undefined} */
     this.fetching = undefined;
-    this.stage = new Stage();
+    this.stage = stage;
     this.left = this.chooser(say.left);
     this.right = this.chooser(say.right);
     this.pickers = h("div.row.sides", { hidden: jobs.length < 2 || !this.stage.viewer }, this.left.element, this.right.element);
     this.blend = new Blend(jobs, jobs.length > 1 ? labels(jobs) : [nameOf(jobs[0])], () => this.showBlend());
     this.blend.element.hidden = true;
+    /** Whether the up direction that the plan has found was read. */
+    this.upright = false;
     this.blends = blend && jobs.length <= 2;
     this.element = h("div.result-stage", this.pickers, this.stage.element, this.blend.element);
     /** Choices for each side of the wipe. @type {Map<string, {name: string, side: Side}>} */
@@ -69,7 +72,7 @@ export class ResultStage {
     viewer.camera.near = first.parameters.near ?? 0.2;
     this.stage.message(words.page.loading);
     this.stage.up = UPS[first.parameters.up] ?? this.stage.up;
-    await this.loadCameras();
+    await Promise.all([this.loadCameras(), first.status === "succeeded" && this.standUp()]);
     await this.openOriginal(first);
     for (const job of this.jobs) await this.openRun(job).catch((error) => this.tell(error));
     if (this.signal.aborted) return;
@@ -80,18 +83,29 @@ export class ResultStage {
     try {
       const blobs = await this.files(this.jobs[0]).cameras();
       if (!blobs.length) return;
-      this.stage.setCameras(await readCameras(blobs), { stand: true });
+      this.stage.setCameras(await readCameras(blobs), { stand: !this.stage.viewer?.touched });
     } catch {
       // without cameras, the view is free
     }
+  }
+
+  /** Turn the scene to the up direction that the plan of an orbit has found. */
+  async standUp() {
+    const [job] = this.jobs, { orbit, up } = job.parameters;
+    if (this.upright || !orbit || UPS[up]) return;
+    this.upright = true;
+    const plan = await get(this.files(job).result("plan.json"), this.signal).catch(() => null);
+    const found = directionOf(plan?.decisions.find((/** @type {any} */ each) => each.item === "up")?.decision);
+    if (found) this.stage.standUp(found);
   }
 
   /** @param {any} job */
   async openOriginal(job) {
     const { viewer } = this.stage;
     if (!viewer || this.signal.aborted) return;
-    const files = this.files(job), path = this.live?.ownScene ? files.result("live/scene.ply") : files.scene;
-    const scene = viewer.open(new URL(path, location.href).href);
+    const files = this.files(job), own = this.live?.ownScene, path = own ? files.result("live/scene.ply") : files.scene;
+    const shown = viewer.sides?.left.scene, scene = shown && !own ? shown : viewer.open(new URL(path, location.href).href);
+    if (scene !== shown) shown?.end();
     this.stage.show({ scene, colors: "own" });
     try {
       const header = await scene.headerRead;
@@ -178,6 +192,7 @@ export class ResultStage {
     const { original, live } = this;
     if (!original || live?.ownScene || job.parameters.sh_attenuation) return false;
     this.live = undefined;
+    this.standUp();
     await this.fetching; // older colors would replace the final ones
     try {
       await this.fetchColors(job, "colors.f16");

@@ -57,6 +57,6 @@ export class ScenePart {
   }
 
   end() {
-    this.opened?.end();
+    if (this.stage.viewer) this.opened?.end(); // else another stage shows it
   }
 }

@@ -65,7 +65,7 @@ export class ShapeTool {
   /** Keep the handles where the camera shows the shape. */
   follow() {
     cancelAnimationFrame(this.requested ?? 0);
-    if (!this.shape || this.stage.viewer?.ended) return;
+    if (!this.shape || this.stage.viewer?.ended !== false) return;
     this.handles?.place();
     this.requested = requestAnimationFrame(() => this.follow());
   }

@@ -5,6 +5,7 @@ import { cameraLines, frameSize, upOf } from "./cameras.js";
 import { fileName } from "./names.js";
 import { Controls } from "./viewer/controls.js";
 import { canShow, Headset } from "./viewer/headset.js";
+import { dot } from "./viewer/vectors.js";
 import { Viewer } from "./viewer/viewer.js";
 import { words } from "./words.js";
 
@@ -15,8 +16,9 @@ import { words } from "./words.js";
 const say = words.viewer;
 
 export class Stage {
-  constructor() {
-    this.canvas = h("canvas.view", { tabIndex: 0, role: "application", "aria-label": say.name, "aria-description": say.instructions });
+  /** @param {Stage} [before] stage whose viewer this one takes over, with its scene and camera */
+  constructor(before) {
+    this.canvas = before?.canvas ?? h("canvas.view", { tabIndex: 0, role: "application", "aria-label": say.name, "aria-description": say.instructions });
     this.overlay = h("div.overlay");
     this.note = h("p.note", { hidden: true });
     this.bar = h("div.loading", { hidden: true }, h("span"));
@@ -45,17 +47,23 @@ export class Stage {
     this.cropped = new Float32Array(0);
     this.hasFrames = false;
     this.framesShown = true;
-    this.up = [0, -1, 0];
+    this.up = before?.up ?? [0, -1, 0];
     try {
-      this.viewer = new Viewer(this.canvas, () => this.told());
+      this.viewer = before?.viewer ?? new Viewer(this.canvas);
     } catch (error) {
       this.element.classList.add("flat");
       this.message(error instanceof Error ? error.message : String(error));
       return;
     }
-    this.controls = new Controls(this.viewer, { moved: () => this.leaveCamera(), toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home(), hold: (held) => this.hold(held) });
+    this.viewer.told = () => this.told();
+    this.controls = before?.controls ?? new Controls(this.viewer);
+    this.controls.keys = { moved: () => this.leaveCamera(), toggle: () => this.toggle(), camera: (by) => this.stand(this.stood + by), home: () => this.home(), hold: (held) => this.hold(held) };
+    this.controls.orbit = true;
     this.makeTools();
-    this.canvas.addEventListener("pointerdown", () => this.leaveCamera());
+    if (before) {
+      before.viewer = null;
+      this.drawFrames();
+    }
     this.divider.addEventListener("wheel", (/** @type {WheelEvent} */ event) => this.controls?.wheel(event), { passive: false });
     this.divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => event.buttons && this.wipeTo(event.clientX));
     this.divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => this.divider.setPointerCapture(event.pointerId));
@@ -255,6 +263,15 @@ export class Stage {
     this.leaveCamera();
     this.viewer.camera.frame(middle, this.up);
     this.viewer.moved();
+  }
+
+  /** Turn the scene so that a direction points up. @param {number[]} up */
+  standUp(up) {
+    const { viewer } = this;
+    if (!viewer || dot(up, this.up) > 0.999) return;
+    this.up = viewer.camera.up = up;
+    this.leaveCamera();
+    viewer.reframe();
   }
 
   async save() {

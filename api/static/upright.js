@@ -10,6 +10,12 @@ const say = words.upright;
 /** Directions that the option `up` offers. */
 export const UPS = /** @type {Record<string, Vector>} */ ({ x: [1, 0, 0], "-x": [-1, 0, 0], y: [0, 1, 0], "-y": [0, -1, 0], z: [0, 0, 1], "-z": [0, 0, -1] });
 
+/** Return a direction such as "-y" or "(0.00, 0.60, 0.80)"; undefined for "auto". @param {string} [text] @returns {Vector | undefined} */
+export function directionOf(text = "") {
+  const numbers = text.match(/-?\d[\d.]*/g)?.map(Number);
+  return UPS[text] ?? (numbers?.length === 3 ? numbers : undefined);
+}
+
 /**
  * Return the up direction after a quarter turn.
  *

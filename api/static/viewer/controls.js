@@ -11,13 +11,12 @@ const THROWN = 60;
 const NEWEST = 0.4;
 
 export class Controls {
-  /**
-   * @param {Viewer} viewer
-   * @param {Actions} keys actions of other keys
-   */
-  constructor(viewer, keys = {}) {
+  /** Actions of other keys. @type {Actions} */
+  keys = {};
+
+  /** @param {Viewer} viewer */
+  constructor(viewer) {
     this.viewer = viewer;
-    this.keys = keys;
     this.motion = new Motion(viewer);
     /** @type {Map<number, {x: number, y: number}>} */
     this.hands = new Map();
@@ -51,6 +50,7 @@ export class Controls {
   /** @param {PointerEvent} event */
   down(event) {
     this.motion.stop();
+    this.keys.moved?.();
     this.viewer.canvas.setPointerCapture(event.pointerId);
     this.hands.set(event.pointerId, { x: event.clientX, y: event.clientY });
     this.thrown = { x: 0, y: 0, at: 0, pans: false };

@@ -17,13 +17,12 @@ export class Viewer {
   /** The scene bounds that the camera was last set to show. @type {SplatScene["middle"]} */
   framed = null;
 
-  /**
-   * @param {HTMLCanvasElement} canvas
-   * @param {() => void} told called after each change of the state
-   */
-  constructor(canvas, told = () => {}) {
+  /** Function that is called after each change of the state. */
+  told = () => {};
+
+  /** @param {HTMLCanvasElement} canvas */
+  constructor(canvas) {
     this.canvas = canvas;
-    this.told = told;
     this.camera = new ViewCamera();
     /** @type {{left: Side, right: Side} | null} */
     this.sides = null;
@@ -75,6 +74,14 @@ export class Viewer {
     }
     this.told();
     this.draw();
+  }
+
+  /** Show the whole scene, as before the first movement of the camera. */
+  reframe() {
+    this.touched = false;
+    this.camera.shape = 0;
+    this.framed = null;
+    this.sceneChanged();
   }
 
   /**

@@ -43,7 +43,7 @@ pytestmark = pytest.mark.slow
 
 def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:
     """Drop files, view them, plan, start, watch and wipe: the pixels on each side are those of `sgsst render`."""
-    earlier = _jobs(service)
+    earlier, sent = _jobs(service), list[str]()
     watched = visit(width=600, height=500)
     page = watched.page
     drop(watched, files)
@@ -61,6 +61,8 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     cost.get_by_text("How it will run").click()
     cost.get_by_text("network layers").wait_for()
 
+    page.locator("canvas.view").evaluate("(canvas) => { canvas.id = 'same'; }")
+    page.on("request", lambda request: sent.append(request.url))
     page.get_by_role("button", name="Start").click()
     page.locator("h1", has_text="scene").wait_for()
     page.locator(".badge", has_text="Done").wait_for()
@@ -68,6 +70,8 @@ def test_from_files_to_wipe(visit: Visit, service: Service, files: dict[str, Pat
     page.get_by_role("heading", name="How it ran").wait_for()
     page.get_by_label("Wipe", exact=True).wait_for()
     job_id = page.url.rsplit("/", 1)[1]
+    assert page.locator("canvas.view").get_attribute("id") == "same", "the job's page shows the scene of the form"
+    assert not [url for url in sent if url.endswith("/inputs/scene")]
 
     page.get_by_label("Camera", exact=True).select_option("1")
     camera = resized(read_cameras(files["cameras"])[1], 384)

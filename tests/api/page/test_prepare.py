@@ -15,10 +15,13 @@ from sgsst_core.files.scene_file import read_scene
 from tests.api.page.actions import REFUSED, STEPS, Visit, choose, done, set_options, started
 from tests.api.page.browser import Watched
 from tests.api.service import Service
-from tests.sgsst_core.orbit.objects import box, scene_of
+from tests.sgsst_core.orbit.objects import box, joined, scene_of
 from tests.small_scenes import write_files
 
 pytestmark = pytest.mark.slow
+
+#: Extents along x and half widths of a base and what stands on it: -x is up.
+TOWER = ((-2.0, 1.0, 0.4), (1.0, 1.4, 1.2))
 
 
 def test_example_is_one_click_from_a_job(visit: Visit, service: Service) -> None:
@@ -41,6 +44,7 @@ def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict
     page = watched.page
     choose(watched, {"scene": files["scene"], "style": files["style"]})
     set_options(watched, orbit=3, resolution=64, **STEPS)
+    assert page.locator("[data-name=views]").is_hidden(), "an orbit has a number of views of its own"
     watched.settled()
     whole = from_first_camera(watched)
     page.get_by_role("button", name="Show everything").click()
@@ -111,6 +115,32 @@ def test_page_asks_which_way_is_up(visit: Visit, service: Service, files: dict[s
     assert job["parameters"]["up"] == "-x"
     done(service, job["id"])
     watched.check(REFUSED)
+
+
+def test_result_stands_as_the_service_has_found(
+    visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path
+) -> None:
+    tower = joined(*(scene_of(box((low, -half, -half), (high, half, half), 900), 0.05) for low, high, half in TOWER))
+    write_files(tmp_path, replace(tower, sh_dc=tower.sh_dc + 2))
+    watched = visit(width=1200, height=800)
+    choose(watched, {"scene": files["scene"], "style": files["style"]})
+    set_options(watched, orbit=3, resolution=64, **STEPS)
+    assert stands(watched) == (False, False), "the form doesn't know it"
+    job = started(watched, service)
+    done(service, job["id"])
+    watched.page.get_by_label("Wipe", exact=True).wait_for()
+    assert stands(watched) == (True, True)
+    assert stands(visit(f"/#/jobs/{job['id']}", width=1200, height=800)) == (True, True)
+    watched.check()
+
+
+def stands(watched: Watched) -> tuple[bool, bool]:
+    """Return whether what the view shows is taller than wide, and whether its lower half is broader."""
+    shown = watched.pixels().max(axis=2) > 40
+    rows, columns = shown.any(axis=1).nonzero()[0], shown.any(axis=0).nonzero()[0]
+    middle = (rows[0] + rows[-1]) // 2
+    taller = bool(np.ptp(rows) > np.ptp(columns))
+    return taller, taller and bool(np.count_nonzero(shown[middle:]) > 1.2 * np.count_nonzero(shown[:middle]))
 
 
 def shown_upright(watched: Watched, answers: list[str]) -> list[np.ndarray]:
