@@ -130,7 +130,7 @@ def render_views(
     check_choice(source)
     file, capture = read_scene_and_capture(source)
     scene, cameras = file.scene, capture.cameras
-    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
+    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near, memory=0)
     check_something_seen(scene, cameras, rasterizer)
     for line in warnings_of(capture.decisions):
         warn(line)

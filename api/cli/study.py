@@ -68,7 +68,7 @@ def _named(text: str) -> tuple[str, Path]:
 def _render(source: SceneRequest, cameras: Sequence[Camera], background: tuple[float, float, float]) -> list[Tensor]:
     """Return the image [H, W, 3] of a scene at each camera."""
     scene = read_scene_and_capture(source)[0].scene
-    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near)
+    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near, memory=0)
     check_something_seen(scene, cameras, rasterizer)
     return [rasterizer.render(scene_colors(scene, camera), camera) for camera in cameras]
 

@@ -34,7 +34,9 @@ def scene_psnr(
     Returns:
         PSNR; None if all renders are identical.
     """
-    pairs = [(make_rasterizer("cpu", each, background=background, near=near), each) for each in (first, second)]
+    pairs = [
+        (make_rasterizer("cpu", each, background=background, near=near, memory=0), each) for each in (first, second)
+    ]
     squares = values = 0.0
     for camera in cameras:
         one, other = (

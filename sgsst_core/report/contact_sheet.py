@@ -96,7 +96,7 @@ def small_renders(
 ) -> Iterator[Tensor]:
     """Yield renders [H, W, 3] of a scene, or of a sample of a large one, with at most `side` pixels per side."""
     part = sampled(scene, _VIEW_GAUSSIANS)
-    rasterizer = make_rasterizer("cpu", part, background=background, near=near)
+    rasterizer = make_rasterizer("cpu", part, background=background, near=near, memory=0)
     for camera in cameras:
         small = resized(camera, min(camera.side, side))
         yield rasterizer.render(scene_colors(part, small), small)

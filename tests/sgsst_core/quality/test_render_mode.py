@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,3 +90,13 @@ def test_psnr_is_that_of_all_pixels() -> None:
         squares.append((one.clamp(0, 1).double() - two.clamp(0, 1).double()).square())
     expected = -10 * torch.cat([each.flatten() for each in squares]).mean().log10()
     assert scene_psnr(scene, other, views, near=0.2) == pytest.approx(float(expected))
+
+
+def test_memory_of_a_comparison_does_not_grow_with_the_views() -> None:
+    scene, peaks = wall(140, 110), []
+    for count in (2, 2, 12):  # the first comparison also compiles kernels
+        tracemalloc.start()
+        scene_psnr(scene, scene, cameras(count), near=0.2)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] < 1.2 * peaks[1]
