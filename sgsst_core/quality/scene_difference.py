@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from torch import Tensor
 
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.loss.gradient_error import psnr
@@ -34,15 +36,15 @@ def scene_psnr(
     Returns:
         PSNR; None if all renders are identical.
     """
-    pairs = [
-        (make_rasterizer("cpu", each, background=background, near=near, memory=0), each) for each in (first, second)
-    ]
+
+    def renders(scene: Scene) -> Iterator[Tensor]:
+        rasterizer = make_rasterizer("cpu", scene, background=background, near=near, memory=0)
+        for camera in cameras:
+            yield rasterizer.render(scene_colors(scene, camera), camera).clamp(0, 1)
+
     squares = values = 0.0
-    for camera in cameras:
-        one, other = (
-            rasterizer.render(scene_colors(each, camera), camera).clamp(0, 1).double() for rasterizer, each in pairs
-        )
-        squares += float((one - other).square().sum())
+    for one, other in zip([*renders(first)], renders(second), strict=True):  # one rasterizer at a time
+        squares += float((one.double() - other.double()).square().sum())
         values += one.numel()
     return psnr(squares / values) if squares else None
 
