@@ -20,7 +20,6 @@ class ServiceError(SgsstError):
         problem: Problem that occurred.
         code, status: Code and HTTP status of the response.
         retry_after: Seconds after which the request may succeed (`Retry-After`); None if waiting does not help.
-        headers: Further headers of the response.
         extra: Additional members of the problem document.
     """
 

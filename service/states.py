@@ -128,7 +128,6 @@ class Action:
     """Transition that users request with `POST /v1/jobs/{id}/{transition}`.
 
     Attributes:
-        help: Description for users.
         statuses: Statuses that the transition changes.
     """
 

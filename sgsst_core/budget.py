@@ -47,7 +47,6 @@ def content_fraction(device: str, *, weighted: bool, has_maps: bool) -> float:
     Args:
         device: "cpu" or "cuda".
         weighted: Whether statistics are weighted by rendered coverage.
-        has_maps: Whether the scene has regions.
     """
     return 0.5 - 0.25 * has_maps + 0.25 * (device != "cpu" and not weighted)
 
@@ -166,7 +165,6 @@ class Cache(Generic[K, V]):
         """Return the value of a key, from the cache or computed, and cache it if it fits.
 
         Args:
-            key: Key of the value.
             make: Function that computes the value. Its exceptions propagate.
             size: Size of the value in bytes; None to use the cache's own `size` function.
         """
@@ -192,7 +190,6 @@ class Cache(Generic[K, V]):
         """Compute and cache the value of a key if it fits; only the first call for a key has an effect.
 
         Args:
-            key: Key of the value.
             count: Function that returns the size of the value in bytes, and a function that computes the value.
         """
         with self._lock:

@@ -16,8 +16,6 @@ class Decision:
     """One line of a plan.
 
     Attributes:
-        item: Subject of the decision.
-        decision: Decision as text.
         reason: Evidence for it.
         seconds: Estimated seconds saved per iteration; None if unknown.
         bytes: Memory saved in bytes; None if unknown.

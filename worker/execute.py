@@ -53,7 +53,6 @@ def execute(
     function. The callbacks are used on rank 0 only.
 
     Args:
-        job: Prepared job.
         progress: Callback for the progress of the steps, called first with the stage "starting".
         stop: Callback that returns True to interrupt the job.
         finish: Callback that returns True to end the job after a step, with its present colors as the result.

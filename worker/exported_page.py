@@ -53,7 +53,6 @@ def write_page(
         viewer: Sources of the viewer; see `api.static_files.exported_viewer`.
         stylized: Scene to show.
         original: Scene of the same Gaussians to show beside it, with a wipe and a blend; None for none.
-        title: Title of the page.
         background: Color behind the scene, in 0..1.
         in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
 

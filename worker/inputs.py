@@ -113,8 +113,6 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
     """Read and check all inputs of a job. Every rank must call this function.
 
     Args:
-        request: Job with paths of the inputs.
-        collectives: Collectives of all ranks.
         limits: Limits of a service. With them, every photo is read, a scene that no camera sees is found, and names of
             photos and masks must be those of cameras. None reads only what the job needs first.
 

@@ -43,12 +43,9 @@ class JobSpec(BaseModel):
     """Specification of one stylization job.
 
     Attributes:
-        source: Scene and cameras.
         styles: Style images and their weights.
         images: Folder of photos for the content term; None for unstylized renders.
         out: PLY to write, or compressed file to write beside a PLY; see `Outputs.of`.
-        settings: Settings of the method.
-        backbone: Feature network.
         resume: Whether to resume from the checkpoint beside `out`.
         regions: Regions with their own style or frozen colors, from `region_requests`.
         colors: Whether to also write a file of the stylized colors alone, if nothing else of the scene changes.

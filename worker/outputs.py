@@ -87,13 +87,10 @@ class Outputs:
     """Output files of a job, named after its PLY so that jobs can share a folder.
 
     Attributes:
-        ply: Stylized scene.
         compressed: Stylized scene in another format, which the suffix of its name determines; None if not requested.
         report, page, plan: Report as JSON and as HTML, and plan as JSON.
         views: Unstylized renders of an orbit's views.
-        sheet, curves: Contact sheet, and loss curves.
         checkpoint: Newest checkpoint.
-        colors: Stylized colors alone.
     """
 
     ply: Path

@@ -93,8 +93,6 @@ def prepare(
     Nothing is written but the first preview.
 
     Args:
-        request: Job to prepare.
-        collectives: Collectives of all ranks.
         resume: Choice of the checkpoint to resume from; None follows the request.
         warn: Callback for checkpoints that cannot be used.
         show_planning: Callback for the progress of planning. It is not called if the checkpoint's plan
@@ -171,9 +169,6 @@ def dry_run(
     """Plan a job as `prepare` would on one rank.
 
     Args:
-        request: Job to plan.
-        inputs: Inputs of the job, from `read_inputs`.
-        show: Callback for the progress of planning.
         hand_over: Existing file to write the plan to, for `prepare`; None writes nothing.
         left: Seconds left of the time budget if the job had been started instead; None without one.
 

@@ -48,9 +48,6 @@ class Previews:
             the folder `live` beside it.
         seconds: Minimum seconds between two previews, except for the first ones.
         warn: Callback that receives the reason why a preview is missing. A missing preview does not fail the job.
-
-    Attributes:
-        live: Writer of the colors.
     """
 
     def __init__(self, folder: Path, seconds: float, warn: Callable[[str], None]) -> None:

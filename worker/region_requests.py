@@ -47,11 +47,9 @@ class Selection:
     """Selection of a region's Gaussians.
 
     Attributes:
-        kind: Kind of selection.
         text: SPEC as the user gave it.
         numbers: Numbers of a box, sphere or half-space, or the value that a property is compared with.
         name, sign: Property and comparison operator of a property selection.
-        path: Mask file, or folder of masks.
     """
 
     kind: Kind

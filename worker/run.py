@@ -28,7 +28,6 @@ class Listener:
         prepared: Called once, after the job has been prepared.
         progress: Called with the latest progress. A further attempt on ranks repeats the stages before the steps if no
             earlier attempt has saved its plan.
-        warn: Called with each warning.
         stop: Called after each step, or a few times per second; returns True to interrupt the job.
         finish: Called like `stop`; returns True to end the job after a step, with its present colors as the result.
         saved: Called with the step of each checkpoint; not used for ranks.
@@ -54,11 +53,8 @@ class LostAttempt:
     """Lost attempt on ranks, as listed in the report.
 
     Attributes:
-        ranks: Number of ranks.
         first_step: Step at which the attempt started; None if it was lost before its first step.
-        last_step: Last completed step.
         saved_step: Step of the checkpoint that the next attempt resumes from.
-        reason: Reason of the loss.
         seconds_lost: Seconds from the last checkpoint (or the start of the job) to the first step of the next attempt.
         seconds_to_resume: Seconds from the loss to the first step of the next attempt.
     """
@@ -99,9 +95,7 @@ def stylize(request: JobSpec, workers: int | None, listener: Listener, options: 
     """Run a job in this process, or on up to `workers` ranks, each in a process of its own.
 
     Args:
-        request: Job to run.
         workers: Maximum number of ranks; None for this process.
-        listener: Callbacks for the events of the job.
         options: Options of running and watching ranks.
 
     Raises:
@@ -129,10 +123,6 @@ def run_rank(
     """Prepare a job on this rank, and execute it. Every rank must call this function.
 
     Args:
-        request: Job to run.
-        listener: Callbacks for the events of the job.
-        options: Options of the job's ranks.
-        resume: Choice of the checkpoint to resume from.
         collectives: Collectives of all ranks; None for one rank.
         run_id: Identifier of this run, stored in checkpoints. None generates one.
         about_ranks: Requested ranks and lost attempts, as JSON for the report.

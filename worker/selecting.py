@@ -44,12 +44,10 @@ def select_regions(
 
     Args:
         requests: Requested regions; see `worker.region_requests.region_requests`.
-        file: Scene.
         cameras: Cameras that mask images may belong to, at the sizes at which the scene is stylized.
         near: Near plane in world units.
         load: Function that reads the images of a style.
         sh_attenuation: SH attenuation of the job, 0 to 1.
-        content_weight: Content weight of the job.
 
     Raises:
         InvalidInputError: If a file cannot be used, or the regions contradict each other or the job; see

@@ -41,10 +41,6 @@ def parse_style(text: str, exists: Callable[[Path], bool] = Path.exists) -> Styl
 
     If a file named like the whole text exists, the text is its path, even if it ends in `:WEIGHT`.
 
-    Args:
-        text: Text to parse.
-        exists: Function that returns whether a file exists.
-
     Raises:
         SettingsError: If the weight is not finite or not above 0.
     """

@@ -36,7 +36,6 @@ class VideoRequest:
     Attributes:
         source: Scene and cameras; its resolution is the longer side of the video.
         out: Video, or images, to write; see `sgsst_core.files.video`.
-        options: Options of the video.
         background: Background color, in 0..1.
         unstylized: Scene file at the start of a transition; None for no transition.
         transparent: Whether to write an alpha channel instead of the background.
@@ -159,7 +158,6 @@ def video_cameras(
         scene: Scene that a turntable surrounds.
         source: Up direction, elevation, radius and near plane of a turntable.
         through: Cameras that the path leads through; None for a turntable.
-        options: Options of the video.
         side: Longer side in pixels; None for the cameras' own, but at most `DEFAULT_SIDE`.
         remaining: [N] bool, Gaussians of a cropped scene that a turntable surrounds; None for all.
         even: Whether sides must be even.

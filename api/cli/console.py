@@ -37,7 +37,6 @@ class Invocation:
     """Invocation of the program.
 
     Attributes:
-        arguments: Arguments of the command line.
         started: Start of the process, or of the call of `main` in another program, in seconds since the epoch.
         missing: Paths to write and their folders, inner ones first, that did not exist when their options were read.
     """

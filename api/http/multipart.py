@@ -59,7 +59,6 @@ class Received:
         files: `role`, `name`, `sha256`, `size` of each file.
         uploads: Index and role of each file that is not in the request, with the id of its upload, the path of an
             input, or a URL. The index counts all files together.
-        texts: Text fields by name.
     """
 
     files: list[dict[str, Any]] = field(default_factory=list)

@@ -75,7 +75,6 @@ class Receipt:
     them.
 
     Attributes:
-        owner: Owner of the request.
         id: Id in the database; None until something is charged.
     """
 

@@ -142,7 +142,6 @@ async def send_list(
     """Return the response with a page of a list, `{NAME: [...], "next_cursor": ...}`, which is sent as it is read.
 
     Args:
-        name: Name of the list.
         read: Function that reads entries.
         cursor: Cursor of the page; None for the first one.
         limit: Maximum number of entries on the page.

@@ -64,7 +64,6 @@ class StaticFile:
     """A file to be served.
 
     Attributes:
-        body: Content.
         compressed: Content with gzip compression; None if that saves nothing.
         digest: SHA-256 of the content.
         kind: Media type.

@@ -75,7 +75,6 @@ class Blend:
     Attributes:
         weight: Weight of the job's result. The scene has the remaining weight up to 1.
         others: Weights of the results of other jobs by job id.
-        format: Format of the blend.
     """
 
     weight: float
@@ -162,9 +161,7 @@ class DerivedFiles:
         """Return the HTML page that shows a job's result in 3D, beside its scene if both have the same Gaussians.
 
         Args:
-            job: Job with a result.
             viewer: Sources of the page; see `worker.exported_page`.
-            quotas: Quotas of the job's owner.
 
         Raises:
             NotFoundError: If the job has no result yet, or the result is gone.
@@ -180,9 +177,6 @@ class DerivedFiles:
         """Render a video of a job's result, which replaces an earlier one, and return it.
 
         Args:
-            job: Job with a result.
-            options: Options of the video.
-            quotas: Quotas of the job's owner.
             show: Callback that receives the progress: `stage`, `step`, `total`, `fraction` and `eta_s`. One step is one
                 frame.
 

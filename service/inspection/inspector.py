@@ -69,11 +69,7 @@ Show = Callable[[dict[str, Any]], None]
 
 
 class InspectionProcess:
-    """Inspecting process that handles one request at a time; it is started on first use and restarted after it dies.
-
-    Args:
-        threads: Number of threads for computations.
-    """
+    """Inspecting process that handles one request at a time; it is started on first use and restarted after it dies."""
 
     def __init__(self, threads: int = 1) -> None:
         self._threads = threads
@@ -87,8 +83,6 @@ class InspectionProcess:
         """Return the response to a request.
 
         Args:
-            request: Request to send.
-            show: Callback for the progress.
             checked: Callback for the findings about the inputs of a job that is then planned.
 
         Raises:
@@ -222,7 +216,6 @@ class Inspector:
             owner: Owner of the job; waiting owners take turns.
             inputs: `role`, `name`, `sha256` and `size` of each file.
             rows: Blob rows by digest.
-            parameters: Parameters of the job.
             show: Callback that receives the progress of planning: `stage`, `step`, `total`, `fraction` and `eta_s`. One
                 step is one view.
             checked: Callback after the inputs have been read and found usable.

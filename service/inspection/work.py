@@ -17,15 +17,12 @@ class WorkRequest(BaseModel):
 
     Attributes:
         work: Kind of work, from `process.WORK`.
-        folder: Folder of the staged files.
         staged: Paths of the files, relative to the folder; the scene is the job's result for work on that.
-        parameters: Parameters of the job.
         seconds: Limit of CPU time in seconds.
         memory: Memory limit in bytes for reading.
         limits: Limits of the service for a job's inputs; empty for work on results.
         options: Values that only one kind of work needs.
         output: Name and maximum bytes of the only file that may be written; None for none.
-        threads: Number of threads for computations.
     """
 
     model_config = ConfigDict(frozen=True)

@@ -24,8 +24,6 @@ class ChildProcess:
     """Running `service.scheduling.attempt_process`; it is started by the constructor.
 
     Args:
-        folder: Folder of the attempt.
-        grant: Capacity of the attempt.
         cluster: Whether the attempt runs on a Ray cluster, which assigns GPUs itself.
     """
 

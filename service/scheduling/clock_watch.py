@@ -24,10 +24,6 @@ class ClockWatch:
     lost if it is not renewed for another lease duration by the monotonic clock, because a live holder would have
     renewed it several times. Nothing is deleted while another dispatcher sends heartbeats whose times disagree with
     this machine's clock.
-
-    Args:
-        lease_seconds: Duration of a lease.
-        monotonic: Monotonic clock.
     """
 
     def __init__(self, store: Store, lease_seconds: float, monotonic: Callable[[], float] = time.monotonic) -> None:

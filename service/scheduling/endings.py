@@ -88,7 +88,6 @@ class Report(BaseModel):
     """Report of an attempt's process to its dispatcher, a line of JSON; one of its fields is set.
 
     Attributes:
-        progress: Progress of the job.
         prepared: Whether the inputs have been read, so that the first step starts.
         left_out: GPUs that the plan does not use.
         stored: File that a rank has put into the file store.

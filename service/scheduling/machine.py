@@ -23,7 +23,6 @@ class Machine:
 
     Attributes:
         gpus: Names of GPUs for CUDA_VISIBLE_DEVICES; consecutive numbers on a cluster.
-        cores: Number of CPU cores.
         memory: Total memory in bytes.
         cluster: Whether jobs run on a Ray cluster, which assigns its GPUs itself.
     """

@@ -51,7 +51,6 @@ class Grant:
     Attributes:
         ranks: Maximum number of ranks; the plan may use fewer.
         gpus: Names of GPUs; empty without GPUs.
-        slots: Number of slots.
         threads: Number of CPU threads; None for all.
         memory: Memory to plan with in bytes; None for the default of a job that runs alone.
         scene: Size of the job's scene in memory, in bytes.
@@ -74,7 +73,6 @@ class Capacity:
     """Capacity of a machine.
 
     Args:
-        machine: Total hardware.
         parallel_jobs: Maximum number of concurrent jobs; None for one per GPU (one in total if there are no GPUs).
     """
 

@@ -109,7 +109,6 @@ class Publisher:
     """Publisher of one attempt's files, which makes them visible under its lease.
 
     Args:
-        folder: Folder of the attempt.
         log_seconds: Interval between copies of a growing log.
     """
 

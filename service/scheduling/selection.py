@@ -37,7 +37,6 @@ class Holding:
     """Capacity that a running job occupies, and its expected end.
 
     Attributes:
-        grant: Capacity that the job occupies.
         until: Expected end by the store's clock; None if unknown.
         pace: Actual duration divided by the estimated one; None if unknown.
     """
@@ -51,8 +50,6 @@ class JobSelector:
     """Selector of jobs for one dispatcher.
 
     Args:
-        dispatcher: Name of the dispatcher.
-        store: Store with the queue.
         capacity: Total capacity of the dispatcher's machine.
         clocks: Clock checks that decide whether an expired lease is lost.
     """

@@ -21,12 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StoredFile:
-    """File in the store.
-
-    Attributes:
-        name: Name of the object.
-        sha256, size: Digest and size of its content.
-    """
+    """File in the store."""
 
     name: str
     sha256: str
@@ -38,7 +33,6 @@ class StoreWorkplace:
     """Description of a job's files for its ranks.
 
     Attributes:
-        url: URL of the store.
         job_id, epoch: Prefix of the job's stored files.
         inputs: `role`, `name`, `sha256` and `size` of each input, for `stage`.
         files: Input files in the store.

@@ -31,7 +31,6 @@ class Delivery:
         id, job_id: Ids of the message and of its job.
         owner: Owner of the job; empty if the job is deleted.
         url: Receiver.
-        body: JSON to send.
         tries: Number of attempts, including this one.
     """
 

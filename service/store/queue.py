@@ -111,10 +111,6 @@ def next_jobs(session: Session, dispatcher: str, now: float, skipped: Sequence[s
     """Return the next jobs: by priority, then the dispatcher's reservation, then owners' turns, then age.
 
     At most one queued job per owner is among them. Their rows are locked; rows that others have locked are skipped.
-
-    Args:
-        skipped: Ids of jobs to skip.
-        most: Maximum number of jobs to return.
     """
     own = {"dispatcher": dispatcher, "now": now}
     ids = [job_id for job_id in session.scalars(_CANDIDATES, {**own, "skipped": list(skipped)}) if job_id is not None]

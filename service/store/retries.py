@@ -36,7 +36,6 @@ class FailureCount:
     """Count of consecutive failed attempts without progress.
 
     Attributes:
-        failures: Number of failures.
         failed_step: Last saved step at the time of the last failure; None for no step.
     """
 

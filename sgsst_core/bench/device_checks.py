@@ -40,7 +40,6 @@ class Check:
     """Result of a check.
 
     Attributes:
-        name: Compared quantity.
         error: Error, or the number of results that differ.
     """
 

@@ -25,7 +25,6 @@ def max_pool(source, out, width, across, windows, CHANNELS: tl.constexpr, MASK: 
         source: [height, width, CHANNELS], ReLU output.
         out: [height // 2, across, CHANNELS].
         across: Columns of the output, width // 2.
-        windows: Number of windows.
         CHANNELS, MASK, BLOCK: As in `max_pool_backward`.
     """
     entry = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)

@@ -23,7 +23,6 @@ class ColorProfile:
     """ICC profile of an image.
 
     Args:
-        data: Profile as stored in a file.
         mode: Mode of the image that it belongs to: "L", "RGB" or "CMYK".
 
     Attributes:

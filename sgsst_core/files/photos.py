@@ -256,7 +256,6 @@ def undistort(photo: Tensor, camera: Camera) -> Tensor:
 
     Args:
         photo: Original photo [H, W, 3] float32, of the lens's aspect ratio.
-        camera: Camera with a lens.
     """
     lens = camera.lens
     assert lens is not None

@@ -66,7 +66,6 @@ class SceneFile:
         header: PLY header, whose file `write_stylized` preserves; None for other formats and variants of PLY.
         retained: Mask [rows] bool of the file's rows that the scene contains; None if it contains all.
         stamp: Size in bytes and modification time in ns of the file when it was read.
-        format: Name of the file's format.
         clamped: Number of infinite opacities that were replaced by finite ones. The stylized PLY keeps them.
         notes: Notes on contents of the file that are not read, or not read as stored.
         tag: Render mode that the file states. `scene.rendering` is another one if it was requested.
@@ -109,7 +108,6 @@ class SceneFile:
         """Return the file with a stylized scene in place of its own.
 
         Args:
-            scene: Stylized scene.
             refinement: Refinement of the stylized scene; None if there was none.
             sh_attenuation: SH attenuation of the stylized scene, in addition to the file's own.
         """

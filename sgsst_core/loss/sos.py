@@ -75,9 +75,6 @@ class SosLoss:
         timer: Timer for `vgg_forward`, `vgg_backward`, `statistics`, `matching` and `communication`.
         collectives: Collectives of the ranks that evaluate each view together. All ranks must call the same methods
             with the same arguments.
-
-    Attributes:
-        targets: Builder of the targets of styles and views.
     """
 
     def __init__(

@@ -195,7 +195,6 @@ def style_loss(
 
     Args:
         feature_eps: Relative rounding error of the features (2^-23 for float32, 2^-52 for float64).
-        dtype: Dtype of the features.
 
     Returns:
         Contribution of the layer to each of `STATISTICS_TERMS`, [3] float64, and the gradient.

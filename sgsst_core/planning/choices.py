@@ -69,8 +69,6 @@ def draft_plan(facts: Facts, settings: Settings, *, measured: bool) -> Plan:
     """Choose everything that needs no trial. The plan lacks ranks, graphs, measurements, decisions and prediction.
 
     Args:
-        facts: Facts about the job.
-        settings: Settings of the job.
         measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
     """
     survey, requested = facts.survey, settings.position_weights
@@ -106,7 +104,6 @@ def compares_precisions(sizes: Sequence[Size], settings: Settings) -> bool:
 
     Args:
         sizes: (height, width) of each view.
-        settings: Settings of the job.
     """
     if settings.precision != "auto":
         return settings.precision != "float32"
@@ -171,9 +168,6 @@ def uses_graphs(plan: Plan, facts: Facts, settings: Settings, cost: Saving | Non
     """Choose whether the loss of a view is captured as a CUDA graph, one per image size and phase.
 
     Args:
-        plan: Plan of the job.
-        facts: Facts about the job.
-        settings: Settings of the job.
         cost: Cost of launching a view's loss; None if it was not measured.
     """
     if cost is None or cost.least_visits is None or _divides_views(facts, settings):
@@ -297,10 +291,6 @@ def decisions(
     """Yield the decisions of a plan, with their reasons.
 
     Args:
-        plan: Plan with all its choices.
-        facts: Facts about the job.
-        settings: Settings of the job.
-        pixels: Pixels through the network.
         parts: Seconds of a step per view by activity; "cached weights" are the seconds that these save.
         cost: Cost of launching a view's loss; None if it was not measured.
         seconds: Measured mean seconds of a step by number of ranks and groups.

@@ -131,7 +131,6 @@ class Hardware:
         device: Device of the feature network.
         memory_limit: Memory budget in bytes of all ranks on one machine together, or on one GPU.
         sharing: Maximum number of ranks that share one machine's memory, or that of a GPU.
-        ranks: Number of available ranks.
         problems: Reason by name for each GPU rasterizer that does not work; empty on the CPU.
     """
 
@@ -173,10 +172,7 @@ class Facts:
         used_degree: Highest SH degree with a non-zero coefficient after SH attenuation, among the rendered Gaussians.
         harmonics_energy: See `spherical_harmonics.harmonics_energy`, with the views' blend weights.
         sizes: (height, width) of each view.
-        survey: Survey of the views.
-        machine: Facts about the machine.
         rasterizer: Rasterizer that computes blend weights.
-        weights: Cost of cached blend weights.
         frozen: [N] bool, frozen Gaussians; None if there are none.
         deepest: Name of the deepest layer in use.
         precisions: Comparison of each precision that may be used; None if the job is too short to compare any.
@@ -237,9 +233,7 @@ def weight_cost(rasterizer: Rasterizer, cameras: Sequence[Camera], settings: Set
     """Count the blend weights of a few evenly spread views; on a GPU, also time a view with and without cached weights.
 
     Args:
-        rasterizer: Rasterizer that computes the weights.
         cameras: Cameras of the views that see anything.
-        settings: Settings of the job.
         budget: Memory budget for blend weights in bytes.
     """
     if not rasterizer.can_cache:
@@ -274,7 +268,6 @@ class Networks:
 
     Attributes:
         precisions: Comparison of each precision; None if there was none yet.
-        created: Networks by precision.
     """
 
     precisions: Mapping[PlannedPrecision, Comparison] | None = None
@@ -296,9 +289,6 @@ class PlanningContext:
     Attributes:
         scene: Whole scene, with the SH attenuation of the settings applied.
         cameras: Cameras at the size used for stylization.
-        settings: Settings of the job.
-        machine: Facts about the machine.
-        weights: Weights of the network.
         network: Network; in float32 if no precision was chosen yet.
         rasterizer: Rasterizer of the whole scene that computes blend weights.
         sh_degree: SH degree of the original scene.
@@ -330,9 +320,6 @@ def equip(
     Args:
         scene: Scene as it was read.
         cameras: Cameras at the size used for stylization.
-        settings: Settings of the job.
-        weights: Weights of the network.
-        collectives: Ranks of the job.
         rasterizer: Rasterizer that computes blend weights; None to choose one.
         networks: Networks of earlier plans of the same job; None if this is the first plan.
     """

@@ -106,10 +106,8 @@ def choose_loss_views(settings: Settings, steps: float, price: float, views: int
     """Choose the number of views on which the loss is evaluated before and after.
 
     Args:
-        settings: Settings of the job.
         steps: Time in seconds of all steps.
         price: Time in seconds to evaluate the loss of one view before and after.
-        views: Number of views of the job.
     """
     half = _PLANNED * allowed_seconds(settings, steps) / 2
     return min(next((count for count in LOSS_VIEWS if min(count, views) * price <= half), LOSS_VIEWS[-1]), views)

@@ -62,7 +62,6 @@ class Plan:
     """Final decisions for a job.
 
     Attributes:
-        survey: Survey of the views.
         optimized: [N] bool, Gaussians whose colors are determined by the views.
         seen: [N] bool, Gaussians that are rendered: those with a blend weight in a view.
         covered: Indices of the views that are stylized.
@@ -73,10 +72,8 @@ class Plan:
         memory_limit: Memory budget in bytes of all ranks on one machine together.
         spare: Bytes of the budget for activations that no step needs, and that data of the views may use.
         spare_intersections: Bytes of `spare` that tile intersections may use, because data of the views do not.
-        device: Device of the feature network.
         rasterizer: Rasterizer of the job; "cached" stores blend weights in the format `cached_weights`.
         uncached: Rasterizer that computes blend weights, and recomputes those that are not cached.
-        precision: Precision of the feature network.
         graphs: Whether the loss of a view is captured as a CUDA graph where possible (`LossGraphs`).
         cached_weights: Format of blend weights that are cached between iterations.
         measured: Whether the prediction includes measurements between steps and the report.

@@ -35,7 +35,6 @@ def progress_of(surveyed: int, total: int, ranks: int, seconds: float, stage: st
     Args:
         surveyed: Number of views that this rank has surveyed.
         total: Number of views that all ranks survey.
-        ranks: Number of ranks.
         seconds: Seconds since the stage started.
         stage: Stage in which the views are surveyed.
     """
@@ -77,10 +76,6 @@ def survey_views(
     """Survey every view once; all ranks get the same result.
 
     Args:
-        scene: Scene with N Gaussians.
-        cameras: Cameras of the views.
-        rasterizer: Rasterizer of the scene.
-        collectives: Ranks that share the work.
         show: Callback, called before the first view of this rank and after each view.
 
     Raises:

@@ -87,9 +87,7 @@ class Rasterizer(ABC):
         options: Other arguments of the subclass's constructor, which `for_scene` passes on.
 
     Attributes:
-        name: Name for `make_rasterizer`.
         title: Name in texts for users.
-        on_gpu: Whether it is meant for GPUs.
         can_cache: Whether `CachedRasterizer` can cache its blend weights, with `count_weights`.
         caches_exactly: Whether images from cached float32 weights are bit-identical to those from recomputed ones.
     """

@@ -34,9 +34,6 @@ class CpuRasterizer(TiledRasterizer[TileIntersections]):
     """Rasterizer in compiled float32 code.
 
     The order of summation is fixed, so results are bit-identical for any number of threads.
-
-    Args:
-        scene, options: As in `TiledRasterizer`.
     """
 
     name = "cpu"

@@ -123,7 +123,6 @@ class StoredHarmonics:
     """Coefficients [N, K, 3] float32 of degree 1 to 3 in a file, as a replacement for a tensor of that shape.
 
     Args:
-        layout: Layout of the file.
         chosen: [N] int32, ascending row numbers of the scene's Gaussians, possibly with repetitions; None for all rows.
         coefficients: K, number of leading coefficients to use; None for all.
         file: The file if it is already open; None to open it.

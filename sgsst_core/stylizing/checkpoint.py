@@ -208,8 +208,6 @@ def save_plan(path: Path, plan: Plan, job: str, conditions: str) -> None:
     """Write a plan into an existing file, for a run of the same job that finds the same conditions.
 
     Args:
-        path: File to write.
-        plan: Plan of the job.
         job: Fingerprint of the job.
         conditions: Text about everything else that the plan depends on, such as the machine.
     """
@@ -221,10 +219,8 @@ def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> 
     """Return a plan from `save_plan` and its conditions. What it says about scene and views is checked.
 
     Args:
-        path: File to read.
         job: Fingerprint of the job.
         scene: Scene of the job, before its refinement.
-        cameras: Cameras of the job.
 
     Raises:
         CheckpointError: If there is no such file, or it is corrupt or of another job.

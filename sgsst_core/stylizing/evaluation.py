@@ -67,7 +67,6 @@ def completed(evaluation: Evaluation, scales: Sequence[int], view: int, history:
     Args:
         evaluation: Loss of the evaluated scales.
         scales: Scales of the view with a positive weight.
-        view: Index of the view.
         history: Records of the earlier steps.
     """
     result, coarsest = dict(evaluation), max(evaluation)
@@ -105,11 +104,7 @@ def round_evaluation(history: Sequence[StepRecord], round_length: int, weights: 
 
 
 class RunningRound:
-    """Losses of the last round of views, step by step.
-
-    Args:
-        round_length: Number of steps of a round.
-    """
+    """Losses of the last round of views, step by step."""
 
     def __init__(self, round_length: int, weights: ScaleWeights, history: Sequence[StepRecord] = ()) -> None:
         self._weights = weights

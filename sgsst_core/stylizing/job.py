@@ -223,7 +223,6 @@ def prepare_job(
         cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
         photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
             for unstylized renders.
-        collectives: Ranks that stylize the scene together.
         planning_context: Planning context of the plan; None to create its objects again.
         regions: Regions for which the plan was made, each with its own style or frozen; None for one style everywhere.
 

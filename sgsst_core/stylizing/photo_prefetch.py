@@ -25,7 +25,6 @@ class PhotosAhead:
 
     Args:
         load: Function that reads a photo; also called in the thread.
-        device: CUDA device.
     """
 
     def __init__(self, load: PhotoLoader, device: torch.device) -> None:

@@ -52,8 +52,6 @@ def with_spare_memory(plan: Plan, facts: Facts, activations: int) -> Plan:
     """Add to a plan the memory for activations that the steps of a single rank on a GPU do not need.
 
     Args:
-        plan: Plan of the job.
-        facts: Facts about the job.
         activations: Bytes of the activations of a view.
     """
     if plan.device == "cpu" or facts.machine.ranks > 1:
@@ -77,9 +75,6 @@ def completed_plan(
 
     Args:
         plan: Plan from `draft_plan`.
-        facts: Facts about the job.
-        settings: Settings of the job.
-        pixels: Pixels through the network.
         trials: Trials by number of ranks and groups.
         cost: Cost of launching a view's loss; None if it was not measured.
     """

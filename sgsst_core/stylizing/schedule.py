@@ -92,7 +92,6 @@ def drawn_scales(chosen: Sequence[int], period: int, seed: int, view: int, visit
     Args:
         chosen: Scales of the view with a positive weight, finest first.
         period: Number of visits; 1 for all scales in every visit.
-        seed: Seed of the job.
         visit: Number of earlier visits of the view.
     """
     count = 1

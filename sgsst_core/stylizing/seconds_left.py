@@ -20,7 +20,6 @@ class Pace:
     """Predicted values and latest steps of a phase.
 
     Attributes:
-        steps: Number of steps of the phase.
         expected: Predicted seconds of a step whose views have all been visited before.
         expected_first: Predicted additional seconds of each view's first visit.
         visited: Views that the phase has visited in this session; caches are empty after a resume.
@@ -53,7 +52,6 @@ class SecondsLeft:
     Args:
         phases: Phases of the schedule by name, in their order.
         views: Views in use, each of which is visited once per round.
-        views_per_step: Number of views per step.
     """
 
     def __init__(self, phases: dict[str, Pace], views: Collection[int], views_per_step: int = 1) -> None:

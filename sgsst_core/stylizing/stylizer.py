@@ -71,7 +71,6 @@ class _QueuedStep:
         results: Results of this group's views, without gradients.
         values: Largest magnitude in the gradient, then the values of the results; in host memory, valid after `copied`.
         copied: Event after the copy of `values`; None if there is nothing to wait for.
-        timer: Timer of this step.
         sent: Bytes that had been sent before the step.
     """
 
@@ -363,12 +362,7 @@ class Stylizer:
         return gradient, results, cost
 
     def _copied(self, largest: Tensor, results: Sequence[SosResult]) -> tuple[Tensor, torch.cuda.Event | None]:
-        """Queue the copy of a step's numbers to the host. Return them in a tensor, and the event after the copy.
-
-        Args:
-            largest: Largest magnitude in the gradient.
-            results: Results of this group's views.
-        """
+        """Queue the copy of a step's numbers to the host. Return them in a tensor, and the event after the copy."""
         # The rasterizer, and with it the colors, may be on the CPU while the network is on a GPU.
         device = self.job.network.device
         first = largest.double()[None].to(device)
@@ -428,7 +422,6 @@ class Stylizer:
         """Return the scales of a view that a step evaluates, finest first; with their weights if they are drawn.
 
         Args:
-            index: Index of the view.
             step: Number of steps before this one.
             first: First view of the step, whose draw applies to all of them, so that no group of ranks waits.
         """

@@ -112,8 +112,6 @@ class ViewTargets:
         Features are computed only for requested scales: phase 1 needs those of one.
 
         Args:
-            index: Index of the view.
-            scales: Requested scales.
             background: Background color, which the content gets too; None for the rasterizer's own. Features with a
                 background color are used only once, so only the images they are computed from are cached.
         """

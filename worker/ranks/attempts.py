@@ -51,7 +51,6 @@ def stylize_on_ranks(
     """Run one job on up to `workers` ranks, in as many attempts as necessary.
 
     Args:
-        request: Job to run.
         workers: Maximum number of ranks.
         listener: Callbacks for the events of the job; None ignores all events.
         options: Options of running and watching ranks; None for the defaults.
@@ -223,7 +222,6 @@ class Relay:
     """Relay that passes each event of rank 0 to a listener once, and tracks the progress of the job.
 
     Args:
-        listener: Callbacks of the job.
         resumed: Callback after the first step of an attempt, before the listener is notified.
 
     Attributes:

@@ -39,7 +39,6 @@ class FailedAttempt:
     """Outcome of a failed attempt, for `check_retry`.
 
     Attributes:
-        failure: Cause of the failure.
         last_step: Last completed step, or the step that the attempt started from.
         progressed: Whether the attempt completed a step or saved a checkpoint that no earlier attempt had reached.
     """
@@ -50,12 +49,7 @@ class FailedAttempt:
 
 
 def failure_of(error: Exception, rank: str) -> Failure:
-    """Classify an error that a rank raised.
-
-    Args:
-        error: Error of the rank.
-        rank: Name of the rank, for the reason.
-    """
+    """Classify an error that a rank raised."""
     if isinstance(error, SgsstError) and not isinstance(error, RanksDriftedError):
         return Failure("job", str(error), error)
     return Failure("loss", f"{rank} failed: {first_line(error)}", error)

@@ -175,7 +175,6 @@ class ProcessGroupCollectives(Collectives):
 
     Args:
         group: Group of torch.distributed.
-        device: Device of the tensors.
         timeout: Timeout of each exchange; see `process_group`.
         gpu_sharing: Largest number of ranks of the job on one GPU; 1 without GPUs.
         sent: Counters of sent bytes to continue; None for new ones.

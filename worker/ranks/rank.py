@@ -71,10 +71,6 @@ class Workplace(Protocol):
     def open(self, rank: int, stored: Stored) -> OpenWorkplace:
         """Create the folder with the job's files. On rank 0, also start to store new output files.
 
-        Args:
-            rank: Rank that opens the folder.
-            stored: Callback for each stored file.
-
         Raises:
             InfrastructureError: If the files cannot be fetched, or the disk is full.
         """
@@ -120,8 +116,6 @@ class RankPlace:
     Attributes:
         node: Ray node ID.
         address: Address under which other nodes reach the node.
-        host: Host name of the machine.
-        process: Identifier of the process, to end it.
         gpus: Assigned GPUs, as CUDA_VISIBLE_DEVICES names them.
     """
 
@@ -137,14 +131,9 @@ class RankTask:
     """Task of a rank.
 
     Attributes:
-        request: Job to run.
         rank, size: Number of this rank, and number of ranks.
         address: Address "host:port" at which rank 0 listens.
-        threads: Number of threads for computation.
-        options: Options of the job's ranks.
         folder: Base folder of relative paths on every machine; unused with a workplace.
-        resume: Choice of the checkpoint to resume from.
-        run_id: Identifier of this run of the program.
         workers: Requested ranks and lost attempts, for the report.
         seconds_lost, seconds_since_loss: Costs of the last lost attempt until this task was created; see
             `attempts.LostAttempt`.
@@ -170,8 +159,6 @@ class Outcome:
 
     Attributes:
         kind: "done", "left-out" (the plan does not use this rank) or "failed".
-        result: Result of the job if the rank is done.
-        error: Error if the rank failed.
         trace: Text of the error's traceback.
         echo: Whether the error occurred in an exchange between ranks. The root cause may then be the loss of another
             rank.
@@ -192,9 +179,7 @@ class RankStatus:
         prepared: Summary of the prepared job; set on rank 0 only.
         progress: Latest progress; None before the first stage. Steps are reported on rank 0 only.
         saved: Step of the last checkpoint. With a workplace, a checkpoint counts once it is stored.
-        warnings: All warnings so far.
         stored: Descriptions of all files that a workplace has stored so far.
-        outcome: Outcome; None while the rank runs.
     """
 
     prepared: Prepared | None = None

@@ -95,7 +95,6 @@ def start_ranks(group: RankGroup, workers: int, scene: int, actor: type[RankProc
         workers: Maximum number of ranks.
         scene: Bytes of the job's scene, for the host memory to reserve on machines with GPUs.
         actor: Class of the Ray actor that runs a rank.
-        make_task: Function that creates the task of a rank.
 
     Raises:
         AttemptFailedError: If there are no free resources.
@@ -210,7 +209,6 @@ def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> 
     """Raise an error with the root cause if a rank has failed or was lost.
 
     Args:
-        group: Ranks of the attempt.
         cluster: Ray cluster that runs them.
         rank_timeout: Seconds without a response after which a rank counts as lost.
 

@@ -66,12 +66,9 @@ def read_shared_scene(
     """Read a scene once on each machine. Every rank must call this function.
 
     Args:
-        path: Scene file.
-        collectives: Collectives of all ranks.
         drop_invalid: Whether to drop invalid Gaussians; see `read_scene`.
         growth: Factor by which refinement may increase the number of Gaussians. It scales the memory requirement, and
             lowers the size up to which spherical harmonics are loaded into memory.
-        spz_axes: Axes of an SPZ file; see `read_scene`.
 
     Returns:
         The scene, and whether this rank read the file itself. Exactly one rank of each machine does.
@@ -160,9 +157,6 @@ def _check_memory(path: Path, collectives: Collectives, sharing: int, growth: fl
     """Check that a scene, by the size in its header, fits into the free memory of each rank's machine and GPU.
 
     Args:
-        path: Scene file.
-        collectives: Collectives of all ranks.
-        sharing: Number of ranks on this machine.
         growth: Factor of growth; see `read_shared_scene`.
     """
     problem: SgsstError | None = None

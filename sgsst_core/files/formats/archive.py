@@ -34,7 +34,6 @@ class FilesOfScene:
 
     Attributes:
         path, folder: As above.
-        is_archived: Whether the files are in an archive.
         surplus: Note on bytes before or after the archive.
     """
 
@@ -105,7 +104,6 @@ class ArchiveEnd(NamedTuple):
     """Statement at the end of an archive.
 
     Attributes:
-        entries: Number of files.
         list_start, list_bytes: Position of their list, and its size.
         surplus: Note on bytes before or after the archive.
     """

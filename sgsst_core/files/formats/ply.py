@@ -46,7 +46,6 @@ class PlySceneHeader(SceneHeader):
     """Header of a PLY.
 
     Attributes:
-        ply: Parsed header.
         stored_coefficients: SH coefficients per color channel above degree 0 in the file.
         sources: Properties of a variant by the name of the usual property that they replace; empty if there are none.
     """

@@ -63,7 +63,6 @@ class PlyElement:
     """Element of a PLY.
 
     Attributes:
-        count: Number of rows.
         count_span: Start and end of the count in the bytes of the header.
         byte_order: Byte order of its numbers; "" in text files.
         kinds: NumPy type codes such as f4, by property; those of the items of a list.

@@ -83,10 +83,8 @@ class SceneHeader:
     """Checked header of a scene file. Formats subclass it to add fields for their readers.
 
     Attributes:
-        count: Number of Gaussians.
         coefficients: SH coefficients per color channel above degree 0.
         notes: Notes on contents that are not read, or not read as stored.
-        tag: Render mode that the file states.
     """
 
     format: SceneFormat
@@ -115,7 +113,6 @@ class SceneFormat:
             for non-finite values. None for PLY, which `scene_file` reads, because its other data is written back.
         write: Writer of a scene's arrays and its render mode, if the format can state one. It raises an OutputError
             without path if it cannot represent the arrays. None if the format is only read.
-        media_type: Media type of downloads.
     """
 
     name: str

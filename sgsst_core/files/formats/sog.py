@@ -117,7 +117,6 @@ class SogFiles(FilesOfScene):
         """Return width and height of a WebP image, from its first bytes alone.
 
         Args:
-            name: Name of the image.
             least: Minimum number of pixels.
             most: Maximum number of pixels; None for the largest image that a writer would create for `least` Gaussians.
         """

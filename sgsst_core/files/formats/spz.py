@@ -126,7 +126,6 @@ class SpzHeader(SceneHeader):
         zipped: Whether the stream of version 1 to 3 is compressed by gzip.
         extended: Whether there are extension records; they follow the Gaussians of version 1 to 3.
         stated_axes: Axes that a file of version 4 states; None if it does not, and for other versions.
-        axes: Requested axes.
     """
 
     size: int

@@ -80,7 +80,6 @@ class _Opened:
     """Open streamed SOG.
 
     Attributes:
-        index: Content of the index.
         surplus: Note on bytes around an archive.
     """
 
@@ -259,7 +258,6 @@ def write_recolored(
 
     Args:
         original: Streamed SOG: its index or an archive.
-        header: Its header.
         means, colors: Positions and SH coefficients of degree 0 of the scene, [n, 3].
         archive: Open archive that gets the files; the index comes last.
 
