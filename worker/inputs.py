@@ -320,18 +320,17 @@ def read_job_capture(request: JobSpec, file: SceneFile) -> Capture:
     return read_capture(source, file.scene, request.images, remaining)
 
 
-def read_scene_and_capture(source: SceneRequest, images: Path | None = None) -> tuple[SceneFile, Capture]:
-    """Read a scene, its requested cameras and their photos, and check that they belong together.
+def read_scene_and_capture(source: SceneRequest) -> tuple[SceneFile, Capture]:
+    """Read a scene and its requested cameras, and check that they belong together.
 
     Raises:
         SceneError: If the scene cannot be used.
         CameraError: If the cameras cannot be used.
-        ImageError: If the photos cannot be used.
     """
-    axes, about_axes = choose_axes(source, images)
+    axes, about_axes = choose_axes(source)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = file.rendered(source.render_mode, source.eps2d)
-    capture = read_capture(source, file.scene, images).with_photos(images).checked(file.scene, source.near)
+    capture = read_capture(source, file.scene).checked(file.scene, source.near)
     decisions = (*about_notes(file), *about_axes, *about_rendering(file), *capture.decisions)
     return file, replace(capture, decisions=decisions)
 

@@ -129,11 +129,7 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
 def run_quality(request: VariantsRequest, progress: Any) -> Quality:
     """Run the variants, measure their quality, and write `quality.json`, plots, `quality.jpg` and scenes.
 
-    Args:
-        progress: Callback that receives a curve after each of its evaluations.
-
-    Raises:
-        InvalidInputError: If an input cannot be used; the first one is reported.
+    Arguments and errors are those of `run_error_time`.
     """
     inputs = _Inputs.of(request)
     quality = inputs.run(compare_quality, request, progress)

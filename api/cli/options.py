@@ -47,15 +47,14 @@ def with_options(
     return _expanding(argument, parameters, build)
 
 
-def with_arguments(group: type, argument: str = "inputs") -> Callable[[Command], Command]:
-    """Return a decorator that replaces one argument of a command by the fields of a dataclass.
+def with_arguments(group: type) -> Callable[[Command], Command]:
+    """Return a decorator that replaces the argument `inputs` of a command by the fields of a dataclass.
 
     Args:
         group: Dataclass whose fields are annotated with `typer.Argument` or `typer.Option`.
-        argument: Name of the function's argument that receives the instance.
     """
     parameters = inspect.signature(group, eval_str=True).parameters
-    return _expanding(argument, parameters, lambda given: group(**given))
+    return _expanding("inputs", parameters, lambda given: group(**given))
 
 
 def _expanding(

@@ -33,9 +33,6 @@ from worker.outputs import check_is_not_input
 from worker.prepare import dry_run
 from worker.styles import split_weight
 
-#: Number of views of an orbit that a converted scene is compared in.
-_COMPARED_VIEWS = 3
-
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ import re
 import urllib.request
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import anyio.to_thread
 import httpx2
@@ -38,7 +38,6 @@ BLOCK = 1 << 20
 #: SHA-256 in an ETag. A proxy may have made the tag weak, or appended to it.
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
-P = ParamSpec("P")
 T = TypeVar("T")
 
 

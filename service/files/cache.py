@@ -21,7 +21,6 @@ from pathlib import Path
 from service import problems
 from sgsst_core.files.atomic import file_digest
 
-_CHUNK = 1 << 20
 #: Number of fetches with a wrong digest after which the file counts as damaged in the store.
 _TRIES = 2
 #: Age in seconds at which partially fetched files are removed; no fetch takes that long, so their processes have died.

@@ -25,7 +25,7 @@ from sgsst_core.quality.lpips import MIN_SIDE, load_lpips_or_none
 from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.quality.novel_views import NovelViewMoment
 from sgsst_core.report.charts import png_chart
-from sgsst_core.report.contact_sheet import write_rows
+from sgsst_core.report.contact_sheet import write_grid
 from sgsst_core.report.palette import INK, color_of
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -122,11 +122,7 @@ def compare_quality(
 ) -> Quality:
     """Run variants on one scene, each with the same time budget, and judge the results.
 
-    Args:
-        style: Style image [H, W, 3] in 0 to 1.
-        seconds: Seconds of optimization per variant.
-        progress: Function called after each evaluation of the loss, with the curve so far.
-        settings: Settings for all variants that override the standard preset.
+    The arguments are those of `error_time`.
 
     Raises:
         WeightsError: If AlexNet is not installed.
@@ -193,9 +189,9 @@ def write_sheet(path: Path, quality: Quality) -> None:
         OutputError: If the file cannot be written.
     """
     cameras = quality.judge.cameras[:_SHOWN]
-    rows = []
+    rows = [[("style", quality.style)]]
     for outcome in quality.outcomes:
-        images = [quality.judge.renders(outcome.sh_dc, camera) for camera in cameras]
-        rows.append((outcome.name, [*(pair[0] for pair in images), images[0][1]]))
+        (first, on_white), *others = [quality.judge.renders(outcome.sh_dc, camera) for camera in cameras]
+        rows.append([(outcome.name, first), *(("", pair[0]) for pair in others), ("", on_white)])
     with torch.no_grad():
-        write_rows(path, quality.style, rows)
+        write_grid(path, rows)

@@ -19,9 +19,9 @@ _OVERLAP = 1.0
 _CHANNELS = (64, 128, 256, 512, 512)
 
 
-def surface_scene(count: int, degree: int = 0, seed: int = 0) -> Scene:
+def surface_scene(count: int, degree: int = 0) -> Scene:
     """Return Gaussians on a ball of radius 1, sized to cover it, with opacities like those of scans."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator)

@@ -82,10 +82,7 @@ def hidden_text(shown: Shown, gaussians: int, near: float) -> str:
 def nothing_seen(means: Tensor, cameras: Sequence[Camera], near: float) -> CameraError:
     """Return the error for cameras that see no Gaussian, which names the near plane if that is the cause.
 
-    Args:
-        means: Centers of the Gaussians, [N, 3].
-        cameras: At least one camera.
-        near: Distance of the near plane in world units.
+    The arguments are those of `shown_by`.
     """
     shown = shown_by(means, cameras, near)
     none = f"None of the {len(cameras)} cameras sees a Gaussian"

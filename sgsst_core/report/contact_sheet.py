@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import accumulate
+from itertools import accumulate, zip_longest
 from pathlib import Path
 
 import torch
@@ -109,30 +109,13 @@ def write_grid(path: Path, rows: Sequence[Sequence[tuple[str, Tensor] | None]]) 
         OutputError: If the file cannot be written.
     """
     grid = [[cell and (cell[0], _fitted(_to_image(cell[1]))) for cell in row] for row in rows]
-    widths = [max((cell[1].width for cell in column if cell), default=0) for column in zip(*grid, strict=True)]
+    widths = [max((cell[1].width for cell in column if cell), default=0) for column in zip_longest(*grid)]
     lefts = [_GAP, *(_GAP + end for end in accumulate(width + _GAP for width in widths))]
     cells: list[_Cell] = []
     top = _LINE
     for row in grid:
         cells += [(left, top, cell[1], cell[0]) for left, cell in zip(lefts, row, strict=False) if cell]
         top += max((cell[1].height for cell in row if cell), default=0) + _LINE
-    _save(path, cells)
-
-
-def write_rows(path: Path, style: Tensor, rows: Sequence[tuple[str, Sequence[Tensor]]]) -> None:
-    """Write a JPEG with the style image and rows of images [H, W, 3] below it, each row with its name above.
-
-    Raises:
-        OutputError: If the file cannot be written.
-    """
-    cells: list[_Cell] = []
-    top = _LINE
-    for name, renders in [("style", [style]), *rows]:
-        images, left = [_fitted(_to_image(render)) for render in renders], _GAP
-        for index, image in enumerate(images):
-            cells.append((left, top, image, "" if index else name))
-            left += image.width + _GAP
-        top += max(image.height for image in images) + _LINE
     _save(path, cells)
 
 

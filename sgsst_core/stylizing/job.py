@@ -37,7 +37,7 @@ from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job_styles import JobStyles
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.schedule import Phase, planned_phases
+from sgsst_core.stylizing.schedule import Phase
 from sgsst_core.stylizing.team import Team
 from sgsst_core.stylizing.view_targets import ViewTargets
 from sgsst_core.stylizing.views import Views
@@ -132,8 +132,8 @@ class StylizationJob:
 
     @property
     def schedule(self) -> list[Phase]:
-        """Phases of the job."""
-        return planned_phases(self.plan, self.settings)
+        """The two phases of every preset."""
+        return [Phase("coarse", self.plan.steps_coarse, 0), Phase("sos", self.settings.steps_sos)]
 
     @property
     def total_steps(self) -> int:

@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.plan import Plan
-from sgsst_core.settings import Settings
 
 #: Parts of a job's time before its first step, as named in `seconds_by_part`: start of the program, inputs, refinement,
 #: survey, the rest of planning, and preparation of the steps.
@@ -36,11 +34,6 @@ class Phase:
     def scales(self, chosen: Sequence[int]) -> list[int]:
         """Return the scales to optimize, given a view's scales with a positive weight (`chosen`), finest first."""
         return list(chosen) if self.scale is None else [chosen[max(len(chosen) - 1 - self.scale, 0)]]
-
-
-def planned_phases(plan: Plan, settings: Settings) -> list[Phase]:
-    """Return the two phases of every preset."""
-    return [Phase("coarse", plan.steps_coarse, 0), Phase("sos", settings.steps_sos)]
 
 
 def phase_at(schedule: Sequence[Phase], step: int) -> Phase:

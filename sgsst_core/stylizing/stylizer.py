@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import psutil
 import torch
@@ -58,8 +58,6 @@ from sgsst_core.stylizing.schedule import (
 )
 from sgsst_core.stylizing.training_background import drawn_color
 from sgsst_core.timing import Timer
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
