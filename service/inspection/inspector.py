@@ -104,8 +104,9 @@ class InspectionProcess:
 
     async def warm(self) -> None:
         """Start the process in advance, so that the first request does not wait for it."""
-        async with self._lock:
-            await self._started()
+        if not self._lock.locked():
+            async with self._lock:
+                await self._started()
 
     async def _started(self) -> asyncio.subprocess.Process:
         if self._process is None or self._process.returncode is not None:
@@ -182,6 +183,10 @@ class Inspector:
         for leftover in self._folder.iterdir():  # left behind by a killed process
             if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
                 shutil.rmtree(leftover, ignore_errors=True)
+
+    async def warm(self) -> None:
+        """Start the process that checks the next job in advance: its imports take seconds."""
+        await self._validating.slots[0].warm()
 
     @property
     def is_planning(self) -> bool:

@@ -63,6 +63,8 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     cookie = request.cookies.get(SESSION_COOKIE)
     key = await asyncio.to_thread(context.store.sessions.find, cookie) if cookie else None
     within = await asyncio.to_thread(lambda: context.usual_budget)
+    if key is not None or not context.settings.keys_required:
+        await context.inspector.warm()  # whoever opens the page may create a job soon
     return SessionView(keys_needed=context.settings.keys_required, signed_in=key is not None, within=within)
 
 

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
+import psutil
 import pytest
 from PIL import Image
 
@@ -65,6 +66,23 @@ def inspecting(folder: Path, **limits: Any) -> Iterator[Inspect]:
         finally:
             runner.run(inspector.close())
             store.close()
+
+
+def test_process_is_started_once_in_advance(tmp_path: Path) -> None:
+    settings = ServiceSettings(data=tmp_path)
+    store = open_store(settings)
+    inspector = Inspector(settings, store, BlobFolder(tmp_path, store.inputs, 0), FileThreads(PATIENCE))
+
+    async def started() -> int:
+        before = psutil.Process().children()
+        try:
+            await asyncio.gather(inspector.warm(), inspector.warm())
+            return len(set(psutil.Process().children()) - set(before))
+        finally:
+            await inspector.close()
+
+    assert asyncio.run(started()) == 1
+    store.close()
 
 
 def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, Any]:
