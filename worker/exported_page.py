@@ -29,7 +29,7 @@ from sgsst_core.files.blending import check_same_shape, common_rests
 from sgsst_core.files.formats.sog import META_NAME, SOG
 from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import SceneFile, encode_scene
-from sgsst_core.orbit.subject import find_subject, find_up
+from sgsst_core.orbit.choice import find_upright_subject
 from sgsst_core.scene.gaussians import Scene
 
 #: Largest relative difference of spherical harmonics that are those of the original times a factor.
@@ -44,6 +44,7 @@ def write_page(
     title: str,
     *,
     background: Color = (0.0, 0.0, 0.0),
+    up: tuple[float, float, float] | None = None,
     in_place: bool = False,
 ) -> None:
     """Write a scene as an HTML file, atomically.
@@ -54,6 +55,7 @@ def write_page(
         stylized: Scene to show.
         original: Scene of the same Gaussians to show beside it, with a wipe and a blend; None for none.
         background: Color behind the scene, in 0..1.
+        up: Up direction; None to estimate it.
         in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
 
     Raises:
@@ -65,9 +67,9 @@ def write_page(
     data = {name: gzip.compress(viewer[name].encode(), mtime=0) for name in ("page", "worker")}
     data["scene"] = _sog(shown.scene, out)
     data["colors"] = b"" if original is None else gzip.compress(_indexed_colors(stylized.scene, out), mtime=0)
-    up = find_up(find_subject(shown.scene)).direction.tolist()
+    upright = find_upright_subject(shown.scene, up)[1].direction.tolist()
     sizes = {name: len(content) for name, content in data.items()}
-    facts = {"title": title, "up": up, "fade": fade, "background": background, "bytes": sizes}
+    facts = {"title": title, "up": upright, "fade": fade, "background": background, "bytes": sizes}
     about = json.dumps(facts).replace("<", "\\u003c")
     values = {"title": html.escape(title), "style": viewer["style"], "about": about}
     values |= {name: _base85(content) for name, content in data.items()}

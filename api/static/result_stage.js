@@ -71,7 +71,7 @@ export class ResultStage {
     viewer.background = first.parameters.background ?? [0, 0, 0];
     viewer.camera.near = first.parameters.near ?? 0.2;
     this.stage.message(words.page.loading);
-    this.stage.up = UPS[first.parameters.up] ?? this.stage.up;
+    this.stage.up = directionOf(first.parameters.up) ?? this.stage.up;
     await Promise.all([this.loadCameras(), first.status === "succeeded" && this.standUp()]);
     await this.openOriginal(first);
     for (const job of this.jobs) await this.openRun(job).catch((error) => this.tell(error));

@@ -54,7 +54,7 @@ from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import versions
-from worker.capture import choose_axes
+from worker.capture import choose_axes, orbit_request
 from worker.derive import blend, convert
 from worker.exported_page import write_page
 from worker.inputs import Inputs, errors_of, read_inputs
@@ -228,8 +228,10 @@ def _page(request: WorkRequest, _send: _Send) -> dict[str, Any]:
     original = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     both = read_scene(Path(options["result"])), original
     stylized, before = (file.rendered(source.render_mode, source.eps2d) for file in both)
-    background = request.parameters.settings().background
-    write = partial(write_page, request.output_file, options["viewer"], stylized, background=background, in_place=True)
+    background, up = request.parameters.settings().background, orbit_request(source).up
+    write = partial(
+        write_page, request.output_file, options["viewer"], stylized, background=background, up=up, in_place=True
+    )
     try:
         write(before, options["title"])
     except SceneError:  # Gaussians were split, for example

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import html
+import json
 from dataclasses import replace
 from typing import Annotated
 
@@ -147,10 +149,22 @@ def _shared_view(context: Context, shared: Shared) -> SharedView:
     return SharedView(
         name=job.row.name,
         expires_at=shared.share.expires_at,
-        parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters},
+        parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters}
+        | _up_direction(context, job_id),
         cameras=[entry["name"] for entry in job.inputs if entry["role"] == "cameras"],
         files=files,
     )
+
+
+def _up_direction(context: Context, job_id: str) -> dict[str, str]:
+    """Return the parameter `up` as the plan of an orbit has requested or found it; nothing without such a plan."""
+    row = context.store.jobs.artifact(job_id, "plan.json")
+    if row is None:
+        return {}
+    with contextlib.suppress(FileNotFoundError):
+        plan = json.loads(b"".join(context.artifacts.objects.read(row.location, 0, row.size)))
+        return next(({"up": each["decision"]} for each in plan["decisions"] if each["item"] == "up"), {})
+    return {}
 
 
 @router.get("/shared/{token}", include_in_schema=False)

@@ -130,7 +130,10 @@ def test_result_stands_as_the_service_has_found(
     done(service, job["id"])
     watched.page.get_by_label("Wipe", exact=True).wait_for()
     assert stands(watched) == (True, True)
-    assert stands(visit(f"/#/jobs/{job['id']}", width=1200, height=800)) == (True, True)
+    with service.client() as client:
+        shared = client.post(f"/v1/jobs/{job['id']}/shares", json={"days": 1}).json()["url"]
+    for place in (f"/#/jobs/{job['id']}", shared.removeprefix(service.url)):
+        assert stands(visit(place, width=1200, height=800)) == (True, True)
     watched.check()
 
 

@@ -159,7 +159,7 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
         work="page",
         folder=tmp_path,
         staged=Staged(scene=Path("scene.ply"), styles=(), cameras=None, photos=None),
-        parameters=JobParameters.model_validate({"background": [1.0, 1.0, 1.0]}),
+        parameters=JobParameters.model_validate({"background": [1.0, 1.0, 1.0], "orbit": 3, "up": "x"}),
         seconds=0,
         memory=0,
         options={"result": RESULT, "viewer": exported_viewer(), "title": "wall"},
@@ -168,6 +168,7 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
     WORK["page"][0](request, lambda response: None)
     text = Path("page.html").read_text(encoding="utf-8")
     assert ('id="colors"></script>' not in text) == holds_both
+    assert '"up": [1.0, 0.0, 0.0]' in text
     assert '"background": [1.0, 1.0, 1.0]' in text
 
 
