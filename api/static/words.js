@@ -181,7 +181,7 @@ export const words = {
   },
   job: {
     stages: /** @type {Record<string, string>} */ ({
-      reading: "Reading the files", planning: "Analyzing views", refining: "Choosing Gaussians to split", probing: "Measuring the speed", starting: "Starting workers", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality", video: "Rendering the video",
+      reading: "Reading the files", planning: "Analyzing views", refining: "Choosing Gaussians to split", probing: "Measuring the speed", starting: "Starting to paint", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality", video: "Rendering the video",
     }),
     unnamed: "Unnamed job", rename: "Rename", newName: "New name", save: "Save", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`, frame: (/** @type {number} */ n, /** @type {number} */ all) => `frame ${count(n)} of ${count(all)}`,
     starts: (/** @type {number} */ s) => (s < 10 ? "starts soon" : `starts in about ${seconds(s)}`),
