@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.machine import add_pair
+from sgsst_core.bench.quality import judged_row
 from sgsst_core.quality.judge import Judge
-from sgsst_core.report.contact_sheet import write_rows
+from sgsst_core.report.contact_sheet import write_grid
 
-#: Number of views in each row of the contact sheet.
-SHOWN = 3
 #: Name of the row of the scene's own colors.
 UNSTYLIZED = "unstylized"
 
@@ -67,13 +66,10 @@ def compare_rows(
 
 
 def write_sheet(folder: Path, name: str, judge: Judge, style: Tensor, colors: dict[str, Tensor]) -> None:
-    """Write each row's colors, and a contact sheet: views on black, then the first view on white."""
+    """Write each row's colors, and a contact sheet; see `judged_row`."""
     folder.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for row, sh_dc in colors.items():
-        renders = [judge.renders(sh_dc, camera) for camera in judge.cameras[:SHOWN]]
-        rows.append((row, [*(pair[0] for pair in renders), renders[0][1]]))
-    write_rows(folder / f"{name}.jpg", style, rows)
+    rows = [judged_row(judge, row, sh_dc) for row, sh_dc in colors.items()]
+    write_grid(folder / f"{name}.jpg", [[("style", style)], *rows])
     torch.save(colors, folder / f"{name}.pt")
 
 

@@ -183,15 +183,17 @@ def write_plot(path: Path, quality: Quality, title: str) -> None:
 
 
 def write_sheet(path: Path, quality: Quality) -> None:
-    """Write a JPEG with the style and a row per outcome: some views on black, and the first one on white.
+    """Write a JPEG with the style and a row per outcome; see `judged_row`.
 
     Raises:
         OutputError: If the file cannot be written.
     """
-    cameras = quality.judge.cameras[:_SHOWN]
-    rows = [[("style", quality.style)]]
-    for outcome in quality.outcomes:
-        (first, on_white), *others = [quality.judge.renders(outcome.sh_dc, camera) for camera in cameras]
-        rows.append([(outcome.name, first), *(("", pair[0]) for pair in others), ("", on_white)])
+    rows = [judged_row(quality.judge, outcome.name, outcome.sh_dc) for outcome in quality.outcomes]
     with torch.no_grad():
-        write_grid(path, rows)
+        write_grid(path, [[("style", quality.style)], *rows])
+
+
+def judged_row(judge: Judge, name: str, sh_dc: Tensor) -> list[tuple[str, Tensor]]:
+    """Return the row of some colors in a contact sheet: some views on black, and the first one on white."""
+    (first, on_white), *others = [judge.renders(sh_dc, camera) for camera in judge.cameras[:_SHOWN]]
+    return [(name, first), *(("", on_black) for on_black, _ in others), ("", on_white)]
