@@ -95,9 +95,16 @@ def _blend(block, alive, value, x, y, high, alpha_max):
 
 
 @compiled()
-def _start_tile(block, alive, columns, high):
-    """Reset the transmittance of a tile to 1. Pixels outside the image are marked as finished."""
-    alive[:] = 0
+def _tile_at(tile, height, width):
+    """Return left and top edge, rows and columns of a tile in the image, and its state before the first Gaussian.
+
+    The state is `block`, with transmittances of 1, and `alive`; see `_blend`. Pixels outside the image are finished.
+    """
+    across = (width + _LAST) // _TILE
+    x, y = tile % across * _TILE, tile // across * _TILE
+    high, columns = min(height - y, _TILE), min(width - x, _TILE)
+    block = np.empty((2, _TILE, _TILE), dtype=np.float32)
+    alive = np.zeros(_TILE + 1, dtype=np.int32)
     for row in range(_TILE):
         for i in range(_TILE):
             inside = row < high and i < columns
@@ -105,6 +112,15 @@ def _start_tile(block, alive, columns, high):
     for row in range(high):
         alive[row] = 1
     alive[_TILE] = high
+    return x, y, high, columns, block, alive
+
+
+@compiled()
+def _store_transmittance(block, y, x, high, columns, transmittance):
+    """Store the final transmittances of a tile in the rows and columns of an image at (y, x)."""
+    for row in range(high):
+        for i in range(columns):
+            transmittance[y + row, x + i] = abs(block[0, row, i])
 
 
 @compiled()
@@ -157,20 +173,15 @@ def _scattered(step, tiles):
 def render(entries, starts, values, gaussians, colors, background, alpha_max, image, transmittance):
     """Render the image [h, w, 3] and the final transmittance [h, w] of a view."""
     height, width = transmittance.shape
-    across = (width + _LAST) // _TILE
     flat = values.reshape(values.size)
     tiles = starts.size - 1
     for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
         tile = _scattered(step, tiles)
         if tile >= tiles:
             continue
-        x, y = tile % across * _TILE, tile // across * _TILE
-        high, columns = min(height - y, _TILE), min(width - x, _TILE)
-        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
-        alive = np.empty(_TILE + 1, dtype=np.int32)
+        x, y, high, columns, block, alive = _tile_at(tile, height, width)
         pixels = np.zeros((_PIXELS // LANES, 3, LANES), dtype=np.float32)
         weights = block.reshape(2 * _PIXELS)
-        _start_tile(block, alive, columns, high)
         end = starts[tile + 1]
         for position in range(starts[tile], end):
             if alive[_TILE] == 0:
@@ -181,9 +192,7 @@ def render(entries, starts, values, gaussians, colors, background, alpha_max, im
             color = colors[gaussians[rank]]
             begin, vectors = first * _STRIPS, (stop - first) * _STRIPS
             add_scaled(weights, _PIXELS + begin * LANES, vectors, pixels, begin, color[0], color[1], color[2])
-        for row in range(high):
-            for i in range(columns):
-                transmittance[y + row, x + i] = abs(block[0, row, i])
+        _store_transmittance(block, y, x, high, columns, transmittance)
         _store_pixels(pixels, transmittance, background, y, x, high, columns, image)
 
 
@@ -191,20 +200,15 @@ def render(entries, starts, values, gaussians, colors, background, alpha_max, im
 def color_gradient(entries, slots, starts, values, image_gradient, alpha_max, slot_gradients):
     """Write dL/dcolor of every (Gaussian, tile) pair to its slot [E, 3]."""
     height, width = image_gradient.shape[0], image_gradient.shape[1]
-    across = (width + _LAST) // _TILE
     flat = values.reshape(values.size)
     tiles = starts.size - 1
     for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
         tile = _scattered(step, tiles)
         if tile >= tiles:
             continue
-        x, y = tile % across * _TILE, tile // across * _TILE
-        high, columns = min(height - y, _TILE), min(width - x, _TILE)
-        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
-        alive = np.empty(_TILE + 1, dtype=np.int32)
+        x, y, high, columns, block, alive = _tile_at(tile, height, width)
         pixels = np.empty((_PIXELS // LANES, 3, LANES), dtype=np.float32)
         weights = block.reshape(2 * _PIXELS)
-        _start_tile(block, alive, columns, high)
         _load_pixels(image_gradient, y, x, high, columns, pixels)
         end = starts[tile + 1]
         for position in range(starts[tile], end):
@@ -239,19 +243,14 @@ def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittanc
     Bit-identical to `render`, and to `color_gradient` for an image gradient of ones, but in one pass.
     """
     height, width = transmittance.shape
-    across = (width + _LAST) // _TILE
     flat = values.reshape(values.size)
     tiles = starts.size - 1
     for step in numba.prange(_blocks(tiles) * _BLOCK_TILES):
         tile = _scattered(step, tiles)
         if tile >= tiles:
             continue
-        x, y = tile % across * _TILE, tile // across * _TILE
-        high, columns = min(height - y, _TILE), min(width - x, _TILE)
-        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
-        alive = np.empty(_TILE + 1, dtype=np.int32)
+        x, y, high, columns, block, alive = _tile_at(tile, height, width)
         weights = block.reshape(2 * _PIXELS)
-        _start_tile(block, alive, columns, high)
         position, end = starts[tile], starts[tile + 1]
         while position < end and alive[_TILE] > 0:
             prefetch(flat, np.int64(entries[min(position + _AHEAD, end - 1)]) * _COLUMNS)
@@ -261,9 +260,7 @@ def survey(entries, slots, starts, values, alpha_max, slot_weights, transmittanc
             position += 1
         for rest in range(position, end):
             slot_weights[slots[rest]] = _ZERO
-        for row in range(high):
-            for i in range(columns):
-                transmittance[y + row, x + i] = abs(block[0, row, i])
+        _store_transmittance(block, y, x, high, columns, transmittance)
 
 
 @compiled(parallel=True)
@@ -323,13 +320,8 @@ def _has_weight(block, row, column):
 @compiled(parallel=True)
 def count_weights(entries, slots, starts, values, height, width, alpha_max, items, pieces, slot_items):
     """Count the items of every strip, the pieces of every block and the items of every slot, to size their arrays."""
-    across = (width + _LAST) // _TILE
     for tile in numba.prange(starts.size - 1):
-        x, y = tile % across * _TILE, tile // across * _TILE
-        high, columns = min(height - y, _TILE), min(width - x, _TILE)
-        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
-        alive = np.empty(_TILE + 1, dtype=np.int32)
-        _start_tile(block, alive, columns, high)
+        x, y, high, _, block, alive = _tile_at(tile, height, width)
         for position in range(starts[tile], starts[tile + 1]):
             slot_items[slots[position]] = 0
             if alive[_TILE] == 0:
@@ -351,16 +343,11 @@ def store_weights(entries, slots, starts, values, gaussians, alpha_max, slot_sta
     """Store the items and weights counted by `count_weights`, and the final transmittance [h, w] of the view."""
     item_starts, piece_starts, item_gaussians, item_slots, piece_items, weights = strips
     height, width = transmittance.shape
-    across = (width + _LAST) // _TILE
     for tile in numba.prange(starts.size - 1):
-        x, y = tile % across * _TILE, tile // across * _TILE
-        high, columns = min(height - y, _TILE), min(width - x, _TILE)
-        block = np.empty((2, _TILE, _TILE), dtype=np.float32)
-        alive = np.empty(_TILE + 1, dtype=np.int32)
+        x, y, high, columns, block, alive = _tile_at(tile, height, width)
         blended = block.reshape(2 * _PIXELS)
         items = item_starts[tile * _STRIPS : (tile + 1) * _STRIPS].copy()
         pieces = piece_starts[tile * _STRIPS * BLOCKS : (tile + 1) * _STRIPS * BLOCKS].copy()
-        _start_tile(block, alive, columns, high)
         for position in range(starts[tile], starts[tile + 1]):
             if alive[_TILE] == 0:
                 break
@@ -383,9 +370,7 @@ def store_weights(entries, slots, starts, values, gaussians, alpha_max, slot_sta
                     item_gaussians[item], item_slots[item] = gaussians[rank], slot
                     items[side] += 1
                     slot += 1
-        for row in range(high):
-            for i in range(columns):
-                transmittance[y + row, x + i] = abs(block[0, row, i])
+        _store_transmittance(block, y, x, high, columns, transmittance)
 
 
 @compiled(parallel=True)
