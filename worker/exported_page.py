@@ -27,6 +27,7 @@ from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.blending import check_same_shape, common_rests
 from sgsst_core.files.formats.sog import META_NAME, SOG
+from sgsst_core.files.formats.streamed_sog import STREAMED_SOG
 from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import SceneFile, encode_scene
 from sgsst_core.orbit.choice import find_upright_subject
@@ -69,7 +70,8 @@ def write_page(
     data["colors"] = b"" if original is None else gzip.compress(_indexed_colors(stylized.scene, out), mtime=0)
     upright = find_upright_subject(shown.scene, up)[1].direction.tolist()
     sizes = {name: len(content) for name, content in data.items()}
-    facts = {"title": title, "up": upright, "fade": fade, "background": background, "bytes": sizes}
+    sog = shown.format in (SOG.name, STREAMED_SOG.name)
+    facts = {"title": title, "up": upright, "fade": fade, "sog": sog, "background": background, "bytes": sizes}
     about = json.dumps(facts).replace("<", "\\u003c")
     values = {"title": html.escape(title), "style": viewer["style"], "about": about}
     values |= {name: _base85(content) for name, content in data.items()}

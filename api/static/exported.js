@@ -3,6 +3,7 @@
 import { Blend } from "./blend.js";
 import { h } from "./dom.js";
 import { Stage } from "./stage.js";
+import { FRONT } from "./viewer/splat_scene.js";
 import { words } from "./words.js";
 
 /**
@@ -10,13 +11,14 @@ import { words } from "./words.js";
  * @property {string} title
  * @property {number[]} up up direction of the scene
  * @property {number} fade fraction by which the stylized scene's harmonics are smaller
+ * @property {boolean} sog whether the scene was a SOG before the export
  * @property {number[]} background color behind the scene, in 0..1
  * @property {File} scene scene as SOG: the original if there is one, else the stylized one
  * @property {Uint8Array | null} colors of the stylized scene: 256 values as halves, then 3 indices for each Gaussian; null
  *   without an original
  */
 
-const { title, up, fade, background, scene: file, colors } = /** @type {Exported} */ (/** @type {any} */ (globalThis).exported);
+const { title, up, fade, sog, background, scene: file, colors } = /** @type {Exported} */ (/** @type {any} */ (globalThis).exported);
 const stage = new Stage();
 stage.up = up;
 stage.title = title;
@@ -28,6 +30,7 @@ document.body.append(h("header.top", h("span.brand", h("span.mark", { "aria-hidd
 const scene = stage.viewer?.open(file);
 if (stage.viewer && scene) {
   stage.viewer.background = background;
+  if (!sog) scene.headerRead.then(() => void (scene.front = FRONT), () => {});
   stage.show({ scene, colors: "own" });
   scene.ready.catch((error) => stage.message(error.message));
   if (colors) {

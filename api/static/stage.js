@@ -258,10 +258,9 @@ export class Stage {
   }
 
   home() {
-    const middle = this.viewer?.sides?.left.scene.middle;
-    if (!middle || !this.viewer) return;
+    if (!this.viewer?.sides?.left.scene.middle) return;
     this.leaveCamera();
-    this.viewer.camera.frame(middle, this.up);
+    this.viewer.frame(this.up);
     this.viewer.moved();
   }
 

@@ -36,13 +36,13 @@ export function upQuestion(stage, candidates, choose) {
  * @param {() => boolean} asking whether the question is still shown
  */
 async function addImages(stage, answers, asking) {
-  const { viewer } = stage, middle = viewer?.sides?.left.scene.middle;
-  if (!viewer || !middle) return;
+  const { viewer } = stage;
+  if (!viewer?.sides?.left.scene.middle) return;
   const frame = () => new Promise(requestAnimationFrame);
   await frame(); // the question is shown by then
   viewer.lines = new Float32Array(0);
   for (const { up, image } of answers) {
-    viewer.camera.frame(middle, UPS[up]);
+    viewer.frame(UPS[up]);
     viewer.draw();
     while (asking() && viewer.canvas.dataset.state !== "settled") await frame();
     if (!asking()) break;

@@ -36,10 +36,11 @@ export class ViewCamera {
    *
    * @param {{center: Vector, radius: number}} middle
    * @param {Vector} up
+   * @param {Vector} front direction from which to look, as far as it is level
    */
-  frame({ center, radius }, up = [0, -1, 0]) {
+  frame({ center, radius }, up, front) {
     this.up = unit(up);
-    const aside = Math.abs(this.up[2]) > 0.9 ? [0, -1, 0] : [0, 0, -1];
+    const aside = Math.abs(dot(this.up, unit(front))) > 0.9 ? [0, -1, 0] : unit(front);
     const level = unit(difference(aside, times(this.up, dot(aside, this.up))));
     const from = unit(sum(level, times(this.up, 0.18)));
     this.size = radius;

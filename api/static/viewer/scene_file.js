@@ -19,6 +19,7 @@ import { words } from "../words.js";
  * @property {number} width number of values in a row
  * @property {Record<string, number>} at index of each value in a row
  * @property {import("./render_tag.js").Rendering} rendering
+ * @property {number[]} [front] direction from which the program that writes the format shows a scene first
  * @property {() => AsyncGenerator<Float32Array>} batches `BATCH` rows each, fewer in the last one
  */
 

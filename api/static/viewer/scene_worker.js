@@ -44,7 +44,7 @@ async function load(source, room) {
   centers = new Float32Array(file.count * 3);
   reach = new Float32Array(file.count);
   colors = new Uint8ClampedArray(file.count * 3);
-  port.postMessage({ kind: "header", header: { count: file.count, degree: file.degree, size, rendering: file.rendering }, degree });
+  port.postMessage({ kind: "header", header: { count: file.count, degree: file.degree, size, rendering: file.rendering, front: file.front }, degree });
   for await (const rows of file.batches()) give(rows, file);
   reader.end();
   port.postMessage({ kind: "done", middle: middle() });

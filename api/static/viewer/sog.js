@@ -19,6 +19,8 @@ import { words } from "../words.js";
 const COEFFICIENTS = /** @type {Record<number, number>} */ ({ 192: 3, 512: 8, 960: 15 });
 /** Alpha of the rotations' image for w as the largest component; x, y and z follow. */
 const FIRST_TAG = 252;
+/** Direction from which SuperSplat shows a scene first, where up is -y. */
+const SUPERSPLAT = [-1, 0, 1];
 const MAX_PALETTE_PIXELS = 65536 * 15;
 const META = "meta.json", INDEX = "lod-meta.json";
 
@@ -40,7 +42,7 @@ export async function sog(reader) {
   const [index] = [...files.keys()].filter((name) => `/${name}`.endsWith(`/${INDEX}`)).sort((a, b) => a.length - b.length);
   if (index === undefined && !files.has(META)) throw new SceneError(words.scene.notScene);
   try {
-    return joined(index === undefined ? [await sogPart(files)] : await finestParts(files, index));
+    return { ...joined(index === undefined ? [await sogPart(files)] : await finestParts(files, index)), front: SUPERSPLAT };
   } catch (error) {
     throw error instanceof SceneError ? error : new SceneError(words.scene.unreadable); // values are missing or wrong
   }

@@ -5,10 +5,12 @@ import { words } from "../words.js";
 
 /** @typedef {{center: number[], radius: number, low: number[], high: number[]}} Middle */
 /** @typedef {import("./depth_order.js").Pose} Pose */
-/** @typedef {{count: number, degree: number, size: number, rendering: import("./render_tag.js").Rendering}} Shown values of a file's header */
+/** @typedef {{count: number, degree: number, size: number, rendering: import("./render_tag.js").Rendering, front?: number[]}} Shown values of a file's header */
 
 /** @typedef {Error & {cut: boolean}} SceneFailure `cut`: whether the file ends too early */
 
+/** Direction from which a scene is seen first: that of the cameras that its own axes suggest. */
+export const FRONT = [0, 0, -1];
 /** Maximum bytes of textures; lower on devices with little memory, such as phones. */
 const MEMORY = (/** @type {any} */ (navigator).deviceMemory ?? 8) >= 8 ? 1.5e9 : 4e8;
 
@@ -26,6 +28,7 @@ export class SplatScene {
     /** @type {Shown | null} */
     this.header = null;
     this.degree = 0;
+    this.front = FRONT;
     this.loaded = 0;
     /** @type {Middle | null} */
     this.middle = null;
@@ -88,6 +91,7 @@ export class SplatScene {
   allocate(header, degree) {
     const { gl } = this;
     this.header = header;
+    this.front = header.front ?? FRONT;
     this.degree = degree;
     this.texels = harmonicTexels(degree);
     this.geometry = this.texture(gl.RGBA32UI, 2 * header.count);

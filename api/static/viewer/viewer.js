@@ -70,10 +70,16 @@ export class Viewer {
     const middle = this.sides?.left.scene.middle;
     if (middle && !this.touched && !this.camera.shape && middle !== this.framed) {
       this.framed = middle;
-      this.camera.frame(middle, this.camera.up);
+      this.frame(this.camera.up);
     }
     this.told();
     this.draw();
+  }
+
+  /** Look at the whole scene. @param {number[]} up */
+  frame(up) {
+    const scene = this.sides?.left.scene;
+    if (scene?.middle) this.camera.frame(scene.middle, up, scene.front);
   }
 
   /** Show the whole scene, as before the first movement of the camera. */

@@ -31,6 +31,7 @@ from tests.real_scenes import scene_path
 from tests.sgsst_core.files.formats.samples import ksplat
 from tests.sgsst_core.files.formats.streamed import archived, streamed
 from tests.sgsst_core.files.test_filtered_and_flat_scenes import with_filter, without_thickness
+from tests.sgsst_core.orbit.objects import joined
 from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.slow
@@ -405,6 +406,19 @@ def test_files_that_cannot_be_shown(visit: Visit, tmp_path: Path, content: bytes
     watched.page.get_by_label("Scene", exact=True).set_input_files(file)
     watched.page.locator(".frame .note").filter(has_text=said).wait_for()
     watched.check()
+
+
+@pytest.mark.parametrize(("form", "front"), [("sog", "red"), ("ply", "blue")])
+def test_scene_is_first_seen_from_its_front(visit: Visit, tmp_path: Path, form: str, front: str) -> None:
+    halves = [replace(wall(), means=wall().means * torch.tensor([1, 1, 0]) + torch.tensor([0, 0, z])) for z in (-1, 1)]
+    colors = [wall().sh_dc.new_tensor(color).expand(616, 3) for color in ([-1.7, -1.7, 1.7], [1.7, -1.7, -1.7])]
+    scene = joined(*(replace(half, sh_dc=color) for half, color in zip(halves, colors, strict=True)))
+    ply, _, _ = write_files(tmp_path)
+    write_scene(ply, scene, by_name(form))
+    steps = "(viewer, source, picture) => { viewer.frame([0, -1, 0]); viewer.draw(); return picture(); }"
+    image = decoded(shown(visit("/#/jobs"), tmp_path, "view_0", (64, 48), steps))
+    middle = image[image.shape[0] // 2, image.shape[1] // 2]
+    assert ("red", "green", "blue")[int(middle.argmax())] == front
 
 
 def test_camera_follows_keys_and_double_clicks(visit: Visit, tmp_path: Path) -> None:

@@ -169,6 +169,7 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
     text = Path("page.html").read_text(encoding="utf-8")
     assert ('id="colors"></script>' not in text) == holds_both
     assert '"up": [1.0, 0.0, 0.0]' in text
+    assert '"sog": false' in text
     assert '"background": [1.0, 1.0, 1.0]' in text
 
 
