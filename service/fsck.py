@@ -45,7 +45,6 @@ class Fault:
 
     Attributes:
         name: Name of the file in the file store or in the data folder.
-        holders: Jobs and uploads that need the file.
         mended: Description of the repair; empty if nothing was done.
     """
 

@@ -125,11 +125,7 @@ TRANSITIONS: Mapping[Transition, Mapping[JobStatus, JobStatus]] = {
 
 @dataclass(frozen=True)
 class Action:
-    """Transition that users request with `POST /v1/jobs/{id}/{transition}`.
-
-    Attributes:
-        statuses: Statuses that the transition changes.
-    """
+    """Transition that users request with `POST /v1/jobs/{id}/{transition}`."""
 
     help: str
     statuses: tuple[JobStatus, ...]

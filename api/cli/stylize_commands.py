@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import signal
 import threading
@@ -20,7 +21,6 @@ from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.number_format import clock
-from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.progress_bar import job_bar
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 
@@ -72,8 +72,6 @@ def demo(
     """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
     from api.cli.demo_scene import build_demo
     from sgsst_core.features.network_weights import load_network_weights
-    from worker.job import JobSpec, SceneRequest
-    from worker.styles import StyleFile
 
     try:
         load_network_weights("auto")
@@ -81,13 +79,12 @@ def demo(
         fetch("vgg16")
     with spinner("Building the scene"):
         files = build_demo(out)
-    source = SceneRequest(scene=files.ply, cameras=files.cameras, resolution=DEMO_RESOLUTION)
-    settings = make_settings("preview", max_resolution=DEMO_RESOLUTION, steps_sos=DEMO_STEPS, within=DEMO_SECONDS)
-    request = JobSpec(source=source, styles=(StyleFile(files.style),), out=out / "stylized.ply", settings=settings)
-    options: dict[str, object] = {"--style": files.style, "--cameras": files.cameras, "--out": request.out}
-    options |= {"--preset": "preview", "--resolution": DEMO_RESOLUTION}
-    options |= {"--steps-sos": DEMO_STEPS, "--within": DEMO_SECONDS}
-    arguments = ["stylize", str(files.ply), *(str(part) for option in options.items() for part in option)]
+    chosen = {"preset": "preview", "resolution": DEMO_RESOLUTION, "steps_sos": DEMO_STEPS, "within": DEMO_SECONDS}
+    inputs = JobInputs(str(files.ply), [str(files.style)], str(files.cameras))
+    request = inputs.request(StylizeOptions.model_validate(chosen), out / "stylized.ply")
+    given = {"style": files.style, "cameras": files.cameras, "out": request.out, **chosen}
+    options = [(f"--{name.replace('_', '-')}", str(value)) for name, value in given.items()]
+    arguments = ["stylize", str(files.ply), *itertools.chain(*options)]
     print_field("command", shlex.join(["sgsst", *arguments]))
     run_job(request, _resuming(arguments))
 

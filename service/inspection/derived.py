@@ -9,8 +9,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import shutil
-import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -26,12 +24,12 @@ from service.files.blobs import Blobs
 from service.files.staging import RESULT, Staged, stage
 from service.files.threads import FileThreads
 from service.inspection.inspector import (
-    LEFTOVER_SECONDS,
     MEMORY_PER_BYTE,
     InspectionProcess,
     Show,
     findings_of,
     threads_of_a_job,
+    working_folder,
 )
 from service.inspection.lanes import Lanes
 from service.inspection.work import WorkRequest
@@ -95,7 +93,6 @@ class _Making:
     Attributes:
         options: Options on which the file depends besides its name.
         watchers: Callbacks that receive the progress.
-        task: Task that makes and publishes it.
     """
 
     options: JobVideo | None
@@ -122,11 +119,7 @@ class DerivedFiles:
         self._threads = threads
         self._files, self._videos = (Lanes([InspectionProcess(count)]) for count in (1, threads_of_a_job(settings)))
         self._making: dict[tuple[str, str], _Making] = {}
-        self._folder = settings.folder / "packing"
-        self._folder.mkdir(parents=True, exist_ok=True)
-        for leftover in self._folder.iterdir():  # left behind by a killed process
-            if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
-                shutil.rmtree(leftover, ignore_errors=True)
+        self._folder = working_folder(settings, "packing")
 
     async def compressed(self, job: JobRow, format: SceneFormat, quotas: Quotas) -> ArtifactRow:
         """Return a job's result in a compressed format; the compression error is stored beside it as JSON.

@@ -40,7 +40,7 @@ _VERSION = "6"
 #: Maximum number of requests that wait for the inspecting process; further ones are rejected with `BUSY`.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20
-LEFTOVER_SECONDS = 3600.0
+_LEFTOVER_SECONDS = 3600.0
 #: Additions to the limits of an inspection per byte of its files. CPU seconds: the slowest readers (text, images) read
 #: at least 30 MB/s, and the limit allows for 8 MB/s. Memory: a number in a text file takes at least two bytes (a digit
 #: and a space) and becomes a float64 (4x) and then a float32 (2x). A binary file is mapped (1x), and its numbers of one
@@ -165,6 +165,16 @@ class InspectionProcess:
             await process.wait()
 
 
+def working_folder(settings: ServiceSettings, name: str) -> Path:
+    """Return a folder for temporary files, without what a killed process has left there."""
+    folder = settings.folder / name
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.iterdir():
+        if time.time() - leftover.stat().st_mtime > _LEFTOVER_SECONDS:
+            shutil.rmtree(leftover, ignore_errors=True)
+    return folder
+
+
 class Inspector:
     """Validator and planner of complete jobs; its findings are cached by files and parameters."""
 
@@ -176,13 +186,9 @@ class Inspector:
         self._warming: asyncio.Task[None] | None = None
         self._validating_large = Lanes([InspectionProcess()])
         self._planning = Lanes([InspectionProcess(threads_of_a_job(settings))])
-        self._folder = settings.folder / "inspections"
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self._folder = working_folder(settings, "inspections")
         for feature in missing():
             _log.warning("confinement incomplete: missing %s", feature)
-        for leftover in self._folder.iterdir():  # left behind by a killed process
-            if time.time() - leftover.stat().st_mtime > LEFTOVER_SECONDS:
-                shutil.rmtree(leftover, ignore_errors=True)
 
     async def warm(self) -> None:
         """Start the process that checks the next job in advance: its imports take seconds."""

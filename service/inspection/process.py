@@ -92,7 +92,6 @@ class _Limits:
 
     Attributes:
         gaussians, views, pixels: Maximum numbers of Gaussians, of views, and of pixels of all views.
-        image_pixels: Maximum number of pixels of an image.
     """
 
     gaussians: int

@@ -94,7 +94,6 @@ class ShownJob:
     Attributes:
         row: Its record, without inputs.
         inputs: Entries of scene, style images and camera files, in their order.
-        input_counts: Number of files by role.
         position: Number of queued jobs ahead by priority and age, plus one; None if it is not queued. The turns of
             owners are ignored, because they change with every lease.
         preview: Name of its newest preview; None if there is none.

@@ -210,10 +210,8 @@ def choose_tile_size(
     less memory for caching.
 
     Args:
-        halo: Width in pixels of the halo, a multiple of 16.
-        held: Number of pixels whose activations fit in the memory budget.
-        working: Additional memory of a tile during back-propagation, as a fraction of the memory of its activations.
-        region: Result of `covered_region`; None for the whole view.
+        halo, region: As in `partition`.
+        held, working: As in `cached_tiles`.
         largest: Maximum pixels of a tile; None for no limit.
     """
 

@@ -22,10 +22,9 @@ def max_pool(source, out, width, across, windows, CHANNELS: tl.constexpr, MASK: 
     """Write the maxima of 2x2 windows, as `pooling_kernels.max_pool` does.
 
     Args:
-        source: [height, width, CHANNELS], ReLU output.
         out: [height // 2, across, CHANNELS].
         across: Columns of the output, width // 2.
-        CHANNELS, MASK, BLOCK: As in `max_pool_backward`.
+        source, CHANNELS, MASK, BLOCK: As in `max_pool_backward`.
     """
     entry = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     channel, window = entry % CHANNELS, entry // CHANNELS

@@ -212,11 +212,7 @@ class TargetBuilder:
         return result
 
     def content_bytes(self, pieces: Sequence[Sequence[Piece]]) -> int:
-        """Return the maximum size over all ranks of the `content_features` of a scale, in bytes.
-
-        Args:
-            pieces: Pieces of the scale for every rank.
-        """
+        """Return the maximum size over all ranks of the `content_features` of a scale, in bytes."""
         value = torch.finfo(self.network.dtype).bits // 8 * self.network.channels(CONTENT_LAYER)
         return max(sum(piece.cells(CONTENT_LAYER) for piece in own) for own in pieces) * value
 

@@ -137,7 +137,6 @@ class ViewTarget:
     Attributes:
         content_image: Content image [H, W, 3] from which uncached content features are computed; None if they are not
             needed.
-        content: Cached content features by scale.
         coverage: Position weights [H >> k, W >> k] for each power of two 2^k; None for equal weights.
         division: Division of work for which the content was prepared; None to divide the work in every evaluation.
         regions: Position weights of each region (its fraction of the blend weights), in the format of `coverage` and

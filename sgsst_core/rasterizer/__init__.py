@@ -43,8 +43,7 @@ def make_rasterizer(
     Args:
         name: `cpu` computes blend weights in every call; `cached` stores them (its options are `precision`, `max_bytes`
             and `uncached`); `triton` runs on GPUs; `reference` is slow and float64.
-        scene: Scene, whose geometry must not change during the rasterizer's lifetime.
-        background: RGB color behind pixels that Gaussians leave uncovered.
+        scene, background: As in `Rasterizer`.
         device: Device for `cached` and `triton`. None selects the CPU for `cached` (or the device of its option
             `uncached`), and the current GPU for `triton`.
         memory: Memory budget in bytes for tile intersections and cached blend weights; None for the default.

@@ -208,7 +208,6 @@ def save_plan(path: Path, plan: Plan, job: str, conditions: str) -> None:
     """Write a plan into an existing file, for a run of the same job that finds the same conditions.
 
     Args:
-        job: Fingerprint of the job.
         conditions: Text about everything else that the plan depends on, such as the machine.
     """
     tensors, values = _plan_parts(plan)
@@ -219,7 +218,6 @@ def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> 
     """Return a plan from `save_plan` and its conditions. What it says about scene and views is checked.
 
     Args:
-        job: Fingerprint of the job.
         scene: Scene of the job, before its refinement.
 
     Raises:

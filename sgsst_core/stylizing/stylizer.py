@@ -65,7 +65,6 @@ class _QueuedStep:
     """Step whose work is queued on the device, and whose losses have yet to be read.
 
     Attributes:
-        views: Indices of its views.
         results: Results of this group's views, without gradients.
         values: Largest magnitude in the gradient, then the values of the results; in host memory, valid after `copied`.
         copied: Event after the copy of `values`; None if there is nothing to wait for.

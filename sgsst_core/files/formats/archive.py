@@ -33,7 +33,6 @@ class FilesOfScene:
         archive: Archive that is open already; None opens it for each file.
 
     Attributes:
-        path, folder: As above.
         surplus: Note on bytes before or after the archive.
     """
 

@@ -59,7 +59,6 @@ class KsplatSection:
         centers_offset: Byte offset of the centers of the buckets, three float32 each.
         step: Position step.
         steps: Steps from the least position in a bucket to its center.
-        data_offset: Byte offset of the Gaussians.
     """
 
     count: int
