@@ -52,7 +52,10 @@ class TruncatedError(OSError):
 
 
 class ObjectStore:
-    """Objects of a file store; their names are relative to its URL."""
+    """Objects of a file store; their names are relative to its URL.
+
+    Methods that read an object raise FileNotFoundError if there is no such object.
+    """
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -70,11 +73,7 @@ class ObjectStore:
             self._files.put_file(str(source), self._path(name), **options)
 
     def get(self, name: str, target: Path) -> None:
-        """Copy an object to a local file.
-
-        Raises:
-            FileNotFoundError: If there is no such object.
-        """
+        """Copy an object to a local file."""
         with self._translated(name):
             if self._s3:
                 self._get_pieces(self._path(name), target)
@@ -101,7 +100,6 @@ class ObjectStore:
         From S3, 32 chunks are fetched at a time; by default, the file system fetches 50 MB.
 
         Raises:
-            FileNotFoundError: If there is no such object.
             TruncatedError: If the object ends before `stop`.
         """
         with self._translated(name), self._files.open(self._path(name), "rb", block_size=32 * chunk) as file:
@@ -115,11 +113,7 @@ class ObjectStore:
                 yield data
 
     def stamp(self, name: str) -> Stamp:
-        """Return metadata that change when the object's content changes.
-
-        Raises:
-            FileNotFoundError: If there is no such object.
-        """
+        """Return metadata that change when the object's content changes."""
         with self._translated(name):
             if self.local:
                 status = Path(self._path(name)).stat()
@@ -136,11 +130,7 @@ class ObjectStore:
             return -1
 
     def digest(self, name: str) -> str:
-        """Read an object completely and return its SHA-256.
-
-        Raises:
-            FileNotFoundError: If there is no such object.
-        """
+        """Read an object completely and return its SHA-256."""
         with self._translated(name), self._files.open(self._path(name), "rb") as file:
             digest = hashlib.sha256()
             while data := _uninterrupted(partial(file.read, CHUNK)):

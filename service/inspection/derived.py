@@ -109,7 +109,13 @@ class DerivedFiles:
     """Writer of files derived from results: one video at a time, and one other file; owners take turns.
 
     Concurrent requests for the same file share one task, which continues even if nobody waits for it any longer, unless
-    the service ends.
+    the service ends. All methods that return a file raise these errors.
+
+    Raises:
+        NotFoundError: If a job has no result yet, or the result is gone.
+        INVALID_INPUT: If the file cannot be made of it, or making it exceeds the limits.
+        QUOTA_EXCEEDED: If the file exceeds the owner's quota of stored bytes.
+        BUSY, NoSpaceError: If the file cannot be made now.
     """
 
     def __init__(
@@ -122,14 +128,7 @@ class DerivedFiles:
         self._folder = working_folder(settings, "packing")
 
     async def compressed(self, job: JobRow, format: SceneFormat, quotas: Quotas) -> ArtifactRow:
-        """Return a job's result in a compressed format; the compression error is stored beside it as JSON.
-
-        Raises:
-            NotFoundError: If the job has no result yet, or the result is gone.
-            INVALID_INPUT: If the format cannot represent the result, or compressing exceeds the limits.
-            QUOTA_EXCEEDED: If the files exceed the owner's quota of stored bytes.
-            BUSY, NoSpaceError: If the result cannot be compressed now.
-        """
+        """Return a job's result in a compressed format; the compression error is stored beside it as JSON."""
         name = result_name(RESULT, format.name)
         return await self._existing(job, name) or await self._derived(
             job, name, lambda: self._compress(job, name, quotas)
@@ -139,12 +138,8 @@ class DerivedFiles:
         """Return a blend of a job's scene and results. The owner of the job must also own the others.
 
         Raises:
-            NotFoundError: If a job has no result yet, or a result is gone.
-            INVALID_INPUT: If the results have other Gaussians than the scene, the format cannot represent the
-                blend, or blending exceeds the limits.
+            INVALID_INPUT: If the results have other Gaussians than the scene.
             TOO_MANY_BLENDS: If the job has `MOST_BLENDS` already.
-            QUOTA_EXCEEDED: If the blend exceeds the owner's quota of stored bytes.
-            BUSY, NoSpaceError: If the results cannot be blended now.
         """
         return await self._existing(job, blend.name) or await self._derived(
             job, blend.name, lambda: self._blend(job, blend, quotas)
@@ -155,12 +150,6 @@ class DerivedFiles:
 
         Args:
             viewer: Sources of the page; see `worker.exported_page`.
-
-        Raises:
-            NotFoundError: If the job has no result yet, or the result is gone.
-            INVALID_INPUT: If writing the page exceeds the limits.
-            QUOTA_EXCEEDED: If the page exceeds the owner's quota of stored bytes.
-            BUSY, NoSpaceError: If it cannot be written now.
         """
         return await self._existing(job, PAGE) or await self._derived(
             job, PAGE, lambda: self._write_page(job, viewer, quotas)
@@ -174,10 +163,7 @@ class DerivedFiles:
                 frame.
 
         Raises:
-            NotFoundError: If the job has no result, or was deleted meanwhile.
-            INVALID_INPUT: If the video cannot be rendered, or exceeds the limits.
-            QUOTA_EXCEEDED: If the video exceeds the owner's quota of stored bytes.
-            BUSY, NoSpaceError: If it cannot be rendered now; another video of the job may be in progress.
+            BUSY: If another video of the job is in progress.
         """
         return await self._derived(job, VIDEO, lambda: self._render(job, options, quotas), options, show)
 
