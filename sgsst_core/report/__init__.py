@@ -1,4 +1,7 @@
-"""Reports of finished jobs: JSON document, HTML page, charts and contact sheet; only they import matplotlib."""
+"""Reports of finished jobs: JSON document, HTML page, charts and contact sheet; only they import matplotlib.
+
+Functions that write a file raise an OutputError if it cannot be written.
+"""
 
 import logging
 

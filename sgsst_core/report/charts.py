@@ -84,9 +84,6 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
 
     Args:
         report: Report from `build_report`; its history may be empty.
-
-    Raises:
-        OutputError: If the file cannot be written.
     """
     with png_chart(path, (8, 4.8), dpi=120) as figure:
         draw_loss(figure, "seconds", history_of(report), novel_view_moments(report))
@@ -94,11 +91,7 @@ def write_loss_chart(path: Path, report: dict[str, Any]) -> None:
 
 @contextmanager
 def png_chart(path: Path, size: tuple[float, float], dpi: int = 110) -> Iterator[Figure]:
-    """Provide a figure of a size in inches to a `with` block, and write it as a PNG afterwards.
-
-    Raises:
-        OutputError: If the file cannot be written.
-    """
+    """Provide a figure of a size in inches to a `with` block, and write it as a PNG afterwards."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=size, dpi=dpi, layout="constrained")
         yield figure

@@ -34,11 +34,7 @@ _MAX_VIEWS, _VIEW_SIDE, _SHEET_SHAPE, _VIEW_GAUSSIANS = 48, 240, 1.6, 250_000
 
 
 def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
-    """Write a JPEG with the style image and, for each evaluation view, the original above the stylized render.
-
-    Raises:
-        OutputError: If the file cannot be written.
-    """
+    """Write a JPEG with the style image and, for each evaluation view, the original above the stylized render."""
     views, rasterizer = stylizer.job.views, stylizer.job.views.rasterizer
     columns = []
     with torch.no_grad():
@@ -69,9 +65,6 @@ def write_views(
     """Write a JPEG with small renders of at most 48 cameras, spread evenly over the list.
 
     Large scenes are rendered from a sample of their Gaussians (see `sampled`).
-
-    Raises:
-        OutputError: If the file cannot be written.
     """
     shown = spread(cameras, _MAX_VIEWS)
     renders = small_renders(scene, shown, _VIEW_SIDE, background=background, near=near)
@@ -103,11 +96,7 @@ def small_renders(
 
 
 def write_grid(path: Path, rows: Sequence[Sequence[tuple[str, Tensor] | None]]) -> None:
-    """Write a JPEG with rows of images [H, W, 3] in columns, each with its name above; None leaves a place empty.
-
-    Raises:
-        OutputError: If the file cannot be written.
-    """
+    """Write a JPEG with rows of images [H, W, 3] in columns, each with its name above; None leaves a place empty."""
     grid = [[cell and (cell[0], _fitted(_to_image(cell[1]))) for cell in row] for row in rows]
     widths = [max((cell[1].width for cell in column if cell), default=0) for column in zip_longest(*grid)]
     lefts = [_GAP, *(_GAP + end for end in accumulate(width + _GAP for width in widths))]
