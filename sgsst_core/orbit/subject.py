@@ -58,10 +58,11 @@ _STANDS = 1.6
 #: minimum ratio of the foot's area to that of the other end, and minimum fraction of the whole subject's area seen from
 #: above.
 _FOOT, _WIDER, _MIN_FOOT = 0.015, 1.3, 0.05
-#: Ratio of the areas of both ends from which on a foot is certain, even if the subject could lie on a side too.
-_MUCH_WIDER = 3.0
-#: Minimum foot area, as a fraction of the whole, of a subject that lies along its length, such as a car on its wheels.
-_LIES = 0.5
+#: Thickness of the base on which a subject rests as a fraction of its height, minimum balance of one that rests firmly,
+#: and fraction of the largest balance from which on others are similar.
+_BASE, _FIRM, _SIMILAR = 0.03, 0.25, 0.75
+#: Minimum cosine between two directions that count as the same.
+_SAME = 0.8
 
 
 @dataclass(frozen=True)
@@ -229,36 +230,58 @@ class Up:
 def find_up(subject: Subject) -> Up:
     """Estimate the up direction.
 
-    The ground plane determines it. Without one, the long axis of the subject and its wider end do; else it is -y, the
-    usual convention.
+    The ground plane determines it. Without one, the long axis of the subject and its wider end do if the subject can
+    stand like that; else the side on which it rests most firmly does. If it rests equally well on several sides, or on
+    none, it is -y, the usual convention.
     """
     axes = _axes_of(subject.points, subject.weights)
-    ground = _ground(subject, [*axes.T, *torch.eye(3, dtype=torch.float64)])
-    if ground is not None:
+    world = torch.eye(3, dtype=torch.float64)
+    ground = _ground(subject, [*axes.T, *world])
+    if ground is not None and _balance(subject, ground) > _FIRM:
         return Up(_snapped(ground), "there is a flat layer below the whole subject, and none above", ground=True)
-    usual = torch.tensor(USUAL_UP, dtype=torch.float64)
+    balances = [(_balance(subject, up), up) for up in (*world, *-world)] if subject.left_out <= _WHOLE else []
+    firmest = max((balance for balance, _ in balances), default=0.0)
+    stands = _standing(subject, axes)
+    if stands is not None:
+        near = [balance for balance, up in balances if float(up @ stands.direction) > _SAME]
+        if max([_balance(subject, stands.direction), *near]) >= firmest:
+            return stands
+    similar = sorted((each for each in balances if each[0] >= _SIMILAR * firmest > 0), key=_likelier)
+    if len(similar) == 1 and firmest >= _FIRM:
+        return Up(similar[0][1], "the subject rests firmly on this side, and on no other one")
+    usual, second = (torch.tensor(up, dtype=torch.float64) for up in (USUAL_UP, _SECOND_UP))
+    likely = [up for _, up in similar] if len(similar) <= 2 else []
+    likely = [*([usual] if firmest < _FIRM else []), *likely, usual, second]
+    other = next(up for up in likely if float(up @ likely[0]) < _SAME)
+    found = "the subject may rest on several sides" if similar else "neither a ground nor a side to rest on was found"
+    return Up(likely[0], f"{found}, and most captures point this way", sure=False, other=other)
+
+
+def _standing(subject: Subject, axes: Tensor) -> Up | None:
+    """Return the up direction of a subject that stands along the longest of its `axes`; None if it has no long one."""
+    long = axes[:, 2]
     offsets = subject.points - (subject.weights[:, None] * subject.points).sum(0)
     spreads = (offsets @ axes).square().mul(subject.weights[:, None]).sum(0).sqrt()
     longer = float(spreads[2] / spreads[1].clamp_min(1e-300)) if float(spreads[2]) > 0 else 1.0
     if longer < _STANDS or subject.left_out > _WHOLE:
-        reason = "neither a ground nor a long axis was found, and most captures point this way"
-        return Up(usual, reason, sure=False, other=torch.tensor(_SECOND_UP, dtype=torch.float64))
-    long = axes[:, 2]
+        return None
     ends = [_foot(subject, long), _foot(subject, -long)]
-    lying = abs(float(long @ usual)) < 0.5 and _foot(subject, usual) >= max(_LIES, _WIDER * max(ends))
-    has_foot = max(ends) > max(_MIN_FOOT, _WIDER * min(ends))
-    if lying and not (has_foot and max(ends) > _MUCH_WIDER * min(ends)):
-        up = _snapped(long if ends[0] > ends[1] else -long)
-        text = f"the subject is {longer:.1f} times as long as wide, and rests lengthwise on a broad foot"
-        return Up(usual, text, sure=not has_foot, other=up if has_foot else None)
     stands = f"the subject is {longer:.1f} times as tall as wide"
-    if has_foot:
+    if max(ends) > max(_MIN_FOOT, _WIDER * min(ends)):
         up = long if ends[0] > ends[1] else -long
         broader = f"{max(ends) / min(ends):.1f} times as broad as" if max(ends) < 100 * min(ends) else "broader than"
         return Up(_snapped(up), f"{stands}, and its foot is {broader} the other end")
-    up = long if _habit(long) > 0 else -long
+    up = _snapped(long if _habit(long) > 0 else -long)
+    usual = torch.tensor(USUAL_UP, dtype=torch.float64)
     reason = f"{stands}; both ends are alike, and most captures point this way"
-    return Up(_snapped(up), reason, sure=False, other=usual if abs(float(up @ usual)) < _SNAP else _snapped(-up))
+    return Up(up, reason, sure=False, other=usual if abs(float(up @ usual)) < _SNAP else -up)
+
+
+def _likelier(resting: tuple[float, Tensor]) -> tuple[bool, bool, float]:
+    """Return the sort key of a balance with its up direction: the usual directions first, then the firmest."""
+    balance, up = resting
+    usual, second = (float(up @ torch.tensor(each, dtype=torch.float64)) > _SAME for each in (USUAL_UP, _SECOND_UP))
+    return not usual, not second, -balance
 
 
 def _habit(direction: Tensor) -> float:
@@ -354,11 +377,32 @@ def _covered_fraction(points: Tensor, up: Tensor, rows: Tensor) -> float:
 
 def _foot(subject: Subject, up: Tensor) -> float:
     """Return the area of the lowest points as a fraction of the subject's area: convex hulls, seen from above."""
+    flat, base = _base(subject, up, _FOOT)
+    return _area(base) / max(_area(flat), 1e-300)
+
+
+def _balance(subject: Subject, up: Tensor) -> float:
+    """Return how firmly the subject rests on its lower end; negative if its center of mass is not above its base.
+
+    It is the distance of the center of mass from the edge of the base, seen from above, relative to the square root of
+    the subject's area.
+    """
+    flat, base = _base(subject, up, _BASE)
+    area = _area(flat)
+    if not _area(base) > 0:
+        return -1.0 if area > 0 else 0.0
+    center = (subject.weights[:, None] * flat).sum(0).numpy()
+    edges = ConvexHull(base.numpy()).equations
+    return -float((edges[:, :2] @ center + edges[:, 2]).max()) / math.sqrt(area)
+
+
+def _base(subject: Subject, up: Tensor, thickness: float) -> tuple[Tensor, Tensor]:
+    """Return all points [P, 2] and the lowest ones, seen from above; `thickness` is a fraction of the height."""
     heights = subject.points @ up
     flat = subject.points @ _across(up)
     # quantiles, so that neither strays nor the few points of a hollow base below its rim count as a foot
     low, high = (quantile(heights, subject.weights, fraction) for fraction in (0.01, 0.99))
-    return _area(flat[heights <= low + _FOOT * (high - low)]) / max(_area(flat), 1e-300)
+    return flat, flat[heights <= low + thickness * (high - low)]
 
 
 def _area(points: Tensor) -> float:
