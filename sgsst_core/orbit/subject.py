@@ -230,28 +230,28 @@ class Up:
 def find_up(subject: Subject) -> Up:
     """Estimate the up direction.
 
-    The ground plane determines it. Without one, the long axis of the subject and its wider end do if the subject can
-    stand like that; else the side on which it rests most firmly does. If it rests equally well on several sides, or on
-    none, it is -y, the usual convention.
+    A ground plane shows it, or the wider end of a long subject, unless the subject rests more firmly on another side.
+    Without both, it is the only side on which the subject rests firmly. Else it is -y, the usual convention, or one of
+    two sides on which it rests about as firmly.
     """
     axes = _axes_of(subject.points, subject.weights)
     world = torch.eye(3, dtype=torch.float64)
-    ground = _ground(subject, [*axes.T, *world])
-    if ground is not None and _balance(subject, ground) > _FIRM:
-        return Up(_snapped(ground), "there is a flat layer below the whole subject, and none above", ground=True)
+    # what a background belongs to doesn't balance
     balances = [(_balance(subject, up), up) for up in (*world, *-world)] if subject.left_out <= _WHOLE else []
     firmest = max((balance for balance, _ in balances), default=0.0)
-    stands = _standing(subject, axes)
-    if stands is not None:
-        near = [balance for balance, up in balances if float(up @ stands.direction) > _SAME]
-        if max([_balance(subject, stands.direction), *near]) >= firmest:
-            return stands
-    similar = sorted((each for each in balances if each[0] >= _SIMILAR * firmest > 0), key=_likelier)
+    ground, standing = _ground(subject, [*axes.T, *world]), _standing(subject, axes)
+    for shown, margin in ((ground, _SIMILAR), (standing, 1.0)):
+        if shown is not None:
+            others = [balance for balance, up in balances if float(up @ shown.direction) <= _SAME]
+            same = [balance for balance, up in balances if float(up @ shown.direction) > _SAME]
+            if margin * max([_balance(subject, shown.direction), *same]) >= max(others, default=0.0):
+                return shown
+    usual, second = (torch.tensor(up, dtype=torch.float64) for up in (USUAL_UP, _SECOND_UP))
+    similar = [each for each in balances if each[0] >= _SIMILAR * firmest > 0]
     if len(similar) == 1 and firmest >= _FIRM:
         return Up(similar[0][1], "the subject rests firmly on this side, and on no other one")
-    usual, second = (torch.tensor(up, dtype=torch.float64) for up in (USUAL_UP, _SECOND_UP))
-    likely = [up for _, up in similar] if len(similar) <= 2 else []
-    likely = [*([usual] if firmest < _FIRM else []), *likely, usual, second]
+    likely = [up for _, up in sorted(similar, key=lambda each: (float(each[1] @ usual) < _SAME, -each[0]))]
+    likely = [*([] if firmest >= _FIRM else [usual]), *(likely if len(likely) <= 2 else []), usual, second]
     other = next(up for up in likely if float(up @ likely[0]) < _SAME)
     found = "the subject may rest on several sides" if similar else "neither a ground nor a side to rest on was found"
     return Up(likely[0], f"{found}, and most captures point this way", sure=False, other=other)
@@ -275,13 +275,6 @@ def _standing(subject: Subject, axes: Tensor) -> Up | None:
     usual = torch.tensor(USUAL_UP, dtype=torch.float64)
     reason = f"{stands}; both ends are alike, and most captures point this way"
     return Up(up, reason, sure=False, other=usual if abs(float(up @ usual)) < _SNAP else -up)
-
-
-def _likelier(resting: tuple[float, Tensor]) -> tuple[bool, bool, float]:
-    """Return the sort key of a balance with its up direction: the usual directions first, then the firmest."""
-    balance, up = resting
-    usual, second = (float(up @ torch.tensor(each, dtype=torch.float64)) > _SAME for each in (USUAL_UP, _SECOND_UP))
-    return not usual, not second, -balance
 
 
 def _habit(direction: Tensor) -> float:
@@ -314,8 +307,8 @@ def _axes_of(points: Tensor, weights: Tensor) -> Tensor:
     return axes
 
 
-def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Tensor | None:
-    """Return up [3] from a flat layer at an end of an axis; None if there is none, or if layers disagree."""
+def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Up | None:
+    """Return the up direction of a flat layer at an end of an axis; None if there is none, or if layers disagree."""
     layers: list[tuple[float, Tensor]] = []
     for axis in candidates:
         for up in (axis, -axis):
@@ -328,7 +321,9 @@ def _ground(subject: Subject, candidates: Sequence[Tensor]) -> Tensor | None:
     if not layers:
         return None
     best = max(layers, key=lambda pair: pair[0])[1]
-    return best if all(float(best @ up) > 0.9 for _, up in layers) else None
+    if any(float(best @ up) <= 0.9 for _, up in layers):
+        return None
+    return Up(_snapped(best), "there is a flat layer below the whole subject, and none above", ground=True)
 
 
 def _levelled(subject: Subject, up: Tensor) -> Tensor | None:

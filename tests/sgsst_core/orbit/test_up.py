@@ -1,14 +1,17 @@
-"""Tests of estimating the up direction: from the ground, from the base of a standing object, or by convention."""
+"""Tests of estimating the up direction: from the ground, from the side that an object rests on, or by convention."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sgsst_core.orbit.subject import Up, find_subject, find_up
+from sgsst_core.files.scene_file import read_scene
+from sgsst_core.orbit.subject import Subject, Up, find_subject, find_up
 from sgsst_core.scene.gaussians import Scene
 from tests.sgsst_core.orbit.objects import UP, ball, box, figure, ground, joined, moved, scene_of
 
@@ -17,6 +20,10 @@ ROTATIONS = [
     Rotation.from_euler("xyz", [40, 65, -130], degrees=True),
     Rotation.from_rotvec([2, 1, 1]),
 ]
+
+
+#: Rotations that map the axes to axes.
+QUARTERS = Rotation.create_group("O")
 
 
 def up_of(scene: Scene) -> Up:
@@ -67,6 +74,67 @@ def test_long_subject_on_wheels_lies_instead_of_standing() -> None:
     up = up_of(scene_of(torch.cat([*wheels, body])))
     assert up.name == "-y"
     assert "rests" in up.reason
+
+
+def turned(subject: Subject) -> list[tuple[Up, str]]:
+    """Return the estimate, and the true up axis, for a subject in each of the 24 orientations along the axes."""
+    estimates = []
+    for rotation in QUARTERS:
+        matrix = torch.from_numpy(rotation.as_matrix()).round()
+        copy = replace(subject, points=subject.points @ matrix.T, hull=subject.hull @ matrix.T)
+        expected = Up(matrix @ torch.tensor(UP, dtype=torch.float64), "")
+        estimates.append((find_up(copy), expected.name))
+    return estimates
+
+
+def legs(height: float, x: float, z: float) -> list[torch.Tensor]:
+    """Return four legs below y = -height, whose outer edges are at x and z."""
+    corners = [(a, b) for a in (-x, x - 0.2) for b in (-z, z - 0.2)]
+    return [box((a, -height, b), (a + 0.2, 0.0, b + 0.2), 300) for a, b in corners]
+
+
+def animal() -> Scene:
+    """Return a long body on four legs. Its back is broad and flat, and would be the foot if it stood on that."""
+    body = box((-1.2, -1.2, -0.4), (1.2, -0.6, 0.4), 3000)
+    head = ball((1.5, -1.4, 0), 0.3, 500)
+    return scene_of(torch.cat([*legs(0.6, 1.2, 0.6), body, head]))
+
+
+def chair() -> Scene:
+    """Return a chair with a flat back, which is no ground below it."""
+    seat, back = box((-0.6, -0.7, -0.6), (0.6, -0.6, 0.6), 2000), box((-0.6, -1.5, 0.4), (0.6, -0.7, 0.5), 1500)
+    return scene_of(torch.cat([*legs(0.6, 0.7, 0.7), seat, back]))
+
+
+@pytest.mark.parametrize("scene", [figure(), lamp(), animal(), chair()])
+def test_up_of_a_turned_scene_is_right_or_asked_for(scene: Scene, one_thread: None) -> None:
+    for up, expected in turned(find_subject(scene)):
+        assert up.name == expected or (not up.sure and expected in up.candidates), up
+
+
+def test_chair_rests_on_its_legs_and_not_on_its_flat_back(one_thread: None) -> None:
+    for up, expected in turned(find_subject(chair())):
+        assert (up.name, up.sure) == (expected, True)
+        assert "rests firmly" in up.reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "sure"),
+    [
+        ("statues/massa.sog", True),
+        ("statues/narcissus.sog", True),
+        ("playbot_synthetic_sh2/point_cloud.ply", True),
+        ("broche/broche.splat", False),
+        ("snowmiku_plush/point_cloud.ply", False),
+    ],
+)
+def test_up_of_real_scenes_is_never_wrong_and_sure(shared_data: Path, name: str, sure: bool, one_thread: None) -> None:
+    subject = find_subject(read_scene(shared_data / "scenes" / name).scene)
+    for up, expected in turned(subject):
+        assert up.sure == sure
+        assert not sure or up.name == expected
+        assert len(up.candidates) == (1 if sure else 2)
 
 
 @pytest.mark.parametrize(
