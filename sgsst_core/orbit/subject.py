@@ -236,7 +236,7 @@ def find_up(subject: Subject) -> Up:
     """
     axes = _axes_of(subject.points, subject.weights)
     world = torch.eye(3, dtype=torch.float64)
-    # what a background belongs to doesn't balance
+    # a subject in front of a background is cut off and doesn't balance
     balances = [(_balance(subject, up), up) for up in (*world, *-world)] if subject.left_out <= _WHOLE else []
     firmest = max((balance for balance, _ in balances), default=0.0)
     ground, standing = _ground(subject, [*axes.T, *world]), _standing(subject, axes)
@@ -250,11 +250,14 @@ def find_up(subject: Subject) -> Up:
     similar = [each for each in balances if each[0] >= _SIMILAR * firmest > 0]
     if len(similar) == 1 and firmest >= _FIRM:
         return Up(similar[0][1], "the subject rests firmly on this side, and on no other one")
-    likely = [up for _, up in sorted(similar, key=lambda each: (float(each[1] @ usual) < _SAME, -each[0]))]
-    likely = [*([] if firmest >= _FIRM else [usual]), *(likely if len(likely) <= 2 else []), usual, second]
+    similar.sort(key=lambda each: (float(each[1] @ usual) < _SAME, -each[0]))
+    likely = [up for _, up in similar] if len(similar) <= 2 else []
+    if not likely or firmest < _FIRM or float(likely[0] @ likely[-1]) < 0:  # a panel may stand as well as lie
+        likely = [usual, *likely]
+    likely = [*likely, usual, second]
     other = next(up for up in likely if float(up @ likely[0]) < _SAME)
-    found = "the subject may rest on several sides" if similar else "neither a ground nor a side to rest on was found"
-    return Up(likely[0], f"{found}, and most captures point this way", sure=False, other=other)
+    sides = "the subject may rest on several sides" if similar else "neither a ground nor a side to rest on was found"
+    return Up(likely[0], f"{sides}, and most captures point this way", sure=False, other=other)
 
 
 def _standing(subject: Subject, axes: Tensor) -> Up | None:

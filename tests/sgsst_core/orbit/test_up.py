@@ -79,8 +79,7 @@ def test_long_subject_on_wheels_lies_instead_of_standing() -> None:
 def turned(subject: Subject) -> list[tuple[Up, str]]:
     """Return the estimate, and the true up axis, for a subject in each of the 24 orientations along the axes."""
     estimates = []
-    for rotation in QUARTERS:
-        matrix = torch.from_numpy(rotation.as_matrix()).round()
+    for matrix in torch.from_numpy(QUARTERS.as_matrix()).round():
         copy = replace(subject, points=subject.points @ matrix.T, hull=subject.hull @ matrix.T)
         expected = Up(matrix @ torch.tensor(UP, dtype=torch.float64), "")
         estimates.append((find_up(copy), expected.name))
@@ -153,6 +152,15 @@ def test_up_is_conventional_without_evidence(scene: Scene) -> None:
     assert not up.sure
     assert up.candidates == ["-y", "z"]
     assert "most captures" in up.reason
+
+
+@pytest.mark.parametrize(("normal", "candidates"), [(0, ["y", "x"]), (1, ["y", "y"]), (2, ["y", "z"])])
+def test_panel_may_stand_or_lie(normal: int, candidates: list[str]) -> None:
+    points = box((-3, -1, -3), (3, -0.9, 3)).roll(normal - 1, 1)
+    up = up_of(scene_of(points))
+    assert not up.sure
+    assert [each.removeprefix("-") for each in up.candidates] == candidates
+    assert up.name == "-y"
 
 
 @pytest.mark.parametrize(("along", "name"), [(0, "x"), (1, "-y"), (2, "z")])
