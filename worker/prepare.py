@@ -23,6 +23,7 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile
+from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.context import Networks, common_device, rasterizer_problem
 from sgsst_core.planning.plan import Plan
@@ -111,7 +112,7 @@ def prepare(
     outputs = collectives.broadcast(lambda: check_request(request))
     settings = request.settings
     with timer("reading"):
-        weights = same_weights(request.backbone, collectives)
+        weights = weights_for(same_weights(request.backbone, collectives), settings)
         inputs = read_inputs(request, collectives)
         fingerprint = fingerprint_of(inputs, settings, weights.sha256, collectives)
     resume = resume or Resume(request.resume)
@@ -175,7 +176,8 @@ def dry_run(
     Raises:
         InvalidInputError: If the job cannot be planned.
     """
-    settings, weights = request.settings, load_network_weights(request.backbone)
+    settings = request.settings
+    weights = weights_for(load_network_weights(request.backbone), settings)
     networks, of_job = Networks(), inputs
     chosen = _choose(inputs, settings, left, weights, ALONE, show, networks)
     applied = chosen.applied(settings) if chosen else settings

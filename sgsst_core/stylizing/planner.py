@@ -121,7 +121,7 @@ def plan_job(
     """
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
-    timer, weights = timer or Timer(), weights or load_network_weights("auto")
+    timer, weights = timer or Timer(), weights_for(weights or load_network_weights("auto"), settings)
     asked, settings = settings, chosen.applied(settings) if chosen else settings
 
     def prepared(plan: Plan, context: PlanningContext | None = None) -> StylizationJob:
@@ -137,7 +137,7 @@ def plan_job(
         fitted = fit_cameras(cameras, settings)
         check_scales(settings.scales, fitted, settings.coarsest_side)
         check_stroke_depth(settings, fitted, regions=regions is not None)
-        context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer, networks)
+        context = equip(scene, fitted, settings, weights, collectives, rasterizer, networks)
         if survey is None:
             with timer("survey"):
                 survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
