@@ -23,7 +23,7 @@ from worker.inputs import Inputs
 #: Minimum time between two previews, as a fraction of the job's elapsed time. It limits the number of previews.
 _SHARE = 0.05
 #: Minimum time between a job's first previews, which differ most, in seconds and as a fraction of the elapsed time.
-_FIRST_SECONDS, _FIRST_SHARE = 2.0, 0.25
+_FIRST_SECONDS, _FIRST_SHARE = 2.0, 0.1
 #: Maximum length of a preview's longer side in pixels.
 _SIDE = 960
 #: Maximum length of the thumbnail's longer side in pixels.
