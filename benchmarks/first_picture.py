@@ -26,7 +26,7 @@ from tests.api.service import SETTINGS, Service
 
 #: Aims in seconds on two quiet cores; that of a result is its time budget and a tenth.
 _AIMS = {"colors": 10.0, "strokes": 60.0}
-#: Steps after which strokes are recognizable in a preview: on the statues, the eye sees the first ones after 8.
+#: Steps after which strokes are clear in a preview: on Massa, the eye sees the first ones after 8.
 _STROKES = 12
 _POLL_SECONDS = 0.2
 _SHOWN = "() => [...document.querySelectorAll('figure.preview img')].map((each) => each.src)"

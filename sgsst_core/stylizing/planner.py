@@ -54,8 +54,8 @@ from sgsst_core.stylizing.trial import Trial, launch_cost, run_trial
 from sgsst_core.timing import Timer
 
 #: Longer side in pixels of the views that a time budget is chosen from, and their number for each rank. The time of
-#: larger views is in proportion to their pixels: within a tenth on CPUs, where smaller ones take a third more for each
-#: pixel. Small views hide how much a GPU can do at once.
+#: larger views is about in proportion to their pixels; smaller ones take a third more for each pixel on a CPU, and hide
+#: how much a GPU can do at once.
 _TRIED_SIDE: dict[Device, int] = {"cpu": 256, "cuda": 1280}
 _TRIED_VIEWS = 4
 
