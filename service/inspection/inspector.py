@@ -192,7 +192,8 @@ class Inspector:
 
     async def warm(self) -> None:
         """Start the process that checks the next job in advance: its imports take seconds."""
-        await self._validating.slots[0].warm()
+        with contextlib.suppress(OSError):  # the next job starts it, or tells why it cannot
+            await self._validating.slots[0].warm()
 
     @property
     def is_planning(self) -> bool:
