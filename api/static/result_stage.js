@@ -167,6 +167,7 @@ export class ResultStage {
       this.live.painted = LIVE;
       return (this.loading = this.openRun(job).then(() => this.offer(), () => void (this.live && (this.live.painted = ""))));
     }
+    if (this.stage.viewer?.crowded()) return;
     this.stale = true;
     this.fetching ??= this.fetchWhileStale(job);
     await this.fetching;

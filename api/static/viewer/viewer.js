@@ -13,6 +13,9 @@ import { words } from "../words.js";
 const SLOW = 70, VERY_SLOW = 350;
 /** Milliseconds without movement after which the full resolution is drawn. */
 const STILL = 160;
+/** Least time between two frames that nobody asked for, in durations of a frame. */
+const REST = 10;
+
 export class Viewer {
   /** The scene bounds that the camera was last set to show. @type {SplatScene["middle"]} */
   framed = null;
@@ -152,6 +155,11 @@ export class Viewer {
     const { left, right } = /** @type {{left: Side, right: Side}} */ (this.sides);
     this.canvas.dataset.state = left.scene.whole && right.scene.whole ? "settled" : "loading";
     this.told();
+  }
+
+  /** Return whether a frame now would leave the machine little time for other work, such as the job that is watched. */
+  crowded() {
+    return performance.now() - (this.begun ?? -Infinity) < REST * (this.milliseconds.at(-1) ?? 0);
   }
 
   /** Return whether the GPU has finished the last frame. */
