@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sgsst_core.features.partition import cached_tiles, choose_tile_size, computed_twice, partition
 from sgsst_core.parallel.collectives import TRAFFIC, Traffic
-from sgsst_core.parallel.division import Piece, Shares, divide, rounds
+from sgsst_core.parallel.division import ImageExchange, Piece, Shares, divide, rounds
 from sgsst_core.parallel.visible_gaussians import gaussians_sent
 
 #: Channels of the style layers. Ranks exchange their statistics in float64: first the pixel count and the mean, then
@@ -21,6 +21,15 @@ _SECOND_BYTES = 8 * sum(c * (c + 1) // 2 for c in _STYLE_CHANNELS)
 def loads(division: Sequence[Sequence[Piece]], halo: int) -> list[int]:
     """Return the number of pixels that each rank passes through the network."""
     return [sum(piece.cost(halo) for piece in own) for own in division]
+
+
+def moved(exchange: ImageExchange, rank: int) -> tuple[int, int]:
+    """Return the number of pixels that a rank sends to others, and that it receives from them."""
+    others = [other for other in range(len(exchange.parts)) if other != rank]
+    return (
+        sum(exchange.parts[rank].intersection(exchange.windows[other]).pixels for other in others),
+        sum(exchange.parts[other].intersection(exchange.windows[rank]).pixels for other in others),
+    )
 
 
 @dataclass(frozen=True)
@@ -189,7 +198,7 @@ class IterationWork:
     def _image_bytes(self, ranks: int) -> list[tuple[int, int]]:
         """Return the bytes of the image that each rank sends and receives; those of its gradient go the other way."""
         exchanges = self._shares(ranks).exchanges(self.shards(ranks), self.halo).values()
-        moved = [[exchange.moved(rank) for exchange in exchanges] for rank in range(ranks)]
+        moved = [[moved(exchange, rank) for exchange in exchanges] for rank in range(ranks)]
         return [(12 * sum(sent for sent, _ in each), 12 * sum(received for _, received in each)) for each in moved]
 
     @property

@@ -1,14 +1,4 @@
-"""Region options of the command line and of JSON, converted to the same requests. Imports no PyTorch.
-
-SPEC is the selection of a region, one of
-
-    box=X0,Y0,Z0,X1,Y1,Z1      between two opposite corners
-    sphere=X,Y,Z,R             no farther than R from a point
-    half-space=A,B,C,D         where A x + B y + C z >= D
-    property=NAME>VALUE        by a property of the PLY; also >=, <, <=, =, !=
-    mask=FILE                  one flag per Gaussian, in the file's order: packed bits (.bin) or .npy
-    masks=FOLDER               mask images of some views, white inside the region
-"""
+"""Region options of the command line and of JSON, converted to the same requests. Imports no PyTorch."""
 
 from __future__ import annotations
 
@@ -26,6 +16,11 @@ from sgsst_core.options import parse_strength
 from sgsst_core.settings import OR_STRENGTH, checked
 from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style
 
+#: Selections that need no file, for help texts. Those with a file are `mask=` and `masks=`.
+SHAPES = (
+    "box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, half-space=A,B,C,D (where A x + B y + C z >= D), "
+    "property=NAME>VALUE (also >=, <, <=, =, !=)"
+)
 #: Name of the region of all Gaussians that no selection contains.
 REST = "rest"
 #: Maximum number of regions, the rest excluded.
@@ -47,7 +42,7 @@ class Selection:
     """Selection of a region's Gaussians.
 
     Attributes:
-        text: SPEC as the user gave it.
+        text: SPEC of `--region` as the user gave it.
         numbers: Numbers of a box, sphere or half-space, or the value that a property is compared with.
         name, sign: Property and comparison operator of a property selection.
     """
@@ -95,10 +90,9 @@ class RegionOptions(BaseModel):
     )
     select: Annotated[str, Field(max_length=1000)] | None = Field(
         None,
-        description="Selection of its Gaussians; omitted for the rest: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, "
-        "half-space=A,B,C,D (where A x + B y + C z >= D), property=NAME>VALUE (also >=, <, <=, =, !=), mask=NAME (an "
-        "uploaded `mask` file with a flag per Gaussian) or masks=FOLDER (the uploaded `mask` images in that folder: "
-        "masks of views, white inside).",
+        description=f"Selection of its Gaussians; omitted for the rest: {SHAPES}, mask=NAME (an uploaded `mask` file "
+        "with a flag per Gaussian) or masks=FOLDER (the uploaded `mask` images in that folder: masks of views, white "
+        "inside).",
         examples=["half-space=0,1,0,0.5"],
     )
     style: (

@@ -13,7 +13,7 @@ from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import SUFFIXES
 from worker.options import ESSENTIALS, REGIONS, VIEWS, StylizeOptions
 from worker.outputs import check_file, check_folder
-from worker.region_requests import RegionOptions, region_options, region_requests
+from worker.region_requests import SHAPES, RegionOptions, region_options, region_requests
 from worker.styles import parse_styles
 
 if TYPE_CHECKING:
@@ -97,9 +97,9 @@ class JobInputs:
         list[str] | None,
         typer.Option(
             metavar="NAME:SPEC",
-            help="Region of the scene: box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, half-space=A,B,C,D (Ax+By+Cz>=D), "
-            "property=NAME>VALUE, mask=FILE (a flag for each Gaussian: packed bits in a .bin, or .npy) or masks=FOLDER "
-            "(images of views, white inside the region). May be repeated; where regions overlap, the later one wins.",
+            help=f"Region of the scene: {SHAPES}, mask=FILE (a flag for each Gaussian, in file order: packed bits in a "
+            ".bin, or .npy) or masks=FOLDER (images of views, white inside the region). May be repeated; where regions "
+            "overlap, the later one wins.",
             rich_help_panel=REGIONS,
         ),
     ] = None

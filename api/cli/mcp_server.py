@@ -23,7 +23,7 @@ from api.client import AsyncClient
 from api.client.answers import Job
 from service.parameters import JobParameters
 from sgsst_core.errors import SgsstError
-from sgsst_core.files.formats import DOWNLOAD_SUFFIXES, RESULT_SUFFIXES, ResultName, download_of_name, format_of_name
+from sgsst_core.files import formats
 from sgsst_core.files.formats.ply import PLY
 
 _INSTRUCTIONS = """
@@ -36,7 +36,7 @@ _RESULT = "stylized.ply"
 _READS = ToolAnnotations(read_only_hint=True, open_world_hint=False)
 _CREATES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
 
-Scene = Annotated[str, Field(description="Scene: path of a PLY, SPZ, SOG, GLB, .ksplat or .splat file, or a URL.")]
+Scene = Annotated[str, Field(description=f"Scene: path of a file ({formats.SUFFIXES}), or a URL.")]
 Styles = Annotated[list[str], Field(min_length=1, description="Style images: paths or URLs. Several are mixed.")]
 Cameras = Annotated[
     str | None,
@@ -54,7 +54,9 @@ Options = Annotated[
 JobId = Annotated[str, Field(description="ID of a job, from `submit`.")]
 Out = Annotated[
     str | None,
-    Field(description=f"File to write the scene to, which must not exist: {DOWNLOAD_SUFFIXES}. Null writes none."),
+    Field(
+        description=f"File to write the scene to, which must not exist: {formats.DOWNLOAD_SUFFIXES}. Null writes none."
+    ),
 ]
 
 
@@ -139,7 +141,7 @@ class Tools:
         """Show the newest image of a job and the addresses of its files, and write its scene to a file."""
         with _messages():
             if out:
-                download_of_name(out)
+                formats.download_of_name(out)
             job = await self._client.job(job_id)
             artifacts = await self._client.artifacts(job_id)
             path = await self._write(job_id, _RESULT, out) if out else None
@@ -215,13 +217,13 @@ def _new_file(out: str) -> Path:
     return path
 
 
-def _format(out: str | None) -> ResultName | None:
+def _format(out: str | None) -> formats.ResultName | None:
     """Return the format of a file to write, from its name; None for no file."""
     if out is None:
         return None
-    format = format_of_name(Path(out).name)
+    format = formats.format_of_name(Path(out).name)
     if format is None or not format.write:
-        raise ToolError(f"{out}: has no extension of a scene. Use {RESULT_SUFFIXES}.")
+        raise ToolError(f"{out}: has no extension of a scene. Use {formats.RESULT_SUFFIXES}.")
     return format.name
 
 

@@ -63,14 +63,6 @@ class ImageExchange:
         """Return the pixels [h, w, ...] of a rank's window that are in another rank's part."""
         return window[self.windows[rank].intersection(self.parts[other]).within(self.windows[rank]).slices]
 
-    def moved(self, rank: int) -> tuple[int, int]:
-        """Return the number of pixels that a rank sends to others, and that it receives from them."""
-        others = [other for other in range(len(self.parts)) if other != rank]
-        return (
-            sum(self.parts[rank].intersection(self.windows[other]).pixels for other in others),
-            sum(self.parts[other].intersection(self.windows[rank]).pixels for other in others),
-        )
-
 
 @dataclass(frozen=True)
 class Shares:

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.iteration_work import moved
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.parallel.division import Piece, Shares, divide, rounds
 
@@ -120,7 +121,7 @@ def test_coarse_scales_are_spread_over_the_ranks() -> None:
     by_rank = divide(view(*size, 4), HALO, (1.0,) * 8)
     exchanges = Shares.of(size, by_rank, HALO).exchanges(by_rank, HALO)
     assert max(map(len, by_rank)) == 2
-    received = [sum(exchange.moved(rank)[1] for exchange in exchanges.values()) for rank in range(8)]
+    received = [sum(moved(exchange, rank)[1] for exchange in exchanges.values()) for rank in range(8)]
     assert max(received) < 0.55 * (size[0] // 2) * (size[1] // 2)
 
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.iteration_work import moved
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO, STYLE_LAYERS
 from sgsst_core.loss.terms import TERMS
@@ -187,7 +188,7 @@ def test_step_record_has_sent_bytes() -> None:
         exchanges = Shares.of((HEIGHT, WIDTH), by_rank, halo).exchanges(by_rank, halo)
         assert [*exchanges] == [*range(1, result["scales"])]
         assert result["steps"][1] == {
-            "image": 12 * sum(sum(exchange.moved(0)) for exchange in exchanges.values()),
+            "image": 12 * sum(sum(moved(exchange, 0)) for exchange in exchanges.values()),
             "statistics": result["scales"] * statistics,
             "gradient": 12 * int(shown_of(wall(), cameras(1, WIDTH, HEIGHT)[0]).sum()),
         }
