@@ -31,59 +31,7 @@ def is_subpath(text: str) -> bool:
 
 
 class ServiceSettings(BaseSettings):
-    """Settings that API and dispatcher read from the same environment.
-
-    Attributes:
-        data: Folder of database, inputs and results.
-        database: SQLAlchemy URL; None for SQLite in `data`. PostgreSQL: `postgresql+psycopg://user@host/name`.
-        artifacts: fsspec URL of the file store. It holds the results and, unless it is a local folder, the inputs; None
-            for a folder in `data`. S3: `s3://bucket/prefix`.
-        file_cache_bytes: Size limit of a host's cache of inputs from the file store.
-        host, port: Address the API listens on.
-        require_keys: Whether requests need an API key; None requires keys unless the API is bound to loopback.
-        max_request_bytes: Size limit of one request body; multipart uploads may be larger.
-        max_upload_bytes: Size limit of one file.
-        max_gaussians, max_views, max_pixels: Limits per job; pixels are those of all views together.
-        max_image_pixels: Pixel limit of each style image and each photo.
-        max_photos: Maximum number of photos per job.
-        max_jobs_per_key: Maximum number of unfinished jobs per key.
-        max_jobs_a_day_per_key, max_gpu_seconds_a_day_per_key, max_bytes_per_key, max_requests_a_second_per_key: Quotas
-            of keys without their own (`service.store.quotas`); None for no limit.
-        max_connections: Maximum number of concurrent connections per API process, including event streams.
-        trusted_proxies: Addresses and networks of reverse proxies, separated by commas, whose `X-Forwarded-For`,
-            `X-Forwarded-Proto` and `X-Forwarded-Prefix` are trusted; empty for none.
-        root_path: Path at which a reverse proxy offers the service, such as `/sgsst`; replaces `X-Forwarded-Prefix`.
-        min_free_bytes: Free disk space below which the service accepts no data.
-        inspection_seconds, inspection_bytes: Base limits of CPU time and memory for checking a job's files; both grow
-            with the size of the files (`service.inspection.inspector`).
-        dry_run_seconds: Base limit of CPU time for a dry run; it grows with Gaussians and views.
-        receive_seconds: Time without new bytes after which a request body is abandoned, or without reading a response.
-        answer_seconds: Time without progress after which a request is answered with 503, or its response ended.
-        session_days: Lifetime of a browser session that was started with a key.
-        upload_hours: Time after which an unfinished upload, or a finished one that no job uses, expires.
-        retention_days: Time after which the results of a finished job expire; the job's record is deleted after another
-            such period.
-        lease_seconds: Time without heartbeat after which another dispatcher takes over a job.
-        max_attempts: Consecutive attempts without progress after which a job fails.
-        retry_seconds: Delay before the second attempt; it doubles with each further one.
-        parallel_jobs: Maximum number of concurrent jobs; None for one per GPU (one in total if there are no GPUs).
-        cluster_gpus: GPUs of the Ray cluster at RAY_ADDRESS that this dispatcher may assign to jobs.
-        start_seconds: Time that a starting process waits for a database server that does not respond yet.
-        checkpoint_seconds: Interval between checkpoints of a running job.
-        preview_seconds: Interval between preview images of a running job; its log is updated as often if it has grown.
-        stop_seconds: Time that a job has for stopping before it is killed.
-        poll_seconds: Interval between a dispatcher's searches for jobs to start, stop or clean up after.
-        webhooks: Whether jobs may name a URL that gets messages about them.
-        webhook_private_addresses: Whether webhook URLs may lead to private networks.
-        url_hosts: Hosts that inputs named by URL may be fetched from, separated by commas; empty for none. `HOST` means
-            `https://HOST`; other schemes and ports are written out, as in `http://minio:9000`.
-        url_bytes: Size limit of all inputs that one request names by URL.
-        url_seconds: Time limit for fetching all inputs of one request, from the first name lookup to the last byte.
-        url_private_addresses: Whether `url_hosts` may have addresses in private networks.
-        embed_origins: Origins whose pages may show shared results in a frame, separated by commas, as in `url_hosts`;
-            empty for none.
-        log_format: "json" or "text".
-    """
+    """Settings that API and dispatcher read from the same environment; docs/operations.md describes each."""
 
     model_config = SettingsConfigDict(env_prefix="SGSST_", extra="ignore", frozen=True)
 

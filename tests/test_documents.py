@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from service.settings import ServiceSettings
 from sgsst_core.files.formats import FORMATS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -88,3 +89,13 @@ def test_usage_lists_every_scene_format() -> None:
 def test_usage_lists_every_capture() -> None:
     captures = {path.name for path in (ROOT / "tests/sgsst_core/files/captures").iterdir()}
     assert {name for row in usage_rows("| from | give |") for name in re.findall(r"`(\w+)`", row[-1])} == captures
+
+
+def test_operations_lists_every_setting_with_its_default() -> None:
+    listed = dict(re.findall(r"^\| `SGSST_(\w+)` \| (.*?) \| ", (ROOT / "docs/operations.md").read_text(), re.M))
+    defaults = {name.upper(): field.default for name, field in ServiceSettings.model_fields.items()}
+    assert listed.keys() == defaults.keys()
+    written = {name: text.strip("`").replace(",", "").replace(" GB", "0" * 9) for name, text in listed.items()}
+    described = {name for name, value in defaults.items() if value is None or value == ""}
+    wrong = {name for name, value in defaults.items() if written[name] != str(value).replace("False", "false")}
+    assert wrong == described
