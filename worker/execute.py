@@ -188,9 +188,8 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
         measure.at_the_end()
     # The initial loss is evaluated here, because evaluating it before the first step would delay the job.
     before = measure.evaluate(unstylized=True)
-    # A run that ends before its first step has no round of views.
-    round_length, weights = stylizer.job.round_length, stylizer.job.loss.weights
-    after = round_evaluation(stylizer.history, round_length, weights) if stylizer.history else measure.evaluate()
+    weights = stylizer.job.loss.weights
+    after = round_evaluation(stylizer.history, stylizer.job.round_length, weights)
     error = _write_reports(job, stopped, before, after, compressed) if first else None
     return Result(
         stopped=stopped,

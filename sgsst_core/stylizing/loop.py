@@ -93,7 +93,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     callbacks.left = callbacks.left or seconds_left(stylizer.job.settings.within)
     try:
         last_checkpoint = last_preview = time.perf_counter()
-        pace, ended = _pace(stylizer), partial(_end_requested, stylizer, callbacks)
+        pace, ended = _pace(stylizer), partial(_end_requested, stylizer, callbacks, stylizer.step)
         report = _Reports(stylizer, callbacks, pace)
         if callbacks.preview and not stylizer.step:
             callbacks.preview(stylizer)
@@ -126,11 +126,16 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
         stylizer.job.view_targets.end_prefetch()
 
 
-def _end_requested(stylizer: Stylizer, callbacks: Callbacks) -> Stopped | None:
-    """Return the reason if the user or the time limit ends the run before the next step. Ranks may disagree."""
+def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int) -> Stopped | None:
+    """Return the reason if the user or the time limit ends the run before the next step. Ranks may disagree.
+
+    A run that is to have a result makes a step at least, given the step that it starts at: resuming it gets further.
+    """
     if callbacks.stop and callbacks.stop():
         return "interrupted"
-    if callbacks.finish and stylizer.step and callbacks.finish():
+    if stylizer.step == first:
+        return None
+    if callbacks.finish and callbacks.finish():
         return "on-request"
     return "within" if callbacks.left and callbacks.left() <= _reserved(stylizer, callbacks) else None
 

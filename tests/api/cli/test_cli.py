@@ -346,7 +346,7 @@ def test_time_budget_writes_result_and_checkpoint(files: Files, capsys: pytest.C
     options = files.stylize("--steps-sos", "5")
     assert main([*options, "--within", "0.000001"]) == 0
     shown = capsys.readouterr().out
-    assert "The time of --within was used up at step 0 of 5" in shown
+    assert "The time of --within was used up at step 1 of 5" in shown
     assert "--resume" in shown
     checkpoint = files.out.with_name("stylized.checkpoint.safetensors")
     assert checkpoint.exists()

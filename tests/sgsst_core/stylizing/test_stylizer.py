@@ -187,14 +187,23 @@ def test_evaluating_changes_nothing(tiny_weights: BackboneWeights, scene: Scene)
 
 
 def test_time_budget_stops_the_run_with_a_checkpoint(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    """The clock advances by a second before each step, and the next step and the end need less than one."""
+    """The clock advances by a second before each step but the first; the next step and the end need less than one."""
     stylizer = make(tiny_weights, scene)
     saved: list[int] = []
-    left = iter(range(3, -1, -1))
+    left = iter(range(2, -1, -1))
     callbacks = Callbacks(checkpoint=lambda s: saved.append(s.step), left=lambda: next(left))
     assert run(stylizer, callbacks) == "within"
     assert saved == [stylizer.step]
     assert 0 < stylizer.step <= 3
+
+
+def test_run_without_time_makes_a_step_so_that_resuming_gets_further(
+    tiny_weights: BackboneWeights, scene: Scene
+) -> None:
+    stylizer = make(tiny_weights, scene)
+    for step in (1, 2):
+        assert run(stylizer, Callbacks(left=lambda: 0.0)) == "within"
+        assert stylizer.step == step
 
 
 def test_stop_request_ends_the_run_between_steps(tiny_weights: BackboneWeights, scene: Scene) -> None:
