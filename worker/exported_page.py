@@ -45,7 +45,7 @@ def write_page(
     title: str,
     *,
     background: Color = (0.0, 0.0, 0.0),
-    up: tuple[float, float, float] | None = None,
+    up: list[float] | None = None,
     in_place: bool = False,
 ) -> None:
     """Write a scene as an HTML file, atomically.
@@ -68,7 +68,7 @@ def write_page(
     data = {name: gzip.compress(viewer[name].encode(), mtime=0) for name in ("page", "worker")}
     data["scene"] = _sog(shown.scene, out)
     data["colors"] = b"" if original is None else gzip.compress(_indexed_colors(stylized.scene, out), mtime=0)
-    upright = find_upright_subject(shown.scene, up)[1].direction.tolist()
+    upright = up or find_upright_subject(shown.scene, None)[1].direction.tolist()
     sizes = {name: len(content) for name, content in data.items()}
     sog = shown.format in (SOG.name, STREAMED_SOG.name)
     facts = {"title": title, "up": upright, "fade": fade, "sog": sog, "background": background, "bytes": sizes}

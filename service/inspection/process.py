@@ -46,6 +46,7 @@ from sgsst_core.features.network_weights import list_network_weights
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.images import image_size
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.orbit.choice import find_upright_subject
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.progress import Progress
@@ -62,6 +63,7 @@ from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo
 from worker.prepare import dry_run
 from worker.processes import die_with_parent, process_start
+from worker.selecting import cropped
 from worker.video import VideoRequest, render_video
 
 with contextlib.suppress(ImportError):
@@ -227,9 +229,12 @@ def _page(request: WorkRequest, _send: _Send) -> dict[str, Any]:
     original = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     both = read_scene(Path(options["result"])), original
     stylized, before = (file.rendered(source.render_mode, source.eps2d) for file in both)
-    background, up = request.parameters.settings().background, orbit_request(source).up
+    job = job_spec(request.staged, request.parameters)
+    remaining = cropped(job.regions, original, source.near)
+    upright = find_upright_subject(original.scene, orbit_request(source).up, remaining)[1].direction.tolist()
+    background = job.settings.background
     write = partial(
-        write_page, request.output_file, options["viewer"], stylized, background=background, up=up, in_place=True
+        write_page, request.output_file, options["viewer"], stylized, background=background, up=upright, in_place=True
     )
     try:
         write(before, options["title"])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Literal
 import av
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from api.static_files import exported_viewer
 from service import problems
@@ -38,6 +41,7 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.service import PATIENCE
 from tests.raised import raises_problem
 from tests.service.store.helpers import usage_of
+from tests.sgsst_core.orbit.objects import figure, joined, moved
 from tests.small_scenes import wall, write_files
 from worker.inputs import read_job_capture
 from worker.options import JobVideo
@@ -171,6 +175,34 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
     assert '"up": [1.0, 0.0, 0.0]' in text
     assert '"sog": false' in text
     assert '"background": [1.0, 1.0, 1.0]' in text
+
+
+def test_page_shows_what_a_crop_leaves_upright(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    lying = moved(figure(), Rotation.from_euler("z", 90, degrees=True), 0.2, (5, 0, 0))
+    write_scene(Path("scene.ply"), joined(figure(), lying))
+    Path(RESULT).write_bytes(Path("scene.ply").read_bytes())
+    crop = [{"name": "inside", "select": "box=4,-1,-1,6,1,1"}, {"name": "rest", "freeze": True}]
+
+    def up(**parameters: object) -> list[float]:
+        request = WorkRequest(
+            work="page",
+            folder=tmp_path,
+            staged=Staged(scene=Path("scene.ply"), styles=(), cameras=None, photos=None),
+            parameters=JobParameters.model_validate({"orbit": 3, **parameters}),
+            seconds=0,
+            memory=0,
+            options={"result": RESULT, "viewer": exported_viewer(), "title": "figures"},
+            output=("page.html", 0),
+        )
+        WORK["page"][0](request, lambda response: None)
+        match = re.search(r'"up": (\[[^]]*\])', Path("page.html").read_text(encoding="utf-8"))
+        assert match
+        direction: list[float] = json.loads(match[1])
+        return direction
+
+    assert up() == [0.0, -1.0, 0.0]
+    assert up(regions=crop) == [1.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("path", ["cameras", "orbit"])
