@@ -13,7 +13,7 @@ import { JobStage } from "./job_stage.js";
 import { nameOf } from "./names.js";
 import { planOf } from "./plan.js";
 import { ShareCard } from "./share_card.js";
-import { LIVE } from "./result_stage.js";
+import { LIVE, PREVIEW } from "./result_stage.js";
 import { actionsOf, titles, UNFINISHED, WORKING } from "./statuses.js";
 import { VideoCard } from "./video_card.js";
 import { time, words } from "./words.js";
@@ -171,7 +171,7 @@ export class JobView {
 
   /** @param {{name: string}} artifact */
   onArtifact({ name }) {
-    if (name.startsWith("previews/")) this.stage.showPreview(name);
+    if (name.startsWith(PREVIEW)) this.stage.showPreview(name);
     else if (name === LIVE && this.stage.live) this.stage.paint();
     else this.filesLater();
   }
@@ -256,7 +256,7 @@ export class JobView {
       return;
     }
     const names = new Set(found.map(({ name }) => name));
-    const previews = found.map(({ name }) => name).filter((name) => name.startsWith("previews/")).sort();
+    const previews = found.map(({ name }) => name).filter((name) => name.startsWith(PREVIEW)).sort();
     if (previews.length) this.stage.showPreview(previews[previews.length - 1]);
     else this.stage.showNoPreview(UNFINISHED.has(this.job.status) ? say.noPreview : "");
     this.files.hidden = false;

@@ -19,6 +19,8 @@ import { words } from "./words.js";
 const say = words.viewer;
 /** Name of the file with the colors so far of a running job. */
 export const LIVE = "live/colors.f16";
+/** Start of the names of previews; the thumbnail of a finished job is none. */
+export const PREVIEW = "previews/step_";
 
 export class ResultStage {
   /**

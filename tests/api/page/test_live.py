@@ -109,7 +109,7 @@ def test_job_that_ended_early_continues(visit: Visit, service: Service, files: d
     before = httpx2.get(f"{service.url}/v1/jobs/{done(service, job_id)}").json()["result"]
     assert before["steps"] < before["total"] == 200
     page.get_by_role("button", name="Continue").click()
-    page.locator(".badge", has_text="Running").wait_for()
+    page.locator("figure.preview img[src*='/step_']").wait_for(state="attached")  # not the thumbnail
     page.locator(".badge", has_text="Done").wait_for()
     assert "stopped early" not in page.locator(".head").inner_text()
     assert page.get_by_role("button", name="Continue").count() == 0
