@@ -45,7 +45,7 @@ export class CropPanel {
     if (!middle) return announce(words.select.notLoaded);
     this.remove.hidden = !this.box;
     this.element.hidden = false;
-    this.tool.show(this.box ? boxOf(this.box) : shapeAround("box", middle, 1));
+    this.tool.show(this.box ? boxOf(this.box) : shapeAround("box", middle, 1.3));
     this.first.focus({ preventScroll: true });
     this.element.scrollIntoView({ block: "nearest" });
   }

@@ -264,13 +264,13 @@ export class Stage {
     this.viewer.moved();
   }
 
-  /** Turn the scene so that a direction points up. @param {number[]} up */
-  standUp(up) {
+  /** Turn the scene so that a direction points up. @param {number[]} up @param {number[]} [front] see `Viewer.frame` */
+  standUp(up, front) {
     const { viewer } = this;
     if (!viewer || dot(up, this.up) > 0.999) return;
     this.up = viewer.camera.up = up;
     this.leaveCamera();
-    viewer.reframe();
+    viewer.reframe(front);
   }
 
   async save() {

@@ -1,7 +1,7 @@
 // @ts-check
 /** Buttons of the form's 3D view that turn a scene which lies on its side: they choose the job's up direction. */
 import { h, icon } from "./dom.js";
-import { dot, times } from "./viewer/vectors.js";
+import { cross, dot, times } from "./viewer/vectors.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./viewer/vectors.js").Vector} Vector */
@@ -31,15 +31,16 @@ export function turnedUp(up, wanted) {
  * Create the buttons.
  *
  * @param {import("./stage.js").Stage} stage
- * @param {(up: string) => void} choose receives the value of the option `up`
+ * @param {(up: string, front: Vector) => void} choose receives the value of the option `up`, and the direction from
+ *   which to look then
  */
 export function uprightButtons(stage, choose) {
-  const button = (/** @type {"turn" | "tip"} */ name, /** @type {(axes: Vector[]) => Vector} */ wanted) => h("button.tool", {
+  const button = (/** @type {"turn" | "tip"} */ name, /** @type {(up: Vector, ahead: Vector) => [Vector, Vector]} */ turned) => h("button.tool", {
     type: "button", title: say[name], "aria-label": say[name], onclick: () => {
       if (!stage.viewer?.sides) return;
-      const { up, axes } = stage.viewer.camera, name = turnedUp(up, wanted(axes));
-      choose(name);
+      const { up, axes: [, , forward] } = stage.viewer.camera, [wanted, front] = turned(up, UPS[turnedUp(up, forward)]);
+      choose(turnedUp(up, wanted), front);
     },
   }, icon(name));
-  return h("div.upright", button("turn", ([right]) => times(right, -1)), button("tip", ([, , forward]) => forward));
+  return h("div.upright", button("turn", (up, ahead) => [cross(up, ahead), times(ahead, -1)]), button("tip", (up, ahead) => [ahead, up]));
 }

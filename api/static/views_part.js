@@ -42,12 +42,16 @@ export class ViewsPart {
     this.turn = 0;
     this.around = choice("views", say.around, false, () => this.choose());
     this.fromFiles = choice("views", say.fromFiles, true, () => this.choose());
-    this.automatic = h("p.help", say.noCameras, " ", h("button.quiet.small", { type: "button", onclick: () => slots.cameras.input.click() }, say.chooseCameras));
+    this.automatic = h("p.help", say.noCameras);
     this.body = h("div.views-body");
     this.found = h("p.quiet");
-    this.upright = uprightButtons(stage, (up) => this.standUp(up));
+    this.upright = uprightButtons(stage, (up, front) => this.standUp(up, front));
     stage.tools.prepend(this.upright);
-    options.ring.addEventListener("input", () => this.showCameras());
+    options.ring.addEventListener("input", (/** @type {Event} */ event) => {
+      const up = options.controls.get("up");
+      if (up?.element.contains(/** @type {Node} */ (event.target))) this.showUp(up.value());
+      else this.showCameras();
+    });
     this.element = h("section", h("h2", say.views), h("fieldset.segments.wide", h("legend.away", say.views), this.fromFiles.element, this.around.element), this.body, this.found);
   }
 
@@ -56,15 +60,15 @@ export class ViewsPart {
     return this.around.input.checked;
   }
 
-  /** Choose the up direction. @param {string} up value of the option `up` */
-  standUp(up) {
+  /** Choose the up direction. @param {string} up value of the option `up` @param {number[]} [front] see `Viewer.frame` */
+  standUp(up, front) {
     this.options.controls.get("up")?.set(up);
-    this.showUp(up);
+    this.showUp(up, front);
   }
 
-  /** Turn the scene and its orbit to an up direction. @param {string} up */
-  showUp(up) {
-    this.stage.standUp(directionOf(up) ?? this.stage.up);
+  /** Turn the scene and its orbit to an up direction. @param {string} up @param {number[]} [front] see `Viewer.frame` */
+  showUp(up, front) {
+    this.stage.standUp(directionOf(up) ?? UPS["-y"], front);
     this.showCameras();
   }
 

@@ -79,18 +79,24 @@ export class Viewer {
     this.draw();
   }
 
-  /** Look at the whole scene. @param {number[]} up */
-  frame(up) {
+  /**
+   * Look at the whole scene.
+   *
+   * @param {number[]} up
+   * @param {number[]} [front] direction from which to look, as far as it is level; by default that of the format
+   */
+  frame(up, front) {
     const scene = this.sides?.left.scene;
-    if (scene?.middle) this.camera.frame(scene.middle, up, scene.front);
+    if (scene?.middle) this.camera.frame(scene.middle, up, front ?? scene.front);
   }
 
-  /** Show the whole scene, as before the first movement of the camera. */
-  reframe() {
+  /** Show the whole scene, as before the first movement of the camera. @param {number[]} [front] see `frame` */
+  reframe(front) {
     this.touched = false;
     this.camera.shape = 0;
-    this.framed = null;
-    this.sceneChanged();
+    this.framed = this.sides?.left.scene.middle ?? null;
+    this.frame(this.camera.up, front);
+    this.draw();
   }
 
   /**
