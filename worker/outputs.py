@@ -151,10 +151,15 @@ def check_request(request: JobSpec) -> Outputs:
     out = request.out
     check_file(out)
     outputs = Outputs.of(out)
-    for path in (outputs.ply, outputs.compressed):
-        if path is not None:
-            remark = "" if path == out else f" (the PLY beside {out.name})"
-            check_is_not_input(path, request.source.scene, remark=remark)
+    inputs = {request.source.scene: "scene itself"}
+    if request.source.cameras is not None:
+        inputs[request.source.cameras] = "camera file"
+    styles = (*request.styles, *(style for region in request.regions for style in region.styles))
+    inputs |= {style.path: "style image" for style in styles}
+    for path in outputs.all:
+        remark = "" if path == out else f" (written beside {out.name})"
+        for read, description in inputs.items():
+            check_is_not_input(path, read, description, remark)
     if outputs.compressed_format is STREAMED_SOG:
         _check_levels(request)
     return outputs

@@ -106,7 +106,7 @@ def test_compressed_result_never_overwrites_scene(files: Files, capsys: pytest.C
     before = files.ply.read_bytes()
     files.out = files.ply.with_suffix(".spz")
     assert main(files.stylize()) == 2
-    assert "(the PLY beside scene.spz): is the scene itself" in capsys.readouterr().err
+    assert "(written beside scene.spz): is the scene itself" in capsys.readouterr().err
     files.out = files.ply.with_suffix(".splat")
     assert main(files.stylize()) == 2
     assert f"does not end in {RESULT_SUFFIXES}" in capsys.readouterr().err
@@ -476,6 +476,18 @@ def _out_is_the_scene(files: Files) -> list[str]:
     return []
 
 
+def _report_is_the_camera_file(files: Files) -> list[str]:
+    files.cameras = files.cameras.rename(files.cameras.with_name("stylized.report.json"))
+    files.out = files.cameras.with_name("stylized.ply")
+    return []
+
+
+def _sheet_is_a_region_style(files: Files) -> list[str]:
+    files.out = files.style.with_name("stylized.ply")
+    sheet = shutil.copy(files.style, files.style.with_name("stylized.before_after.jpg"))
+    return ["--region", "near:sphere=0,0,4,1", "--region-style", f"near={sheet}"]
+
+
 def _out_is_no_ply(files: Files) -> list[str]:
     files.out = files.style
     return []
@@ -520,6 +532,8 @@ def _damaged_checkpoint(files: Files) -> list[str]:
         (_out_is_a_folder, ["is a folder"]),
         (_out_lies_in_a_file, ["cameras.json"]),
         (_out_is_the_scene, ["is the scene itself"]),
+        (_report_is_the_camera_file, ["report.json (written beside stylized.ply): is the camera file"]),
+        (_sheet_is_a_region_style, ["before_after.jpg (written beside stylized.ply): is the style image"]),
         (_out_is_no_ply, ["does not end in .ply"]),
         (_no_steps, ["steps are 0"]),
         (_both_cameras_and_orbit, ["--cameras", "--orbit"]),
