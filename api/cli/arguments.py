@@ -53,6 +53,12 @@ def _checking(check: Callable[[Path], None]) -> Callable[..., Path | None]:
 #: for a path that the command itself checks.
 file_to_write, folder_to_write, path_to_write = map(_checking, (check_file, check_folder, lambda path: None))
 
+
+def path_to_read(help: str, **how: Any) -> Any:
+    """Return an option that names a local file or folder to read, with further arguments of `typer.Option`."""
+    return typer.Option(parser=local_path, metavar="PATH", help=help, **how)
+
+
 _SCENE: dict[str, Any] = {"metavar": "SCENE", "help": f"3DGS scene: {SUFFIXES}.", "show_default": False}
 _CAMERAS: dict[str, Any] = {
     "metavar": "PATH",
@@ -61,12 +67,15 @@ _CAMERAS: dict[str, Any] = {
 }
 SceneArgument = Annotated[Path, typer.Argument(parser=local_path, **_SCENE)]
 CamerasOption = Annotated[Path | None, typer.Option(parser=local_path, **_CAMERAS)]
-_STYLE: Any = typer.Option(
-    parser=local_path, metavar="PATH", help="Style image.", show_default=False, rich_help_panel=ESSENTIALS
-)
+_STYLE = path_to_read("Style image.", show_default=False, rich_help_panel=ESSENTIALS)
 StyleOption = Annotated[Path, _STYLE]
 OptionalStyleOption = Annotated[Path | None, _STYLE]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def _of_region(metavar: str, help: str) -> Any:
+    """Return an option of regions."""
+    return typer.Option(metavar=metavar, help=help, rich_help_panel=REGIONS)
 
 
 @dataclass(frozen=True)
@@ -95,43 +104,29 @@ class JobInputs:
     ] = None
     region: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME:SPEC",
-            help=f"Region of the scene: {SHAPES}, mask=FILE (a flag for each Gaussian, in file order: packed bits in a "
+        _of_region(
+            "NAME:SPEC",
+            f"Region of the scene: {SHAPES}, mask=FILE (a flag for each Gaussian, in file order: packed bits in a "
             ".bin, or .npy) or masks=FOLDER (images of views, white inside the region). May be repeated; where regions "
             "overlap, the later one wins.",
-            rich_help_panel=REGIONS,
         ),
     ] = None
     region_style: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=FILE[:WEIGHT]",
-            help="Style image of a region. Several are mixed. [default: the job's style]",
-            rich_help_panel=REGIONS,
-        ),
+        _of_region("NAME=FILE[:WEIGHT]", "Style image of a region. Several are mixed. [default: the job's style]"),
     ] = None
     region_weight: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=WEIGHT", help="Weight of a region's style in the loss. [default: 1]", rich_help_panel=REGIONS
-        ),
+        list[str] | None, _of_region("NAME=WEIGHT", "Weight of a region's style in the loss. [default: 1]")
     ] = None
     region_freeze: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Freeze a region: its colors stay bit-identical. rest: all Gaussians without a region.",
-            rich_help_panel=REGIONS,
-        ),
+        _of_region("NAME", "Freeze a region: its colors stay bit-identical. rest: all Gaussians without a region."),
     ] = None
-
     region_content_weight: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=W",
-            help="Weight of the content term in a region: a number, light, balanced or strong. [default: the job's]",
-            rich_help_panel=REGIONS,
+        _of_region(
+            "NAME=W",
+            "Weight of the content term in a region: a number, light, balanced or strong. [default: the job's]",
         ),
     ] = None
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from api.cli.arguments import JobInputs, folder_to_write, local_path
+from api.cli.arguments import JobInputs, folder_to_write, local_path, path_to_read
 from api.cli.client_commands import KeyOption, conclude, follow, open_client
 from api.cli.console import FAILURE, JOB_FAILED, Invocation, error_console, print_field, transfer_bar
 from api.cli.options import flags, with_options
@@ -134,12 +134,7 @@ def batch(
     ],
     cameras: Annotated[
         Path | None,
-        typer.Option(
-            parser=local_path,
-            metavar="PATH",
-            help="Cameras of all scenes. [default: those beside each scene]",
-            rich_help_panel=ESSENTIALS,
-        ),
+        path_to_read("Cameras of all scenes. [default: those beside each scene]", rich_help_panel=ESSENTIALS),
     ] = None,
     url: Annotated[
         str | None, typer.Option("--url", help="URL of a service that makes the results. [default: this machine]")

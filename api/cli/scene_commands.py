@@ -19,7 +19,7 @@ from api.cli.arguments import (
     SceneArgument,
     file_to_write,
     folder_to_write,
-    local_path,
+    path_to_read,
     path_to_write,
 )
 from api.cli.console import error_console, out_console, print_field, spinner
@@ -123,9 +123,7 @@ def render(
     cameras: CamerasOption = None,
     compare: Annotated[
         Path | None,
-        typer.Option(
-            parser=local_path, metavar="PATH", help="Unstylized scene: the video starts with it and ends with SCENE."
-        ),
+        path_to_read("Unstylized scene: the video starts with it and ends with SCENE."),
     ] = None,
     transparent: Annotated[
         bool, typer.Option("--transparent", help="Write an alpha channel, to a .webm file or PNG images of a video.")
@@ -208,19 +206,11 @@ def convert(
     ] = False,
     cameras: Annotated[
         Path | None,
-        typer.Option(
-            parser=local_path,
-            metavar="PATH",
-            help="Cameras that --compare renders, and that decide the axes of an SPZ. [default: an orbit]",
-        ),
+        path_to_read("Cameras that --compare renders, and that decide the axes of an SPZ. [default: an orbit]"),
     ] = None,
     levels_of: Annotated[
         Path | None,
-        typer.Option(
-            parser=local_path,
-            metavar="PATH",
-            help="Streamed SOG that SCENE was made from: its coarser levels take the nearest changes of color.",
-        ),
+        path_to_read("Streamed SOG that SCENE was made from: its coarser levels take the nearest changes of color."),
     ] = None,
     *,
     options: ViewOptions,
@@ -250,12 +240,7 @@ def view(
     ],
     original: Annotated[
         Path | None,
-        typer.Option(
-            parser=local_path,
-            metavar="PATH",
-            help="Unstylized scene to compare with, by a wipe and a blend.",
-            rich_help_panel=ESSENTIALS,
-        ),
+        path_to_read("Unstylized scene to compare with, by a wipe and a blend.", rich_help_panel=ESSENTIALS),
     ] = None,
     title: Annotated[str | None, typer.Option(help="Title of the page. [default: the name of the scene]")] = None,
     *,
