@@ -17,8 +17,6 @@ class ServiceError(SgsstError):
     """Error that the service raises on purpose, and answers with a problem document.
 
     Attributes:
-        problem: Problem that occurred.
-        code, status: Code and HTTP status of the response.
         retry_after: Seconds after which the request may succeed (`Retry-After`); None if waiting does not help.
         extra: Additional members of the problem document.
     """
@@ -87,12 +85,10 @@ class ProblemType:
 
     Attributes:
         code: Stable identifier for programs.
-        status: HTTP status of the response.
         message: Usual message, with the names of values in braces.
         members: Names of the values that are additional members of the problem document.
         retry_after: Seconds after which the request may succeed; None if waiting does not help.
         headers: Further headers of the response, with the names of values in braces.
-        error: Class of the error.
         example: Arguments of a call for the example in the API's documentation.
     """
 

@@ -16,7 +16,6 @@ class Decision:
     """One line of a plan.
 
     Attributes:
-        reason: Evidence for it.
         seconds: Estimated seconds saved per iteration; None if unknown.
         bytes: Memory saved in bytes; None if unknown.
         error: Possible cost in accuracy; "none" if results change only by rounding.

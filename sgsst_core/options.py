@@ -71,13 +71,7 @@ class Option:
 
 @dataclass(frozen=True)
 class Declared:
-    """Model field that is offered as an option.
-
-    Attributes:
-        field: Name in the model.
-        info: Field information from pydantic.
-        option: Presentation to users.
-    """
+    """Model field that is offered as an option."""
 
     field: str
     info: FieldInfo

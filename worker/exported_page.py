@@ -51,9 +51,7 @@ def write_page(
     """Write a scene as an HTML file, atomically.
 
     Args:
-        out: File to write.
         viewer: Sources of the viewer; see `api.static_files.exported_viewer`.
-        stylized: Scene to show.
         original: Scene of the same Gaussians to show beside it, with a wipe and a blend; None for none.
         background: Color behind the scene, in 0..1.
         up: Up direction; None to estimate it.

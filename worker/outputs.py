@@ -35,8 +35,6 @@ def check_is_not_input(out: Path, path: Path, description: str = "scene itself",
     """Check that an output is not one of the inputs.
 
     Args:
-        out: File to write.
-        path: File to read.
         description: Name of the input in the message.
         remark: Text about the output for the message.
 

@@ -163,7 +163,6 @@ def blend_files(texts: Sequence[str], out: Path, options: ViewOptions) -> list[t
 
     Args:
         texts: FILE or FILE:WEIGHT of each scene.
-        options: Options for reading the scenes.
 
     Raises:
         InvalidInputError: If the weights, a scene or the output cannot be used.

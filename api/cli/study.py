@@ -35,7 +35,6 @@ def make_study(
     Args:
         variants: Scenes to compare, each as FILE or NAME=FILE.
         source: Cameras and view options; its scene is replaced by each variant. An orbit is placed around the first.
-        background: Background color of the views.
         page: HTML file to write; the key goes beside it.
 
     Raises:

@@ -149,7 +149,6 @@ class Transport:
 
     Attributes:
         http: HTTP client for requests without retries.
-        url: Address of the service.
         reached: Whether the service has responded. If it has, a refused connection may mean that it restarts.
     """
 

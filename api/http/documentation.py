@@ -236,7 +236,6 @@ def raises(*raised: ProblemType, body: type[BaseModel] | None = None) -> Callabl
     """Return a decorator that documents a dependency of routes.
 
     Args:
-        raised: Problems that it raises.
         body: Model of the JSON body that it reads; None if it reads none.
     """
 

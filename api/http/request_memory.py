@@ -14,9 +14,6 @@ class RequestMemory:
     Each connection may hold an equal fraction of the total. It covers the head, the part of the body that the app has
     not read yet, and the block that is written to disk next. A JSON body must be complete before it can be parsed. It
     may exceed this fraction as long as all JSON bodies together stay within the total.
-
-    Attributes:
-        connections: Number of open connections.
     """
 
     def __init__(self) -> None:

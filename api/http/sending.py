@@ -78,7 +78,6 @@ class SentFile:
 
     Attributes:
         owner: Owner of the file, whose turn it is sent in.
-        sha256, size: SHA-256 and size in bytes of the content.
         name: Suggested name for saving the file.
         kind: Media type.
         check: Function that checks that the stored file has this content. It is fast if the file was checked recently.

@@ -48,8 +48,6 @@ class Service:
         """Stylize a scene, write it to a file, and return the job's id.
 
         Args:
-            scene: 3DGS scene.
-            style: Style image.
             out: File to write, a PLY.
             cameras: Camera files; None requires the option `orbit`, a number of views.
             options: Parameters of the job, as in /docs of the service.
@@ -192,10 +190,8 @@ class BackgroundJob(threading.Thread):
     """Job that runs while a program stays usable. The program reads the attributes from its own thread.
 
     Args:
-        service: Service that computes.
         files: Scene, style image, and the PLY to write.
         live: Whether to download the colors while they are being painted.
-        options: Parameters of the job.
 
     Attributes:
         fraction: Completed fraction of the steps.

@@ -17,7 +17,6 @@ def write_splat(path: Path, columns: Mapping[str, Any]) -> None:
     """Write a splat.
 
     Args:
-        path: PLY to write.
         columns: Arrays of N numbers by property: `x`, `y`, `z`, `REQUIRED`, and `f_rest_*` if there are any.
     """
     rest = sorted((name for name in columns if name.startswith("f_rest_")), key=lambda name: int(name[7:]))

@@ -360,7 +360,6 @@ class DerivedFiles:
         dies.
 
         Args:
-            files: Files by name.
             replace: Whether files replace those of the same names.
 
         Raises:

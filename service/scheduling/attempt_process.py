@@ -45,7 +45,6 @@ class Task(BaseModel):
             which is in `out` or in the workplace and may turn out to be unusable.
         workers: Maximum number of ranks; 1 runs the job in this process alone.
         cluster: Whether to run even a single rank on the Ray cluster.
-        checkpoint_seconds, preview_seconds: Intervals of checkpoints and previews, as in `ServiceSettings`.
         workplace: Description of the job's files for ranks on machines that share no folder with this one; None if all
             ranks share the folder.
     """

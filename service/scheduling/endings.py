@@ -71,7 +71,6 @@ class Ending:
 
     Attributes:
         outcome: Outcome for the record: SUCCEEDED, CANCELED, RELEASED or FAILED.
-        result: Result of a success.
         error: Error of a failure: `code`, `message` and further members.
         permanent: Whether another attempt would fail in the same way.
         detail: Details of a failure for the operator only.

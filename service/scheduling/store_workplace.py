@@ -35,7 +35,6 @@ class StoreWorkplace:
     Attributes:
         job_id, epoch: Prefix of the job's stored files.
         inputs: `role`, `name`, `sha256` and `size` of each input, for `stage`.
-        files: Input files in the store.
         checkpoint: Checkpoint to resume from; None for none.
         weights: Feature network weights by file name; empty to use the machine's own.
     """

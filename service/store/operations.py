@@ -28,9 +28,7 @@ class Delivery:
     """Webhook message that a dispatcher has claimed for sending.
 
     Attributes:
-        id, job_id: Ids of the message and of its job.
         owner: Owner of the job; empty if the job is deleted.
-        url: Receiver.
         tries: Number of attempts, including this one.
     """
 

@@ -41,8 +41,6 @@ class _Changes(NamedTuple):
 
     Attributes:
         columns: New values of all Gaussians, by property.
-        attenuated: Properties that are attenuated.
-        factor: Factor of these.
     """
 
     columns: dict[str, NDArray[np.float32]]

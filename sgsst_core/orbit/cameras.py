@@ -54,7 +54,6 @@ def orbit(
     the subject. Aspect ratios follow its shape, and every frame has as many pixels as 1024x768.
 
     Args:
-        scene: Scene, or its subject.
         count: Number of cameras, distributed over the rings so that neighbors are about equally far apart.
         up: World direction of up. Captures processed by COLMAP have y pointing down, so -y is up.
         elevations: Elevation of each ring above the scene's horizon in degrees, between -90 and 90.

@@ -86,7 +86,6 @@ class Plan:
         refinement: Refinement that produced the scene of the plan from the input scene; None if the input scene is not
             refined.
         time_choice: Choice of the time budget; None without one, or if everything was given.
-        decisions: Decisions for display.
         prediction: Predicted values, for comparison with the measured ones.
     """
 

@@ -36,7 +36,6 @@ def progress_of(surveyed: int, total: int, ranks: int, seconds: float, stage: st
         surveyed: Number of views that this rank has surveyed.
         total: Number of views that all ranks survey.
         seconds: Seconds since the stage started.
-        stage: Stage in which the views are surveyed.
     """
     done = min(total, surveyed * ranks)
     return Progress(stage=stage, step=done, total=total, eta_s=seconds * (total - done) / done if done else None)

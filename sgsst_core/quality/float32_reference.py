@@ -52,7 +52,6 @@ class GradientError(Difference):
     Attributes:
         step: Number of steps before the measurement.
         seconds: Seconds to compute the gradient with the job's approximations.
-        seconds_exact: Seconds to compute the exact gradient.
     """
 
     step: int

@@ -34,9 +34,6 @@ class TiledRasterizer(Rasterizer, Generic[L]):
     Args:
         scene, background, near, device: As in `Rasterizer`.
         max_intersection_bytes: Memory budget for tile intersections in bytes; None for the rasterizer's default.
-
-    Attributes:
-        default_intersection_bytes: Default budget for tile intersections in bytes.
     """
 
     can_cache = True

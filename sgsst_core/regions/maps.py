@@ -63,7 +63,6 @@ class RegionMaps(ViewMaps):
 
     Args:
         labels: [N] uint8, region of each Gaussian of the rasterizer.
-        active: Regions to render.
     """
 
     def __init__(self, labels: Tensor, active: tuple[int, ...], rasterizer: Rasterizer) -> None:

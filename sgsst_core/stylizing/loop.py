@@ -46,13 +46,10 @@ class Callbacks:
 
     Attributes:
         progress: Called after the first and the last iteration, and between them about every `progress_seconds`.
-        progress_seconds: Seconds between calls of `progress`.
         stop: Called before every iteration; True ends the loop as "interrupted".
         finish: Called before every iteration but the first; True ends the loop as "on-request".
         checkpoint: Called with the stylizer about every `checkpoint_seconds`, and once if the loop ends early.
-        checkpoint_seconds: Seconds between checkpoints.
         preview: Called with the stylizer before the first step and about every `preview_seconds`.
-        preview_seconds: Seconds between previews.
         measure: Called with the stylizer after each step for which it is due; its time does not count toward
             `Stylizer.seconds`.
         left: Seconds left of the time budget (`Settings.within`); None to count it from the start of the loop.

@@ -91,12 +91,9 @@ def plan_job(
     Args:
         scene: Scene, after refinement if there was one.
         cameras: Cameras; larger ones are reduced to `settings.max_resolution`.
-        style: Style of the job.
-        settings: Settings of the job.
         weights: Weights of the feature network; None for VGG19, or VGG16 if only that is installed.
         photos: See `prepare_job`.
         rasterizer: Rasterizer that computes blend weights: "cpu", "triton" or "reference". None to choose one.
-        collectives: Ranks of the job.
         plan: Plan from an earlier run of the same job, which is used unchanged; None to make one.
         survey: Survey from an earlier plan of the same job; None to survey the views.
         groups: `Plan.groups` of an earlier plan of the same job; None to choose them.

@@ -45,7 +45,6 @@ def stylize(
 
     Args:
         scene: Result of `load_scene`, a `Scene`, or a dictionary of tensors of gsplat (`scene_of_splats`).
-        cameras: Cameras of the views.
         style: Style image, such as from `load_image`; or a mixture of several.
         preset: Preset of the settings: "preview", "standard" or "paper".
         render_mode: Render mode of the scene's training, "classic" or "antialiased"; "auto" for that of its file, which

@@ -174,7 +174,6 @@ class ProcessGroupCollectives(Collectives):
     """`Collectives` of a torch.distributed group.
 
     Args:
-        group: Group of torch.distributed.
         timeout: Timeout of each exchange; see `process_group`.
         gpu_sharing: Largest number of ranks of the job on one GPU; 1 without GPUs.
         sent: Counters of sent bytes to continue; None for new ones.

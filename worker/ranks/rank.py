@@ -88,7 +88,6 @@ class WorkerOptions:
 
     Attributes:
         rank_timeout: Seconds without a response to a poll after which a rank counts as lost.
-        checkpoint_seconds: Seconds between checkpoints.
         preview_folder: Folder of preview images on rank 0's machine; None writes no previews.
         preview_seconds: Minimum seconds between two previews.
         actor: Class of the Ray actor that runs a rank; None for `RankProcess`.

@@ -28,7 +28,6 @@ class RankHandle:
     """Handle of one rank.
 
     Attributes:
-        actor: Ray actor of the rank.
         group: Ray placement group that the actor runs in.
         place: Location of the rank's process; None until the rank has reported it.
         pending_poll: Ray reference to the response to a pending poll; None if no poll is pending.

@@ -137,7 +137,6 @@ def stated(mode: str, reason: str, eps2d: float | None = None, warnings: tuple[t
         mode: Stated mode, one of `Rendering.mode`. Any other is read as classic, with a warning.
         reason: Part of the file that states it.
         eps2d: Stated blur; None for the default.
-        warnings: Further warnings.
     """
     if mode not in ("classic", "antialiased", "2dgs"):
         warnings = (*warnings, ("classic", f"{reason} is unknown"))

@@ -349,7 +349,6 @@ class _Stream:
     """Content of a file of version 1 to 3: one stream, compressed by gzip or not.
 
     Attributes:
-        source: File.
         inflate: Decompressor; None for a stream that is not compressed.
     """
 
