@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 from collections.abc import Sequence
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Response
 
@@ -54,6 +54,11 @@ FOLLOWING_OPERATIONS = (
 )
 
 
+def _documented(*following: str, **more: str) -> dict[str, Any]:
+    """Return the documentation of a response that shows a job, with the operations that may follow."""
+    return {**more, "headers": _SHOWN, "links": links(*following, job_id="$response.body#/id")}
+
+
 @router.get(
     "",
     response_model=JobPage,
@@ -86,7 +91,7 @@ async def list_jobs(
     "/{job_id}",
     response_model=JobDetail,
     responses={
-        200: {"headers": _SHOWN, "links": links(*FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")},
+        200: _documented(*FOLLOWING_OPERATIONS[1:]),
         304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
     },
 )
@@ -99,7 +104,7 @@ def get_job(job_id: JobId, context: ContextDep, caller: CallerDep, if_none_match
 @router.patch(
     "/{job_id}",
     response_model=JobDetail,
-    responses={200: {"headers": _SHOWN, "links": links(*FOLLOWING_OPERATIONS[1:], job_id="$response.body#/id")}},
+    responses={200: _documented(*FOLLOWING_OPERATIONS[1:])},
 )
 async def change_job(
     job_id: JobId, context: ContextDep, caller: CallerDep, change: Annotated[JobChange, Depends(json_body(JobChange))]
@@ -126,12 +131,7 @@ def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> Progr
 @router.post(
     "/{job_id}/finish",
     response_model=JobDetail,
-    responses={
-        200: {
-            "headers": _SHOWN,
-            "links": links("get_job", "cancel_job", "watch_job", "list_artifacts", job_id="$response.body#/id"),
-        }
-    },
+    responses={200: _documented("get_job", "cancel_job", "watch_job", "list_artifacts")},
 )
 def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """End a running job after its current step and keep its result so far. Until then, its status is `finishing`."""
@@ -143,12 +143,7 @@ def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
 @router.post(
     "/{job_id}/cancel",
     response_model=JobDetail,
-    responses={
-        200: {
-            "headers": _SHOWN,
-            "links": links("get_job", "retry_job", "delete_job", "watch_job", job_id="$response.body#/id"),
-        }
-    },
+    responses={200: _documented("get_job", "retry_job", "delete_job", "watch_job")},
 )
 def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Cancel a job. A waiting job is canceled at once, a running one within seconds (`canceling` until then)."""
@@ -161,13 +156,7 @@ def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Respons
     "/{job_id}/retry",
     status_code=202,
     response_model=JobDetail,
-    responses={
-        202: {
-            "description": "The job is queued again.",
-            "headers": _SHOWN,
-            "links": links("get_job", "cancel_job", "list_artifacts", job_id="$response.body#/id"),
-        }
-    },
+    responses={202: _documented("get_job", "cancel_job", "list_artifacts", description="The job is queued again.")},
 )
 def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
     """Queue a failed or canceled job again, or one that was stopped early. It resumes from its last checkpoint."""
