@@ -6,6 +6,10 @@ Every message says what is wrong, where (file, property, view), and what to do a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 
 class SgsstError(Exception):
     """Base class of all errors that this package raises deliberately."""
@@ -114,6 +118,15 @@ class ClusterAwayError(RanksFailedError, InfrastructureError):
     """Cluster that is unavailable, or that has no capacity for even a single worker."""
 
     code = "workers-failed"
+
+
+@contextmanager
+def reading_scene(path: Path) -> Iterator[None]:
+    """Raise SceneError in place of an OSError in the block, which reads a scene file."""
+    try:
+        yield
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
 
 
 def is_out_of_memory(error: Exception) -> bool:

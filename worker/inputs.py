@@ -327,12 +327,17 @@ def read_scene_and_capture(source: SceneRequest) -> tuple[SceneFile, Capture]:
         SceneError: If the scene cannot be used.
         CameraError: If the cameras cannot be used.
     """
-    axes, about_axes = choose_axes(source)
+    file, decisions = read_requested(source)
+    capture = read_capture(source, file.scene).checked(file.scene, source.near)
+    return file, replace(capture, decisions=(*decisions, *capture.decisions))
+
+
+def read_requested(source: SceneRequest) -> tuple[SceneFile, list[Decision]]:
+    """Read a scene with the axes that its cameras suggest and the requested render mode; add decisions about both."""
+    axes, decisions = choose_axes(source)
     file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
     file = file.rendered(source.render_mode, source.eps2d)
-    capture = read_capture(source, file.scene).checked(file.scene, source.near)
-    decisions = (*about_notes(file), *about_axes, *about_rendering(file), *capture.decisions)
-    return file, replace(capture, decisions=decisions)
+    return file, [*about_notes(file), *decisions, *about_rendering(file)]
 
 
 def check_something_seen(scene: Scene, cameras: Sequence[Camera], rasterizer: Rasterizer) -> None:

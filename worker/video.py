@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sgsst_core.decision import Decision, warnings_of
+from sgsst_core.decision import warnings_of
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.images import Color
-from sgsst_core.files.scene_file import SceneFile, read_scene
+from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit.cameras import ELEVATION, turntable
 from sgsst_core.orbit.choice import find_upright_subject
@@ -21,8 +21,8 @@ from sgsst_core.report.video import Layer, write_frames
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene
-from worker.capture import Capture, about_notes, about_rendering, choose_axes, orbit_request, read_capture
-from worker.inputs import check_something_in_view, read_job_capture
+from worker.capture import Capture, orbit_request, read_capture
+from worker.inputs import check_something_in_view, read_job_capture, read_requested
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import DEFAULT_SIDE, VideoOptions
 from worker.outputs import check_folder, check_is_not_input
@@ -98,16 +98,16 @@ def render_video(
         InvalidInputError: If an input cannot be used, or the video cannot be written.
     """
     source = request.source
-    file, decisions = _read(source)
+    file, decisions = read_requested(source)
     scene, before = file.scene, None
     if request.unstylized is not None:
-        before = _read(source.model_copy(update={"scene": request.unstylized}))[0].scene
+        before = read_requested(source.model_copy(update={"scene": request.unstylized}))[0].scene
     through = remaining = None
     if request.along_cameras:
         capture = _read_views(request, file).checked(scene, source.near)
         through, decisions = capture.cameras, [*decisions, *capture.decisions]
     elif request.job is not None and request.job.regions:
-        file, _ = _read(request.job.source)  # regions select its Gaussians, which may have been split since
+        file, _ = read_requested(request.job.source)  # regions select its Gaussians, which may have been split since
         remaining = cropped(request.job.regions, file, source.near)
     even, side = is_encoded(request.out), source.resolution
     cameras = video_cameras(file.scene, source, through, request.options, side, remaining, even=even)
@@ -191,13 +191,5 @@ def _read_views(request: VideoRequest, file: SceneFile) -> Capture:
     if job is None:
         return read_capture(request.source, file.scene)
     if job.source.cameras is None:  # an orbit depends on the job's scene, whose Gaussians may have been split since
-        file, _ = _read(job.source)
+        file, _ = read_requested(job.source)
     return read_job_capture(job, file)
-
-
-def _read(source: SceneRequest) -> tuple[SceneFile, list[Decision]]:
-    """Read a scene with the axes that its cameras suggest and the requested render mode; add decisions about both."""
-    axes, decisions = choose_axes(source)
-    file = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
-    file = file.rendered(source.render_mode, source.eps2d)
-    return file, [*about_notes(file), *decisions, *about_rendering(file)]

@@ -63,6 +63,8 @@ class Artifacts:
         target = Path(self.objects.root, location)
         target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(target) as temporary:
+            if final:
+                temporary.unlink()
             if not (final and _link(source, temporary)):
                 shutil.copyfile(source, temporary)
             size, sha256 = temporary.stat().st_size, file_digest(temporary)
@@ -106,8 +108,7 @@ def media_type(name: str) -> str:
 
 
 def _link(source: Path, target: Path) -> bool:
-    """Replace `target` with a hard link to `source`; return False if the file system does not support that."""
-    target.unlink()
+    """Create a hard link to `source`; return False if the file system does not support that."""
     try:
         os.link(source, target)
     except OSError as error:
@@ -121,11 +122,7 @@ def _link(source: Path, target: Path) -> bool:
 def _snapshot(source: Path) -> Iterator[Path]:
     """Provide a second hard link to a file, so that replacing the file during its upload does not affect the upload."""
     link = source.with_name(f".{secrets.token_hex(6)}-{source.name}")
-    try:
-        os.link(source, link)
-    except OSError as error:
-        if error.errno not in _NO_LINKS:
-            raise
+    if not _link(source, link):
         yield source
         return
     try:

@@ -312,9 +312,14 @@ def _full_scale(mode: str, largest: float) -> float:
 def _save(path: Path, image: Tensor, **options: Any) -> None:
     if image.ndim != 3 or image.shape[2] != 3 or bool(torch.isnan(image).any()):
         raise ValueError(f"an image must be [H, W, 3] without NaN, got {tuple(image.shape)}")
-    values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
     with atomic_path(path) as temporary:
-        Image.fromarray(values.numpy()).save(temporary, **options)
+        to_image(image).save(temporary, **options)
+
+
+def to_image(image: Tensor) -> Image.Image:
+    """Return an image [H, W, 3] in 0..1 with 8 bits per channel."""
+    values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
+    return Image.fromarray(values.numpy())
 
 
 @dataclass

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
-from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.errors import OutputError, SceneError, reading_scene
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.formats import read_scene_header, scene_path
 from sgsst_core.files.formats.ply import PLY, PROPERTIES, PlySceneHeader, write_ply
@@ -361,10 +361,8 @@ def text_vertices(path: Path, header: PlyHeader) -> NDArray[Any]:
 
 def file_stamp(path: Path) -> tuple[int, int]:
     """Return the size in bytes and the modification time in ns of a file, to detect changes."""
-    try:
+    with reading_scene(path):
         status = path.stat()
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
     return status.st_size, status.st_mtime_ns
 
 

@@ -238,7 +238,6 @@ def find_up(subject: Subject) -> Up:
     world = torch.eye(3, dtype=torch.float64)
     # a subject in front of a background is cut off and doesn't balance
     balances = [(_balance(subject, up), up) for up in (*world, *-world)] if subject.left_out <= _WHOLE else []
-    firmest = max((balance for balance, _ in balances), default=0.0)
     ground, standing = _ground(subject, [*axes.T, *world]), _standing(subject, axes)
     for shown, margin in ((ground, _SIMILAR), (standing, 1.0)):
         if shown is not None:
@@ -246,6 +245,12 @@ def find_up(subject: Subject) -> Up:
             same = [balance for balance, up in balances if float(up @ shown.direction) > _SAME]
             if margin * max([_balance(subject, shown.direction), *same]) >= max(others, default=0.0):
                 return shown
+    return _resting(balances)
+
+
+def _resting(balances: Sequence[tuple[float, Tensor]]) -> Up:
+    """Return the up direction of a subject without ground or foot, given how firmly it rests on each of its sides."""
+    firmest = max((balance for balance, _ in balances), default=0.0)
     usual, second = (torch.tensor(up, dtype=torch.float64) for up in (USUAL_UP, _SECOND_UP))
     similar = [each for each in balances if each[0] >= _SIMILAR * firmest > 0]
     if len(similar) == 1 and firmest >= _FIRM:

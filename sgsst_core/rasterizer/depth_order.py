@@ -39,7 +39,7 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
     with kernel_threads():
         threads = numba.get_num_threads()
         bits = np.empty(count, dtype=np.int64)
-        _gather(depths.view(np.int64), visible, bits)
+        take_elements(depths.view(np.int64), visible, bits)
         lowest, highest = int(bits.min()), int(bits.max())
         target = min(max(count // _BUCKET, 1), _MAX_BUCKETS)
         shift = max((highest - lowest).bit_length() - target.bit_length(), 0)
@@ -59,7 +59,8 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
 
 
 @compiled(parallel=True)
-def _gather(values, indices, out):
+def take_elements(values, indices, out) -> None:
+    """Write values[indices] to `out` for values [N], on all cores."""
     for i in numba.prange(indices.size):
         out[i] = values[indices[i]]
 

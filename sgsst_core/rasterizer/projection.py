@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import LOG2_ALPHA_MIN, NEAR, TO_POWER_OF_TWO
-from sgsst_core.rasterizer.depth_order import depth_order
+from sgsst_core.rasterizer.depth_order import depth_order, take_elements
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
@@ -311,10 +311,3 @@ def take_rows(values, indices, out) -> None:
     for i in numba.prange(indices.size):
         for column in range(values.shape[1]):
             out[i, column] = values[indices[i], column]
-
-
-@compiled(parallel=True)
-def take_elements(values, indices, out) -> None:
-    """Write values[indices] to `out` for values [N], on all cores."""
-    for i in numba.prange(indices.size):
-        out[i] = values[indices[i]]

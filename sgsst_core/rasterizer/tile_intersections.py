@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import LOG2_ALPHA_MIN, NEAR, RASTER_TILE
 from sgsst_core.errors import TooManyIntersectionsError
-from sgsst_core.rasterizer.projection import Projection, Shapes, project, take_elements, take_rows
+from sgsst_core.rasterizer.depth_order import take_elements
+from sgsst_core.rasterizer.projection import Projection, Shapes, project, take_rows
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sgsst_core.constants import NEAR
 from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.images import to_image
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.palette import INK, PAPER
 from sgsst_core.scene.camera import Camera, resized, spread
@@ -42,8 +43,8 @@ def write_contact_sheet(path: Path, stylizer: Stylizer) -> None:
             # Call the rasterizer directly, because only one rank writes the sheet and the other ranks do not render.
             dcs = (views.scene.sh_dc.to(rasterizer.device), stylizer.shown())
             renders = [rasterizer.render(views.colors(index, dc), views.cameras[index]) for dc in dcs]
-            columns.append((views.cameras[index].name, [_fitted(_to_image(render)) for render in renders]))
-    style = _fitted(_stacked([_to_image(image) for style in stylizer.job.styles.all for image in style.images]))
+            columns.append((views.cameras[index].name, [_fitted(to_image(render)) for render in renders]))
+    style = _fitted(_stacked([to_image(image) for style in stylizer.job.styles.all for image in style.images]))
     second = _LINE + max(images[0].height for _, images in columns) + _LINE
     cells: list[_Cell] = [(_GAP, _LINE, style, "style")]
     left = _GAP + style.width + _GAP
@@ -68,7 +69,7 @@ def write_views(
     """
     shown = spread(cameras, _MAX_VIEWS)
     renders = small_renders(scene, shown, _VIEW_SIDE, background=background, near=near)
-    images = [(camera.name, _to_image(render)) for camera, render in zip(shown, renders, strict=True)]
+    images = [(camera.name, to_image(render)) for camera, render in zip(shown, renders, strict=True)]
     width = max(image.width for _, image in images) + _GAP
     height = max(image.height for _, image in images) + _LINE
     columns = min(len(images), max(1, round(math.sqrt(_SHEET_SHAPE * len(images) * height / width))))
@@ -97,7 +98,7 @@ def small_renders(
 
 def write_grid(path: Path, rows: Sequence[Sequence[tuple[str, Tensor] | None]]) -> None:
     """Write a JPEG with rows of images [H, W, 3] in columns, each with its name above; None leaves a place empty."""
-    grid = [[cell and (cell[0], _fitted(_to_image(cell[1]))) for cell in row] for row in rows]
+    grid = [[cell and (cell[0], _fitted(to_image(cell[1]))) for cell in row] for row in rows]
     widths = [max((cell[1].width for cell in column if cell), default=0) for column in zip_longest(*grid)]
     lefts = [_GAP, *(_GAP + end for end in accumulate(width + _GAP for width in widths))]
     cells: list[_Cell] = []
@@ -123,11 +124,6 @@ def _save(path: Path, cells: Sequence[_Cell]) -> None:
         draw.text((left, top - _LABEL), label, INK, font)
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="JPEG", quality=88)
-
-
-def _to_image(image: Tensor) -> Image.Image:
-    values = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8)
-    return Image.fromarray(values.numpy())
 
 
 def _stacked(images: Sequence[Image.Image]) -> Image.Image:

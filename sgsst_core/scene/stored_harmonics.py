@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.errors import SceneError
+from sgsst_core.errors import SceneError, reading_scene
 
 #: Bytes per read; a block stays in the L2 cache of one core until it has been used.
 BLOCK_BYTES = 1 << 20
@@ -69,10 +69,8 @@ class RowFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
+        with reading_scene(path):
             self._file = path.open("rb", buffering=0)
-        except OSError as error:
-            raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
         self._reading = threading.Lock()
         weakref.finalize(self, self._file.close)
 

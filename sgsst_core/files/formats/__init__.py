@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sgsst_core.errors import OutputError, SceneError
+from sgsst_core.errors import OutputError, SceneError, reading_scene
 from sgsst_core.files.advice import SCENES, refuse_known, refuse_scene_folder
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.glb import GLB
@@ -99,11 +99,8 @@ def read_scene_header(path: Path) -> SceneHeader:
     path = scene_path(path)
     if path.is_dir():
         refuse_scene_folder(path)
-    try:
-        with path.open("rb") as file:
-            start = FileStart(path, file.read(HEAD_BYTES), path.stat().st_size)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    with reading_scene(path), path.open("rb") as file:
+        start = FileStart(path, file.read(HEAD_BYTES), path.stat().st_size)
     for each in FORMATS:
         if each.matches(start):
             return each.read_header(start)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.constants import EPS2D, SH_DEGREES
-from sgsst_core.errors import SceneError
+from sgsst_core.errors import SceneError, reading_scene
 from sgsst_core.scene.rendering import CLASSIC, MAX_EPS2D, Rendering
 
 #: SH coefficients per color channel above degree 0, by SH degree.
@@ -214,12 +214,9 @@ def read_bytes(path: Path, start: int, end: int) -> bytes:
     Raises:
         SceneError: If the file cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            file.seek(start)
-            return file.read(end - start)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}. Check the path.") from error
+    with reading_scene(path), path.open("rb") as file:
+        file.seek(start)
+        return file.read(end - start)
 
 
 def truncated(path: Path, declared: str) -> SceneError:
