@@ -123,7 +123,6 @@ class Cache(Generic[K, V]):
             cache if it needs the space.
 
     Attributes:
-        capacity: Memory budget in bytes; None for no limit.
         values: Cached values by key, oldest first.
         costs: Size in bytes and seconds of each value that has been computed, by key. The seconds are those of the
             latest time, without the time for values of other caches.

@@ -107,10 +107,13 @@ class ShownJob:
 
 
 class Jobs:
-    """Jobs of users in the store.
+    """Jobs of users in the store. Methods that take an `owner` accept None for any.
 
     Args:
         retention: Time in seconds until the results of an ended job expire.
+
+    Raises:
+        NoJobError: If a method gets a job that does not exist or belongs to another owner.
     """
 
     def __init__(self, database: Database, retention: float) -> None:
@@ -172,20 +175,12 @@ class Jobs:
         return job, True
 
     def get(self, job_id: str, owner: str | None) -> JobRow:
-        """Return a job of this owner, or of any owner if None, without its inputs.
-
-        Raises:
-            NoJobError: If there is no such job or it belongs to another owner.
-        """
+        """Return a job without its inputs."""
         with self._database.reading() as session:
             return job_of_owner(session, job_id, owner)
 
     def inputs(self, job_id: str) -> list[dict[str, Any]]:
-        """Return `role`, `name`, `sha256` and `size` of all inputs of a job.
-
-        Raises:
-            NoJobError: If there is no such job.
-        """
+        """Return `role`, `name`, `sha256` and `size` of all inputs of a job."""
         with self._database.reading() as session:
             inputs: list[dict[str, Any]] | None = session.scalar(select(JobRow.inputs).where(JobRow.id == job_id))
         if inputs is None:
@@ -203,11 +198,7 @@ class Jobs:
             return job_inputs.one(connection, job_id, role, index)
 
     def detail(self, job_id: str, owner: str | None) -> tuple[ShownJob, list[AttemptRow]]:
-        """Return a job as it is shown, and its attempts, all in one snapshot.
-
-        Raises:
-            NoJobError: If there is no such job or it belongs to another owner.
-        """
+        """Return a job as it is shown, and its attempts, all in one snapshot."""
         with self._database.reading_rows() as connection:
             row = connection.execute(_JOB, {"job_id": job_id}).one_or_none()
             if row is None or (owner is not None and row.owner != owner):
@@ -302,11 +293,7 @@ class Jobs:
         return job
 
     def rename(self, job_id: str, owner: str | None, name: str) -> None:
-        """Change the display name of a job.
-
-        Raises:
-            NoJobError: If there is no such job or it belongs to another owner.
-        """
+        """Change the display name of a job."""
         with self._database.writing() as session:
             job_of_owner(session, job_id, owner, lock=True).name = name
 
