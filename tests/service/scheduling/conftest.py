@@ -33,10 +33,10 @@ def lease(store: Store) -> Lease:
     return new_lease(store)
 
 
-def new_lease(store: Store) -> Lease:
+def new_lease(store: Store, dispatcher: str = "one") -> Lease:
     """Create a job, and return its lease."""
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
-    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    taken = store.leases.take("one")
+    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=100)
+    taken = store.leases.take(dispatcher)
     assert taken is not None
     return taken

@@ -28,6 +28,7 @@ from service.store.jobs import NewJob
 from service.store.leases import Lease
 from sgsst_core.progress import Progress
 from tests.api.service import wait_for
+from tests.service.scheduling.conftest import new_lease
 from tests.stores import new_store
 
 SHA = "a" * 64
@@ -44,14 +45,6 @@ def at_work(settings: ServiceSettings, store: Store) -> Iterator[Dispatcher]:
     finally:
         dispatcher.stop()
         thread.join()
-
-
-def leased(store: Store, dispatcher: str) -> Lease:
-    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
-    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=10)
-    lease = store.leases.take(dispatcher)
-    assert lease is not None
-    return lease
 
 
 def test_running_dispatcher_is_registered(settings: ServiceSettings, store: Store) -> None:
@@ -94,7 +87,7 @@ def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Stor
 
 
 def test_attempt_reports_its_expected_end(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
-    held = leased(store, "one")
+    held = new_lease(store, "one")
     attempt = attempt_of(held, Grant(1, ("0",)), settings, store, tmp_path)
     for stage in ("planning", "preparing"):  # the remaining seconds of these stages are not the job's
         attempt._handle(Report(progress=Progress(stage=stage, eta_s=3.0)))
@@ -110,7 +103,7 @@ def test_attempt_reports_its_expected_end(settings: ServiceSettings, store: Stor
 
 
 def test_released_gpus_are_free_for_other_jobs(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
-    held = leased(store, "one")
+    held = new_lease(store, "one")
     grant = Grant(3, ("5", "6", "7"))
     attempt = attempt_of(held, grant, settings, store, tmp_path)
     capacity = Capacity(Machine(grant.gpus, 2, 10**11), None)
@@ -142,7 +135,7 @@ def test_jobs_of_a_dead_dispatcher_are_taken_over_at_once(settings: ServiceSetti
     dead = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
     assert is_dead(dead)
     assert not is_dead(own_name())
-    held = leased(store, dead)
+    held = new_lease(store, dead)
     store.jobs.cancel(held.job_id, None)
     store.operations.record_heartbeat(dead, 8, 0)
     with at_work(settings, store) as dispatcher:
@@ -212,11 +205,11 @@ def test_leftovers_of_a_killed_dispatcher_are_swept(settings: ServiceSettings, s
     artifacts = Artifacts(settings.artifacts_url)
     source = tmp_path / "stylized.ply"
     source.write_bytes(b"ply")
-    held = leased(store, "elsewhere")
+    held = new_lease(store, "elsewhere")
     artifacts.put(held.job_id, held.epoch, "previews/cut_off.jpg", source)
     result = artifacts.put(held.job_id, held.epoch, "stylized.ply", source)
     store.leases.succeed(held, [result], {})
-    running = leased(store, "elsewhere")
+    running = new_lease(store, "elsewhere")
     published_next = artifacts.put(running.job_id, running.epoch, "stylized.ply", source)
     with at_work(settings, store):
         wait_for(lambda: store.retention.unswept(10) == [], "the job to be swept")

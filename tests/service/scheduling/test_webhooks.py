@@ -264,29 +264,19 @@ def test_message_that_always_fails_is_given_up(
     assert "port" in last.getMessage()
 
 
-def test_only_the_head_of_a_response_is_read(tmp_path: Path, store: Store, start: Start) -> None:
+@pytest.mark.parametrize(
+    ("head", "tries"),
+    [(b"HTTP/1.1 200 OK\r\nContent-Type: text/plain\r\n\r\n", []), (b"HTTP/1.1 200 OK\r\nX: ", [1])],
+    ids=["body", "head"],
+)
+def test_only_the_head_of_a_response_is_read(
+    tmp_path: Path, store: Store, start: Start, head: bytes, tries: list[int]
+) -> None:
+    """Only the head of a response is read, and at most some of an endless one."""
     sent, cut_off = [0], threading.Event()
 
     def endless(handler: Any) -> None:
-        handler.wfile.write(b"HTTP/1.1 200 OK\r\nContent-Type: text/plain\r\n\r\n")
-        try:
-            while sent[0] < LARGE:
-                sent[0] += handler.wfile.write(b"x" * (1 << 16))
-        except OSError:
-            cut_off.set()
-
-    receiver = start(endless)
-    _end_job(store, receiver.url)
-    _deliver(store, tmp_path)
-    assert cut_off.wait(PATIENCE), f"{sent[0]:,} bytes were read"
-    assert _tries(store) == []
-
-
-def test_endless_response_head_is_not_buffered(tmp_path: Path, store: Store, start: Start) -> None:
-    sent, cut_off = [0], threading.Event()
-
-    def endless(handler: Any) -> None:
-        handler.wfile.write(b"HTTP/1.1 200 OK\r\nX: ")
+        handler.wfile.write(head)
         try:
             while sent[0] < LARGE:
                 sent[0] += handler.wfile.write(b"x" * (1 << 16))
@@ -296,7 +286,7 @@ def test_endless_response_head_is_not_buffered(tmp_path: Path, store: Store, sta
     _end_job(store, start(endless).url)
     _deliver(store, tmp_path)
     assert cut_off.wait(PATIENCE), f"{sent[0]:,} bytes were read"
-    assert _tries(store) == [1]
+    assert _tries(store) == tries
 
 
 @pytest.mark.parametrize("head", [b"", b"HTTP/1.1 200 OK\r\nX: "], ids=["100-continue", "head"])

@@ -23,6 +23,7 @@ from service.store.jobs import NewJob
 from service.store.leases import Lease
 from service.store.tables import DispatcherRow
 from tests.api.service import ROOT, SETTINGS, wait_for
+from tests.service.scheduling.conftest import new_lease
 from tests.service.store.helpers import Clock
 from tests.stores import migrated_database
 
@@ -44,15 +45,6 @@ def store(settings: ServiceSettings) -> Iterator[Store]:
     opened.inputs.add_blob(SHA, "aa/blob", 3)
     yield opened
     opened.close()
-
-
-def leased(store: Store, dispatcher: str) -> Lease:
-    """Return the lease of a new job."""
-    scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
-    store.jobs.create(NewJob("local", "", 0, {}, [scene]), limit=100)
-    lease = store.leases.take(dispatcher)
-    assert lease is not None
-    return lease
 
 
 def heartbeats(store: Store) -> dict[str, float]:
@@ -111,14 +103,14 @@ def test_dispatcher_with_a_wrong_clock_deletes_nothing(
     source.write_bytes(b"ply")
     ended = []
     for _ in range(3):
-        done = leased(store, "healthy-00000000-1-1")
+        done = new_lease(store, "healthy-00000000-1-1")
         result = artifacts.put(done.job_id, done.epoch, "stylized.ply", source)
         store.leases.succeed(done, [result], {})
         ended.append((done.job_id, result))
     incoming = settings.folder / "incoming" / "arrives.part"
     incoming.parent.mkdir(parents=True, exist_ok=True)
     incoming.write_bytes(b"on its way")
-    held = leased(store, "healthy-00000000-1-1")
+    held = new_lease(store, "healthy-00000000-1-1")
     # the wrong heartbeat precedes the first housekeeping, which the process does in its own thread
     with store_with_clock(settings, seconds) as (wrong, _, _):
         wrong.operations.record_heartbeat("wrong-00000000-1-1", 1, 1)
@@ -140,7 +132,7 @@ def test_dispatcher_with_a_wrong_clock_deletes_nothing(
 
 @pytest.mark.slow
 def test_dispatcher_with_a_fast_clock_takes_no_live_lease(settings: ServiceSettings, store: Store) -> None:
-    held = leased(store, "healthy-00000000-1-1")
+    held = new_lease(store, "healthy-00000000-1-1")
     with healthy(store, held) as statuses, wrong_dispatcher(settings, 120.0) as process:
         beats = set[float]()
 
@@ -172,7 +164,7 @@ def test_lease_is_lost_after_a_lease_duration_without_renewal(tmp_path: Path) ->
     settings = ServiceSettings(data=tmp_path, lease_seconds=LEASE)
     with store_with_clock(settings, 0.0) as (store, _, _), store_with_clock(settings, 120.0) as (ahead, watch, clock):
         store.inputs.add_blob(SHA, "aa/blob", 3)
-        held = leased(store, "healthy")
+        held = new_lease(store, "healthy")
         for _ in range(5):
             assert ahead.leases.take("wrong", is_lost=watch.is_lost) is None
             clock.now += 0.9 * LEASE
@@ -185,7 +177,7 @@ def test_lease_is_lost_after_a_lease_duration_without_renewal(tmp_path: Path) ->
 def test_lease_of_a_dead_local_dispatcher_is_lost_at_once(tmp_path: Path) -> None:
     with store_with_clock(ServiceSettings(data=tmp_path, lease_seconds=LEASE), 0.0) as (store, watch, _):
         store.inputs.add_blob(SHA, "aa/blob", 3)
-        leased(store, "dead")
+        new_lease(store, "dead")
         assert store.leases.take("new", is_lost=watch.is_lost) is None
         store.leases.expire("dead")
         assert store.leases.take("new", is_lost=watch.is_lost) is not None
@@ -197,7 +189,7 @@ def test_times_written_by_a_fast_clock_delay_nothing(settings: ServiceSettings, 
         store_with_clock(settings, 31 * DAY) as (ahead, _, _),
         store_with_clock(settings, 0.0) as (right, watch, clock),
     ):
-        lost = leased(ahead, "ahead")
+        lost = new_lease(ahead, "ahead")
         assert right.leases.take("right", is_lost=watch.is_lost) is None
         clock.now += LEASE
         again = right.leases.take("right", is_lost=watch.is_lost)
@@ -215,7 +207,7 @@ def test_overdue_data_are_deleted_gradually(settings: ServiceSettings) -> None:
     clock = Clock()
     store = open_store(settings, clock)
     store.inputs.add_blob(SHA, "aa/blob", 3)
-    done = leased(store, "one")
+    done = new_lease(store, "one")
     store.leases.succeed(done, [], {})
     store.retention.advance(0.0)
     clock.now += 40 * DAY
@@ -235,7 +227,7 @@ def test_overdue_data_are_deleted_gradually(settings: ServiceSettings) -> None:
 
 def test_slow_clock_does_not_shorten_retention(settings: ServiceSettings, store: Store) -> None:
     store.retention.advance(0.0)
-    held = leased(store, "behind")
+    held = new_lease(store, "behind")
     with store_with_clock(settings, -31 * DAY) as (behind, _, _):
         behind.leases.succeed(held, [], {})
     expires = store.jobs.get(held.job_id, None).expires_at
