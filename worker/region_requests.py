@@ -57,16 +57,7 @@ class Selection:
 
 @dataclass(frozen=True)
 class RegionRequest:
-    """Request for one region.
-
-    Attributes:
-        name: Name; `REST` for the Gaussians that no region selects.
-        selection: Selection of the Gaussians; None for the rest.
-        styles: Images of the region's style; empty for the job's style.
-        weight: Weight of the region's style in the loss.
-        freeze: Whether the colors of its Gaussians stay unchanged.
-        content_weight: Weight of the content term in the region; None for that of the job.
-    """
+    """Request for one region, as `RegionOptions` describes; without a selection, it is the rest."""
 
     name: str
     selection: Selection | None = None
