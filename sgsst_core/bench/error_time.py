@@ -171,6 +171,7 @@ def error_time(
     """Run variants on one scene, each with the same time budget or until its last step.
 
     Args:
+        seconds: Seconds of optimization per variant.
         progress: Function called after each evaluation, with the curve so far.
         settings: Settings for all variants that override the standard preset.
     """
