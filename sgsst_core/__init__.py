@@ -7,16 +7,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sgsst_core.files.images import load_image
-    from sgsst_core.files.library import load_cameras, load_scene, save
-    from sgsst_core.progress import Progress
-    from sgsst_core.scene.camera import Camera
-    from sgsst_core.scene.gaussians import Scene
-    from sgsst_core.settings import Settings, make_settings
-    from sgsst_core.style import Style
-    from sgsst_core.stylizing.loop import Callbacks, run
-    from sgsst_core.stylizing.stylize import stylize
-    from sgsst_core.stylizing.stylizer import Stylizer
+    from sgsst_core.files.images import load_image as load_image
+    from sgsst_core.files.library import load_cameras as load_cameras
+    from sgsst_core.files.library import load_scene as load_scene
+    from sgsst_core.files.library import save as save
+    from sgsst_core.progress import Progress as Progress
+    from sgsst_core.scene.camera import Camera as Camera
+    from sgsst_core.scene.gaussians import Scene as Scene
+    from sgsst_core.settings import Settings as Settings
+    from sgsst_core.settings import make_settings as make_settings
+    from sgsst_core.style import Style as Style
+    from sgsst_core.stylizing.loop import Callbacks as Callbacks
+    from sgsst_core.stylizing.loop import run as run
+    from sgsst_core.stylizing.stylize import stylize as stylize
+    from sgsst_core.stylizing.stylizer import Stylizer as Stylizer
 
 # PyTorch reads this variable once, before it allocates its first tensor. Allocations of 2 MB and more then use huge
 # pages, so a step on a CPU touches a few thousand pages instead of millions. Linux provides huge pages if it can; other
@@ -32,23 +36,7 @@ if "OMP_WAIT_POLICY" not in os.environ:
 if os.environ.keys().isdisjoint({"PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF"}):
     os.environ["PYTORCH_ALLOC_CONF"] = "expandable_segments:True"
 
-__all__ = [
-    "Callbacks",
-    "Camera",
-    "Progress",
-    "Scene",
-    "Settings",
-    "Style",
-    "Stylizer",
-    "load_cameras",
-    "load_image",
-    "load_scene",
-    "make_settings",
-    "run",
-    "save",
-    "stylize",
-]
-
+#: Modules of the exported names.
 _MODULES = {
     "Callbacks": "stylizing.loop",
     "Camera": "scene.camera",
@@ -65,10 +53,11 @@ _MODULES = {
     "save": "files.library",
     "stylize": "stylizing.stylize",
 }
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> Any:
     """Import exported names on first access: PyTorch takes seconds to import, and `sgsst --help` does not need it."""
-    if name not in __all__:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
