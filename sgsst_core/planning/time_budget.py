@@ -81,7 +81,7 @@ class TimeChoice:
         views: Indices of the chosen views.
         steps_coarse, steps_sos: Steps of both phases.
         seconds: Predicted seconds of the steps and everything after the choice.
-        more: Text about what more time would bring; empty if it would bring nothing.
+        longer_resolution, longer_steps: Longer side of the views and steps of a budget that is `_MORE` times as long.
     """
 
     resolution: int
@@ -89,7 +89,8 @@ class TimeChoice:
     steps_coarse: int
     steps_sos: int
     seconds: float
-    more: str = ""
+    longer_resolution: int = 0
+    longer_steps: int = 0
 
     def of(self, views: Sequence[T]) -> list[T]:
         """Return what belongs to the chosen views."""
@@ -113,7 +114,9 @@ class TimeChoice:
         views = f"{len(self.views)} view{'s' if len(self.views) != 1 else ''}"
         reason = f"about {duration(self.seconds, ' ')} from here on"
         reason += f" of {duration(within, ' ')}" if within else ", as chosen before"
-        more = f"; {self.more}" if self.more else ""
+        gains = [f"{self.longer_resolution} px"] if self.longer_resolution > self.resolution else []
+        gains += [f"{self.longer_steps} steps"] if self.longer_steps > steps else []
+        more = f"; in {duration(_MORE * within, ' ')}: {', '.join(gains)}" if within and gains else ""
         taken = f"{steps} step{'s' if steps != 1 else ''}"
         return Decision("time budget", f"{self.resolution} px, {views}, {taken}", reason + more)
 
@@ -138,7 +141,7 @@ def choosable(settings: Settings) -> bool:
 
 
 def choose(cameras: Sequence[Camera], settings: Settings, cost: ViewCost, left: float, ending: float) -> TimeChoice:
-    """Choose what fits a time budget, and tell what more time would bring.
+    """Choose what fits a time budget, and what fits a longer one.
 
     Args:
         cameras: All cameras at the resolution of the settings.
@@ -148,12 +151,9 @@ def choose(cameras: Sequence[Camera], settings: Settings, cost: ViewCost, left: 
         ending: Seconds from the last step to the last file.
     """
     estimate = _Estimate(cameras, settings, cost, ending)
-    chosen, longer = estimate.best(left), estimate.best(left + (_MORE - 1) * (settings.within or 0.0))
-    gains = [f"{longer.resolution} px"] if longer.resolution > chosen.resolution else []
-    more = longer.steps_coarse + longer.steps_sos
-    gains += [f"{more} steps"] if more > chosen.steps_coarse + chosen.steps_sos else []
-    text = f"in {duration(_MORE * (settings.within or 0.0), ' ')}: {', '.join(gains)}" if gains else ""
-    return replace(chosen, more=text)
+    longer = estimate.best(left + (_MORE - 1) * (settings.within or 0.0))
+    steps = longer.steps_sos + longer.steps_coarse * estimate.has_two_phases(longer.resolution)
+    return replace(estimate.best(left), longer_resolution=longer.resolution, longer_steps=steps)
 
 
 class _Estimate:
@@ -180,6 +180,10 @@ class _Estimate:
                 return self._choice(side, fraction)
         return self._choice(smaller[-1], fraction)
 
+    def has_two_phases(self, side: int) -> bool:
+        """Return whether views of a resolution have a phase on the coarsest of several scales."""
+        return self._cost(side).scales > 1
+
     def _fraction(self, side: int, left: float) -> float:
         """Return the largest fraction of all steps that fits, in hundredths; 0 if none fits."""
         hundredths = range(100, 0, -1)
@@ -190,7 +194,7 @@ class _Estimate:
         coarse, sos = _steps(settings, fraction)
         visits = max(sos, int(not sos) * coarse) * settings.views_per_step
         count = self._count if "views" in settings.fixed else min(self._count, max(visits, 1))
-        coarse_seconds = _COARSE * cost.seconds if cost.scales > 1 else 0.0
+        coarse_seconds = _COARSE * cost.seconds if self.has_two_phases(side) else 0.0
         steps = coarse * coarse_seconds + sos * cost.seconds + min(visits, count) * cost.first
         steps *= 1 + settings.measure
         seconds = steps + count * cost.survey + _TRIAL_STEPS * cost.seconds + self._ending

@@ -28,7 +28,8 @@ def test_more_time_never_brings_less() -> None:
         assert more_steps >= steps or more.resolution > less.resolution
         assert more.seconds <= 2.0 * 2.0**15
     assert choices[0].resolution == 96
-    assert (choices[-1].resolution, choices[-1].steps_sos, choices[-1].more) == (1280, 240, "")
+    assert (choices[-1].resolution, choices[-1].steps_sos) == (1280, 240)
+    assert "; in " not in choices[-1].decision(2.0**15, 240).reason
 
 
 @pytest.mark.parametrize("seconds", [20, 60, 300, 1200])
@@ -45,7 +46,21 @@ def test_resolution_falls_before_steps_do_and_then_again() -> None:
     assert 0.2 * 240 - 2 <= fewer.steps_coarse + fewer.steps_sos < 240
     assert small.resolution < 256
     assert small.steps_sos >= 0.2 * 240 - 1 or small.resolution == 96
-    assert whole.more.startswith("in 20 min 00 s: ")
+    assert "; in 20 min 00 s: " in whole.decision(300, 240).reason
+
+
+def test_what_more_time_brings_is_more_than_the_steps_after_their_correction() -> None:
+    choice = chosen(20)
+    more = f"; in 1 min 20 s: {choice.longer_resolution} px"
+    assert choice.decision(20, choice.steps_sos).reason.endswith(f"{more}, {choice.longer_steps} steps")
+    assert choice.decision(20, choice.longer_steps).reason.endswith(more)
+    assert "; in " not in choice.decision(None, choice.steps_sos).reason
+
+
+def test_steps_of_more_time_leave_out_a_phase_on_the_only_scale() -> None:
+    choice = chosen(20, make_settings("preview", within=20))
+    assert choice.longer_resolution < 511
+    assert choice.longer_steps == 60
 
 
 def test_given_options_stay() -> None:
