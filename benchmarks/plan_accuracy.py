@@ -90,6 +90,7 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
     from worker.job import JobSpec, SceneRequest
     from worker.options import StylizeOptions
     from worker.prepare import prepare
+    from worker.run import Listener
     from worker.styles import StyleFile
 
     (case,) = arguments.cases
@@ -121,7 +122,7 @@ def _run(arguments: argparse.Namespace) -> dict[str, Any]:
             if now.is_step and now.views_to_check is None:
                 promises.append((now.stage, now.step, now.seconds, time.perf_counter(), now.eta_s))
 
-        execute(job, progress=progress, stop=lambda: False, warn=print)
+        execute(job, Listener(progress=progress, warn=print))
         ended = time.perf_counter()
         report = json.loads((Path(folder) / "stylized.report.json").read_text())
     history, plan = report["history"], report["plan"]

@@ -6,6 +6,7 @@ import secrets
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -30,19 +31,18 @@ from worker.options import RunOptions
 from worker.prepare import Job, Warn
 from worker.previews import Previews
 
+if TYPE_CHECKING:
+    from worker.run import Listener
+
 #: Default seconds between checkpoints. If a rank is lost, at most this much work is repeated.
 CHECKPOINT_SECONDS = RunOptions().checkpoint_seconds
 
 
 def execute(
     job: Job,
+    listener: Listener,
     *,
-    progress: Callable[[Progress], None],
-    stop: Callable[[], bool],
-    warn: Warn,
-    finish: Callable[[], bool] = lambda: False,
     preview: Previews | None = None,
-    saved: Callable[[int], None] = lambda step: None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     run_id: str | None = None,
     left: SecondsLeft | None = None,
@@ -50,15 +50,10 @@ def execute(
     """Run a prepared job and write its outputs.
 
     The PLY is written first, so that it exists even if the report fails. Every participating rank must call this
-    function. The callbacks are used on rank 0 only.
+    function. The listener is used on rank 0 only.
 
     Args:
-        progress: Callback for the progress of the steps, called first with the stage "starting".
-        stop: Callback that returns True to interrupt the job.
-        finish: Callback that returns True to end the job after a step, with its present colors as the result.
-        warn: Callback for warnings, such as a checkpoint that cannot be written while the job runs.
         preview: Writer of previews after every step, and of the thumbnail at the end. None writes neither.
-        saved: Callback that receives the step of each checkpoint.
         checkpoint_seconds: Seconds between checkpoints. A job that ends early writes one more at its end.
         run_id: Identifier of this run, stored in checkpoints. None generates one.
         left: Seconds left of the time budget; None without one.
@@ -68,22 +63,22 @@ def execute(
     """
     stylizer = job.stylizer
     first = stylizer.job.collectives.rank == 0
-    reported = _ReportedSteps(progress)
+    reported = _ReportedSteps(listener.progress)
     measure = Measurements(stylizer, reported.show_views if first else show_nothing)
     if job.resumed:
         stylizer.load_state(job.resumed.state)
     if first:
-        progress(Progress(stage="starting", step=stylizer.step, total=stylizer.job.total_steps))
+        listener.progress(Progress(stage="starting", step=stylizer.step, total=stylizer.job.total_steps))
         job.outputs.ply.parent.mkdir(parents=True, exist_ok=True)
         for path in job.outputs.all:
             remove_leftovers(path)  # of an attempt that was killed
     stylizer.job.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.job.plan)))
     if first:
-        _write_views(job, warn)
-    checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), saved, warn)
+        _write_views(job, listener.warn)
+    checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), listener)
     callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds, left=left)
     if first:
-        callbacks.progress, callbacks.stop, callbacks.finish = reported, stop, finish
+        callbacks.progress, callbacks.stop, callbacks.finish = reported, listener.stop, listener.finish
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
         callbacks.preview_seconds = 0.0  # `Previews` itself limits how often a preview is written
         if preview and not _has_rows_of_file(job):
@@ -148,9 +143,9 @@ class _CheckpointWriter:
         error: Error of the last attempt to write a checkpoint; None if it succeeded.
     """
 
-    def __init__(self, job: Job, run_id: str, saved: Callable[[int], None], warn: Warn) -> None:
+    def __init__(self, job: Job, run_id: str, listener: Listener) -> None:
         self._job, self._run_id = job, run_id
-        self._saved, self._warn = saved, warn
+        self._listener = listener
         self.error: OutputError | None = None
 
     def __call__(self, stylizer: Stylizer) -> None:
@@ -160,10 +155,10 @@ class _CheckpointWriter:
         checkpoint = Checkpoint(stylizer.state(), stylizer.job.plan, job.planned_ranks, self._run_id, versions())
         try:
             job.outputs.checkpoints.save(checkpoint, job.fingerprint)
-            self._saved(stylizer.step)
+            self._listener.saved(stylizer.step)
         except OutputError as error:
             self.error = error
-            self._warn(f"The checkpoint could not be written: {error}")
+            self._listener.warn(f"The checkpoint could not be written: {error}")
 
 
 def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft | None) -> Result:

@@ -26,8 +26,9 @@ class Listener:
 
     Attributes:
         prepared: Called once, after the job has been prepared.
-        progress: Called with the latest progress. A further attempt on ranks repeats the stages before the steps if no
-            earlier attempt has saved its plan.
+        progress: Called with the latest progress; the steps start with the stage "starting". A further attempt on ranks
+            repeats the stages before the steps if no earlier attempt has saved its plan.
+        warn: Called with warnings, such as about a checkpoint that cannot be written while the job runs.
         stop: Called after each step, or a few times per second; returns True to interrupt the job.
         finish: Called like `stop`; returns True to end the job after a step, with its present colors as the result.
         saved: Called with the step of each checkpoint; not used for ranks.
@@ -158,14 +159,5 @@ def run_rank(
     if collectives.rank == 0:
         listener.prepared(describe(job))
     return execute(
-        job,
-        progress=listener.progress,
-        stop=listener.stop,
-        finish=listener.finish,
-        warn=listener.warn,
-        preview=preview,
-        saved=listener.saved,
-        checkpoint_seconds=options.checkpoint_seconds,
-        run_id=run_id,
-        left=left,
+        job, listener, preview=preview, checkpoint_seconds=options.checkpoint_seconds, run_id=run_id, left=left
     )

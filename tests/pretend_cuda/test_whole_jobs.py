@@ -31,6 +31,7 @@ from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume, SceneRequest
 from worker.prepare import Job, dry_run, prepare
 from worker.region_requests import region_options, region_requests
+from worker.run import Listener
 from worker.styles import StyleFile
 
 pytest.importorskip("triton")
@@ -62,13 +63,8 @@ def request_(
 
 def run_job(job: Job, steps: int | None = None) -> Result:
     """Run a job; if `steps` is given, interrupt it after that many steps."""
-    return execute(
-        job,
-        progress=lambda progress: None,
-        stop=lambda: steps is not None and job.stylizer.step >= steps,
-        warn=pytest.fail,
-        checkpoint_seconds=0.0,
-    )
+    listener = Listener(stop=lambda: steps is not None and job.stylizer.step >= steps, warn=pytest.fail)
+    return execute(job, listener, checkpoint_seconds=0.0)
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume
 from worker.prepare import Job, dry_run, prepare
 from worker.previews import Previews
+from worker.run import Listener
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
 
@@ -38,14 +39,11 @@ def run_job(
 ) -> Result:
     """Run a job; if `steps` is given, interrupt it after that many steps."""
     first = job.stylizer.step
-    return execute(
-        job,
-        progress=lambda progress: None,
+    listener = Listener(
         stop=lambda: steps is not None and job.stylizer.step - first >= steps,
         warn=(warnings if warnings is not None else []).append,
-        checkpoint_seconds=checkpoint_seconds,
-        run_id="run",
     )
+    return execute(job, listener, checkpoint_seconds=checkpoint_seconds, run_id="run")
 
 
 @pytest.fixture
@@ -79,13 +77,7 @@ def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
 def test_job_that_ends_early_has_no_steps_left(request_: JobSpec) -> None:
     reports: list[Progress] = []
     job = prepare(request_)
-    ended = execute(
-        job,
-        progress=reports.append,
-        stop=lambda: False,
-        finish=lambda: job.stylizer.step == 3,
-        warn=print,
-    )
+    ended = execute(job, Listener(progress=reports.append, finish=lambda: job.stylizer.step == 3))
     assert (ended.stopped, ended.steps) == ("on-request", 3)
     third = next(index for index, now in enumerate(reports) if now.step == 3)
     step, after = reports[third : third + 2]
@@ -147,7 +139,7 @@ def test_first_preview_precedes_planning(request_: JobSpec, tmp_path: Path) -> N
     assert [done for done, _ in happened[:4]] == [0, 1, 2, 3]
     assert all(written == ["step_0000000.jpg"] for _, written in happened)
     first = (tmp_path / "previews" / "step_0000000.jpg").read_bytes()
-    execute(job, progress=lambda now: None, stop=lambda: False, warn=pytest.fail, preview=previews)
+    execute(job, Listener(warn=pytest.fail), preview=previews)
     assert names() == ["step_0000000.jpg", "thumbnail.jpg"], "the hour is not over"
     assert (tmp_path / "previews" / "step_0000000.jpg").read_bytes() == first
     without = small_request(tmp_path / "without", 8)
@@ -159,7 +151,7 @@ def test_watchers_get_the_refined_scene(tmp_path: Path) -> None:
     request = small_request(tmp_path, 2, refine=3.0)
     write_scene(request.source.scene, large_wall())
     previews = Previews(tmp_path / "previews", 3600, pytest.fail)
-    execute(prepare(request), progress=lambda now: None, stop=lambda: False, warn=pytest.fail, preview=previews)
+    execute(prepare(request), Listener(warn=pytest.fail), preview=previews)
     shared, result = (read_scene(path).scene for path in (tmp_path / "live" / "scene.ply", request.out))
     assert torch.equal(shared.means, result.means)
     assert len(shared) > len(large_wall())

@@ -137,7 +137,7 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
 @pytest.mark.slow
 def test_two_ranks_reach_the_loss_of_one_rank(undisturbed: tuple[float, bytes], tmp_path: Path) -> None:
     job = prepare(small_request(tmp_path, STEPS))
-    alone = execute(job, progress=lambda step: None, stop=lambda: False, warn=pytest.fail)
+    alone = execute(job, Listener(warn=pytest.fail))
     assert undisturbed[0] == pytest.approx(alone.loss_after, rel=TOLERANCE)
 
 
