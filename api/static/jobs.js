@@ -87,9 +87,10 @@ export class JobsView {
     const name = nameOf(job), style = stylesOf(job);
     const running = UNFINISHED.has(job.status), done = job.status === "succeeded", painted = stepFraction(job);
     const picture = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: "", loading: "lazy", decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
+    const early = done && job.result?.steps < job.result?.total;
     const choose = done ? h("label.check", h("input", { type: "checkbox", checked: this.chosen.has(job.id), "aria-label": say.select(name), onchange: (/** @type {any} */ event) => this.choose(job.id, event.target.checked) }), h("small", { "aria-hidden": "true" }, say.choose)) : null;
-    const element = h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", picture), h("strong", { title: name }, name), h("small", [name.includes(style) ? "" : style, time(job.created_at)].filter(Boolean).join(" · "))),
-      h("div.row", badge(job.status), painted === undefined ? null : h("small", percent(painted)), done && job.result?.steps < job.result?.total ? h("small", words.job.steps(job.result.steps, job.result.total)) : null, h("span.grow"), choose, running ? null : this.deleter(job, name)),
+    const element = h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", picture), h("strong", { title: name }, name), h("small", [name.includes(style) ? "" : style, time(job.created_at), early && words.job.steps(job.result.steps, job.result.total)].filter(Boolean).join(" · "))),
+      h("div.row", badge(job.status), painted === undefined ? null : h("small", percent(painted)), h("span.grow"), choose, running ? null : this.deleter(job, name)),
       painted === undefined ? null : h("progress", { max: 1, value: painted, "aria-label": words.job.progress }));
     this.cards.set(job.id, { element, told });
     return element;
