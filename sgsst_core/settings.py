@@ -269,6 +269,7 @@ class Settings(BaseModel):
     ] = Field(
         None,
         gt=0,
+        le=1e9,
         allow_inf_nan=False,
         description="Time budget of the whole job, from its start to its last file; chooses the resolution, the number "
         "of views and the steps that fit, unless they are given.",

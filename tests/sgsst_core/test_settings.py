@@ -60,6 +60,7 @@ def test_learning_rate_is_exponential_in_the_fraction_of_steps() -> None:
         ({"content_weight": "weak"}, "content_weight"),
         ({"precision": "float8"}, "precision"),
         ({"within": 0}, "within"),
+        ({"within": 1e300}, "within"),
         ({"unheard_of": 1}, "unheard_of"),
     ],
 )
