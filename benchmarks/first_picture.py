@@ -2,9 +2,9 @@
 
 python -m benchmarks.first_picture SCENE STYLE [--cameras FILE] [--command-within 90] [--page-within 600]
 
-The command is timed from the start of its process to its end. The page's times start with the click on Start, in a
-service that has run no job: until it shows the painting's colors, the first strokes, and the result. Without --cameras,
-the views are an orbit.
+The command is timed from the start of its process to its end. The page's times start with the click on Start, once the
+page shows the scene, in a service that has run no job: until it shows the painting's colors, the first strokes, and the
+result. Without --cameras, the views are an orbit.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def time_page(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
     for name in SETTINGS:  # one thread, and short intervals
         service.environment.pop(name)
     with service, open_browser() as browser:
-        page: Any = Watched(browser, service.url, width=1280, height=800).page
+        watched = Watched(browser, service.url, width=1280, height=800)
+        page: Any = watched.page
         page.goto(service.url)
         page.locator(".presets input").first.wait_for()
         for role, path in given.items():
@@ -61,6 +62,7 @@ def time_page(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
         if not arguments.cameras and not orbit.is_checked():
             orbit.check()
         page.locator("[data-name=within] input").fill(str(arguments.page_within / 60))
+        watched.settled()
         page.get_by_role("button", name="Start", exact=True).click()
         started = time.monotonic()
         page.wait_for_url(re.compile("#/jobs/"))
