@@ -125,16 +125,15 @@ def prepare(
     if plan_file and not resumed:
         known = collectives.broadcast(lambda: _handed_over(plan_file, fingerprint, inputs, settings))
     chosen, networks = known.plan.time_choice if known else None, Networks()
-    always: dict[str, Any] = {"weights": weights, "collectives": collectives, "show": show_planning}
     if not known:
         with timer("planning"):
-            chosen = _choose(inputs, settings, left, networks=networks, **always)
+            chosen = _choose(inputs, settings, left, weights, collectives, show_planning, networks)
     asked, settings = settings, chosen.applied(settings) if chosen else settings
     inputs = inputs.chosen(chosen, settings) if chosen else inputs
     refinement, scene_file = known.plan.refinement if known else None, inputs.scene_file
     if settings.growth > 1:
         with timer("refining"):
-            refinement = refinement if known else _refine(inputs, settings, **always)
+            refinement = refinement if known else _refine(inputs, settings, weights, collectives, show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     plan = _usable_plan(known, collectives)
     if known and not plan and known.plan.device == common_device(collectives):
@@ -180,10 +179,10 @@ def dry_run(
     settings = request.settings
     weights = weights_for(load_network_weights(request.backbone), settings)
     networks, of_job = Networks(), inputs
-    chosen = _choose(inputs, settings, left, weights=weights, show=show, networks=networks)
+    chosen = _choose(inputs, settings, left, weights, ALONE, show, networks)
     applied = chosen.applied(settings) if chosen else settings
     inputs = inputs.chosen(chosen, applied) if chosen else inputs
-    refinement = _refine(inputs, applied, weights=weights, show=show)
+    refinement = _refine(inputs, applied, weights, ALONE, show)
     scene = refined(inputs.scene_file.scene, refinement)
     plan = _planner(inputs, settings, weights, scene, refinement, chosen)(show=show, left=left, networks=networks).plan
     if hand_over:
@@ -228,10 +227,20 @@ def _conditions(settings: Settings) -> str:
     return json.dumps([settings.model_dump(mode="json"), versions(), machine])
 
 
-def _choose(inputs: Inputs, settings: Settings, left: SecondsLeft | None, **more: Any) -> TimeChoice | None:
-    """Return the choice of the time budget, given further arguments of `choose_within`; None without one."""
-    scene = inputs.scene_file.scene
-    return left and choose_within(scene, inputs.cameras, inputs.style, settings, left, regions=inputs.regions, **more)
+def _choose(
+    inputs: Inputs,
+    settings: Settings,
+    left: SecondsLeft | None,
+    weights: BackboneWeights,
+    collectives: Collectives,
+    show: ShowPlanning | None,
+    networks: Networks,
+) -> TimeChoice | None:
+    """Return the choice of the time budget; None without one."""
+    return left and choose_within(
+        inputs.scene_file.scene, inputs.cameras, inputs.style, settings, left, weights=weights,
+        collectives=collectives, regions=inputs.regions, show=show, networks=networks,
+    )  # fmt: skip
 
 
 def _planner(
@@ -259,9 +268,14 @@ def _planner(
     )
 
 
-def _refine(inputs: Inputs, settings: Settings, **more: Any) -> Refinement | None:
-    """Return the refinement of the scene, given further arguments of `refine`; None if `settings` turn it off."""
-    return refine(inputs.scene_file.scene, inputs.cameras, inputs.style, settings, regions=inputs.regions, **more)
+def _refine(
+    inputs: Inputs, settings: Settings, weights: BackboneWeights, collectives: Collectives, show: ShowPlanning | None
+) -> Refinement | None:
+    """Return the refinement of the scene; None if `settings.refine` turns it off."""
+    return refine(
+        inputs.scene_file.scene, inputs.cameras, inputs.style, settings, weights=weights, collectives=collectives,
+        regions=inputs.regions, show=show,
+    )  # fmt: skip
 
 
 def _usable_plan(known: Checkpoint | _HandedOver | None, collectives: Collectives) -> Plan | None:

@@ -163,20 +163,19 @@ class Stylizer:
         """
         style, regions = Style.given(style), regions and regions.with_checked_styles()
         scene, cameras = checked_scene(scene), checked_cameras(cameras)
+        weights = weights or load_network_weights("auto")
         left, networks = left or seconds_left(settings.within), Networks()
-        always: dict[str, Any] = {
-            "weights": weights or load_network_weights("auto"),
-            "rasterizer": rasterizer,
-            "collectives": collectives,
-            "show": show,
-        }
         chosen = left and choose_within(
-            scene, cameras, style, settings, left, regions=regions, networks=networks, **always
-        )
+            scene, cameras, style, settings, left, weights=weights, rasterizer=rasterizer, collectives=collectives,
+            regions=regions, show=show, networks=networks,
+        )  # fmt: skip
         views = chosen.views if chosen else range(len(cameras))
         cameras = [cameras[index] for index in views]
         applied = chosen.applied(settings) if chosen else settings
-        refinement = refine(scene, cameras, style, applied, regions=regions, **always)
+        refinement = refine(
+            scene, cameras, style, applied, weights=weights, rasterizer=rasterizer, collectives=collectives,
+            regions=regions, show=show,
+        )  # fmt: skip
         job = plan_job(
             refined(scene, refinement),
             cameras,
@@ -185,10 +184,13 @@ class Stylizer:
             photos=photos and (lambda index: image_of(photos(views[index]), f"photo of view {views[index]}")),
             regions=regions and regions.refined(refinement),
             refinement=refinement,
+            weights=weights,
+            rasterizer=rasterizer,
+            collectives=collectives,
+            show=show,
             chosen=chosen,
             left=left,
             networks=networks,
-            **always,
         )
         return cls(job)
 
