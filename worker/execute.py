@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -101,7 +102,11 @@ def execute(
 def _write_views(job: Job, warn: Warn) -> None:
     """Save images of an orbit's views, so that users can check the cameras before the job is done."""
     path = job.outputs.views
-    if job.request.source.orbit is None or (job.resumed and path.exists()):
+    if job.request.source.orbit is None:
+        with suppress(OSError):  # on Windows, another program may hold it open
+            path.unlink(missing_ok=True)  # of an earlier job, or this report would show it
+        return
+    if job.resumed and path.exists():
         return
     settings, cameras = job.stylizer.job.settings, job.stylizer.job.views.cameras
     try:

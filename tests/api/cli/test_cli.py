@@ -184,6 +184,10 @@ def test_orbit_needs_no_camera_file(files: Files) -> None:
         assert views.format == "JPEG"
     assert "Views of the orbit" in files.out.with_name("stylized.report.html").read_text()
     assert report["position_weights"]["used"] is True
+    # a job with cameras of the same name does not show the views of this one
+    assert main(files.stylize("--steps-sos", "1")) == 0
+    assert not files.out.with_name("stylized.views.jpg").exists()
+    assert "Views of the orbit" not in files.out.with_name("stylized.report.html").read_text()
 
 
 def test_names_that_are_too_long_are_refused(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
