@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import sys
 
 from api.cli import ABORTED, INTERRUPTED
@@ -9,6 +11,7 @@ from api.cli import ABORTED, INTERRUPTED
 
 def run() -> int:
     """Run the command line, and return its exit code. Ctrl-C ends it in one line, also while its imports run."""
+    atexit.register(gc.freeze)  # or the end searches all that was imported for garbage, for half a second
     try:
         from api.cli.main import main
     except KeyboardInterrupt:
