@@ -63,6 +63,11 @@ def test_steps_of_more_time_leave_out_a_phase_on_the_only_scale() -> None:
     assert choice.longer_steps == 60
 
 
+def test_budget_that_nothing_fits_is_said_to_be_exceeded() -> None:
+    assert "more than the 1 s given" in chosen(1).decision(1, 1).reason
+    assert "more than" not in chosen(20).decision(20, 1).reason
+
+
 def test_given_options_stay() -> None:
     settings = make_settings(within=20, steps_sos=150, max_resolution=1280)
     assert settings.fixed == ("max_resolution", "steps_sos")
