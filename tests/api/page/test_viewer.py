@@ -314,6 +314,15 @@ def test_less_memory_shows_fewer_harmonics_and_says_so(visit: Visit, tmp_path: P
     assert shown(watched, tmp_path, "view_1", (64, 48), steps) == [3, 3, 1]
 
 
+def test_frames_that_take_long_are_followed_by_rest(visit: Visit, tmp_path: Path) -> None:
+    write_files(tmp_path, wall(sh_degree=1))
+    steps = """async (viewer, source, picture) => {
+      await picture();
+      return [1e9, 0].map((took) => (viewer.milliseconds.push(took), viewer.crowded()));
+    }"""
+    assert shown(visit("/#/jobs"), tmp_path, "view_1", (64, 48), steps) == [True, False]
+
+
 def test_wipe_is_exact_to_the_pixel(visit: Visit, tmp_path: Path) -> None:
     write_files(tmp_path, wall(sh_degree=1), cameras(1, 200, 150))
     halves = struct.pack("<1848e", *np.linspace(-2, 2, 1848))
