@@ -100,11 +100,14 @@ def execute(
 
 
 def _write_views(job: Job, warn: Warn) -> None:
-    """Save images of an orbit's views, so that users can check the cameras before the job is done."""
+    """Save images of an orbit's views, so that users can check the cameras before the job is done.
+
+    Without an orbit, those of an earlier job of the same name are deleted.
+    """
     path = job.outputs.views
     if job.request.source.orbit is None:
         with suppress(OSError):  # on Windows, another program may hold it open
-            path.unlink(missing_ok=True)  # of an earlier job, or this report would show it
+            path.unlink(missing_ok=True)  # or the report of this job would show it
         return
     if job.resumed and path.exists():
         return

@@ -113,12 +113,11 @@ class TimeChoice:
         """Return the choice as a decision of a plan, given the seconds of the budget and the steps of the plan."""
         views = f"{len(self.views)} view{'s' if len(self.views) != 1 else ''}"
         reason = f"about {duration(self.seconds, ' ')} from here on"
-        if not within:
-            reason += ", as chosen before"
-        elif self.seconds > within:
-            reason += f", more than the {duration(within, ' ')} given: no other choice takes less"
+        if within:
+            given = duration(within, " ")
+            reason += f", more than the {given} given" if self.seconds > within else f" of {given}"
         else:
-            reason += f" of {duration(within, ' ')}"
+            reason += ", as chosen before"
         gains = [f"{self.longer_resolution} px"] if self.longer_resolution > self.resolution else []
         gains += [f"{self.longer_steps} steps"] if self.longer_steps > steps else []
         more = f"; in {duration(_MORE * within, ' ')}: {', '.join(gains)}" if within and gains else ""
