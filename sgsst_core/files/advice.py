@@ -212,7 +212,7 @@ CAMERAS = (
 _CHANGED_MEANING: tuple[tuple[re.Pattern[str], str], ...] = (
     (
         re.compile(
-            r"t|times?|(t|time)_(center|mean|scale|sigma|start|end)|(start|end)_time|trbf_\w+|motion_\w+|omega_\w+"
+            r"t|times?|(t|time)_(center|mean|scale|sigma|start|end)|(start|end)_time|trbf(_\w+)?|motion(_\w+)?|omega_\w+|sogst"
             r"|f_t_\d+|(scale|scales|scaling|rot|rotation|opacity|xyz|mean|mu|center|sigma|cov)_t"
             r"|(rot|rotation)_r(_\w+)?|v[xyz]|vel(ocity|ocities)?(_\w+)?|durations?|life(span|time)"
         ),

@@ -4,7 +4,8 @@ The format is that of Greg Turk, "The PLY Polygon File Format" (1994). The newer
 accepted too, as are LF, CR LF and CR line ends.
 
 Comments state render modes: Brush's `SplatRenderMode: mip` (also of splat-transform and gsplat), Postshot's
-`antialiased 1`, fVDB's `fvdb_ply_af_8198767135antialias|int64|1` and `...eps2d|double|0.3`, and our own `eps2d 0.1`.
+`postshot.anti_aliasing=1`, `antialiased 1`, fVDB's `fvdb_ply_af_8198767135antialias|int64|1` and `...eps2d|double|0.3`,
+and our own `eps2d 0.1`. Other comments that seem to state one give a warning.
 """
 
 from __future__ import annotations
@@ -51,10 +52,29 @@ FILTER_3D = "filter_3D"
 #: Blur of Mip-Splatting and of Brush's antialiased scenes.
 _MIP_EPS2D = 0.1
 
-_MODES = {"mip": "antialiased", "default": "classic", "2dgs": "2dgs"}
-_MODE = re.compile(r"splatrendermode:\s*(\S+)\s*", re.IGNORECASE)
-_FLAG = re.compile(r"(?:antialiased\s+|fvdb_ply_\w+antialias\|int64\|)([01])\s*", re.IGNORECASE)
-_EPS2D = re.compile(r"(?:eps2d\s+|fvdb_ply_\w+eps2d\|double\|)([\d.eE+-]+)\s*", re.IGNORECASE)
+_MODES = {
+    "mip": "antialiased",
+    "default": "classic",
+    "2dgs": "2dgs",
+    "antialiased": "antialiased",
+    "classic": "classic",
+}
+_MODES |= dict.fromkeys(("1", "true", "yes", "on"), "antialiased") | dict.fromkeys(
+    ("0", "false", "no", "off"), "classic"
+)
+_IS = r"(?:\s*[:=]\s*|\s+|\|\w{1,9}\|)(\S+)"
+_MODE = re.compile(
+    r"[\w.|]*?(?:(?:render|raster)[a-z]{0,9}[-_ ]?mode|anti[-_ ]?alias(?:ed|ing)?|(?<![a-z])mip(?:[-_ ]?splatting)?)"
+    + _IS,
+    re.IGNORECASE,
+)
+_EPS2D = re.compile(r"[\w.|]*?(?:eps_?2d|kernel_?size)" + _IS, re.IGNORECASE)
+#: Comments that seem to state a render mode.
+_ABOUT_MODE = re.compile(
+    r"anti[-_ ]?alias|(?<![a-z])mip(?:map|[-_ ]?splat|(?![a-z]))|filter[-_ ]?3d|low[-_ ]?pass|eps_?2d|kernel"
+    r"|(?:render|raster)\w{0,9}[-_ ]?mode",
+    re.IGNORECASE,
+)
 _UNSCENTED = re.compile(r"\b3dgr?ut\b|\b3dgrt\b|\bunscented", re.IGNORECASE)
 
 
@@ -123,9 +143,9 @@ class PlyHeader:
 
 
 def comment_of(line: bytes) -> str | None:
-    """Return the text of a comment line of a header; None if the line is not a comment."""
+    """Return the text of a comment or information line of a header; None if the line is another."""
     keyword, _, comment = line.strip().partition(b" ")
-    return comment.decode("latin-1").strip() if keyword == b"comment" else None
+    return comment.decode("latin-1").strip() if keyword in (b"comment", b"obj_info") else None
 
 
 def read_header(file: FileStart) -> PlyHeader:
@@ -278,19 +298,18 @@ def ply_tag(header: PlyHeader) -> RenderTag:
     names = header.vertex.kinds
     mode, eps2d, reasons, warnings = None, None, [], []
     for comment in header.comments:
-        if match := _MODE.fullmatch(comment):
-            mode = _MODES.get(match[1].lower(), mode)
-            if match[1].lower() not in _MODES:
-                warnings.append(("classic unless stated otherwise", f"the comment {comment!r} is unknown"))
-                continue
-        elif match := _FLAG.fullmatch(comment):
-            mode = "antialiased" if match[1] == "1" else "classic"
-        elif match := _EPS2D.fullmatch(comment):
-            eps2d = usable_eps2d(match[1])
+        if (match := _MODE.fullmatch(comment)) and match[1].lower() in _MODES:
+            mode = _MODES[match[1].lower()]
+        elif (match := _EPS2D.fullmatch(comment)) and (blur := usable_eps2d(match[1])):
+            eps2d = blur
         elif _UNSCENTED.search(comment):
             reason = f"the comment {comment!r} names another projection"
             differs = "renders differ where Gaussians are large or lenses were distorted"
             warnings.append(("by linearized projection (EWA)", f"{reason}; {differs}"))
+            continue
+        elif _ABOUT_MODE.search(comment):
+            advice = "if the scene was trained antialiased, add --render-mode antialiased"
+            warnings.append(("classic unless stated otherwise", f"the comment {comment[:80]!r} is unknown; {advice}"))
             continue
         else:
             continue
@@ -326,11 +345,10 @@ def retagged(raw: bytes, header: PlyHeader, rendering: Rendering) -> bytes:
     """
     if ply_tag(header).rendering == rendering:
         return raw
-    stating = (_MODE, _FLAG, _EPS2D)
     lines = [
         line
         for line in raw.split(header.newline)
-        if not any(pattern.fullmatch(comment_of(line) or "") for pattern in stating)
+        if not any(pattern.fullmatch(comment_of(line) or "") for pattern in (_MODE, _EPS2D))
     ]
     after_format = next(i for i, line in enumerate(lines) if line.startswith(b"format")) + 1
     lines[after_format:after_format] = [line.encode() for line in _stating(rendering)]

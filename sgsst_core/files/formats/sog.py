@@ -1,11 +1,11 @@
-"""Reader and writer of PlayCanvas' SOG: a ZIP archive, or a folder, with meta.json and WebP images.
+"""Reader and writer of PlayCanvas' SOG: a ZIP archive, or a folder, with meta.json and WebP images, or PNGs.
 
-Pixel i of each image belongs to Gaussian i. Positions are 16-bit steps on a logarithmic scale, in two images. Scales
-and colors are indices into codebooks of 256 values. Rotations have three components of 8 bits. SH coefficients are a
-palette of up to 65,536 vectors. Version 1 has linear steps between bounds in place of codebooks. The layout is that of
-https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. Axes are those of the PLY. The field
-`model` of meta.json is the render mode, as splat-transform writes it. Written files have their blur in `extras`, which
-is for programs' own values.
+Pixel i of each image belongs to Gaussian i; pixels after the last one mean nothing. Positions are 16-bit steps on a
+logarithmic scale, in two images. Scales and colors are indices into codebooks of 256 values. Rotations have three
+components of 8 bits. SH coefficients are a palette of up to 65,536 vectors. Version 1 has linear steps between bounds
+in place of codebooks. The layout is that of https://developer.playcanvas.com/user-manual/gaussian-
+splatting/formats/sog. Axes are those of the PLY. The field `model` of meta.json is the render mode, as splat-transform
+writes it; `antialias` was its older form. Written files have their blur in `extras`, which is for programs' own values.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import io
 import json
 import math
 import re
+import struct
 import zipfile
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -24,7 +25,7 @@ from PIL import Image
 
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.advice import converted, is_checkpoint, is_usdz
+from sgsst_core.files.advice import converted, is_checkpoint, is_usdz, refuse_changed_meaning
 from sgsst_core.files.formats.archive import ZIP_MAGIC, FilesOfScene
 from sgsst_core.files.formats.codebooks import VALUES, nearest_entries, palette, value_codebook
 from sgsst_core.files.formats.quantized import (
@@ -42,7 +43,6 @@ from sgsst_core.files.formats.scene_format import (
     OpenScene,
     SceneFormat,
     SceneHeader,
-    about_surplus,
     blocks,
     extras_of,
     extras_tag,
@@ -72,6 +72,7 @@ _PALETTE_PIXELS = _MAX_PALETTE * COEFFICIENTS[3]
 _COEFFICIENTS_BY_WIDTH = {_PALETTE_COLUMNS * number: number for number in COEFFICIENTS.values() if number}
 #: Alpha of the rotations' image for w as the omitted component; x, y and z follow.
 _FIRST_TAG = 252
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 #: Number and kind of images by property.
 _IMAGES = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
@@ -95,6 +96,7 @@ class SogHeader(SceneHeader):
         colors: SH coefficient of degree 0 of each byte, by channel, [3, 256].
         opacities: Logit of each byte, [256].
         harmonics: SH coefficient of each byte of the palette, [256]; None without spherical harmonics.
+        vectors: Declared number of vectors of the palette; None if the file does not state it.
     """
 
     names: dict[str, list[str]]
@@ -103,6 +105,7 @@ class SogHeader(SceneHeader):
     colors: NDArray[np.float64]
     opacities: NDArray[Any]
     harmonics: NDArray[np.float64] | None
+    vectors: int | None
 
 
 class SogFiles(FilesOfScene):
@@ -114,7 +117,7 @@ class SogFiles(FilesOfScene):
         return self.load(name, _MAX_PART_META_BYTES if self.folder else _MAX_META_BYTES)
 
     def dimensions(self, name: str, least: int, most: int | None = None) -> tuple[int, int]:
-        """Return width and height of a WebP image, from its first bytes alone.
+        """Return width and height of a WebP or PNG image, from its first bytes alone.
 
         Args:
             least: Minimum number of pixels.
@@ -127,8 +130,12 @@ class SogFiles(FilesOfScene):
             size = (bits & 16383) + 1, (bits >> 14 & 16383) + 1
         elif kind == b"VP8X":
             size = int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
-        if size is None or head[:4] != b"RIFF" or head[8:12] != b"WEBP":
-            raise SceneError(f"{self.path}: {self.folder}{name} is not a lossless WebP image. Export the scene again.")
+        if head[:4] != b"RIFF" or head[8:12] != b"WEBP":
+            size = struct.unpack_from(">2I", head, 16) if head.startswith(_PNG_MAGIC) else None
+        if size is None:
+            raise SceneError(
+                f"{self.path}: {self.folder}{name} is no lossless WebP or PNG image. Export the scene again."
+            )
         if not least <= size[0] * size[1] <= (_PIXELS_PER_GAUSSIAN * least + _MORE_PIXELS if most is None else most):
             raise SceneError(
                 f"{self.path}: {self.folder}{name} has {size[0]} x {size[1]} pixels, which do not fit {least} "
@@ -145,13 +152,14 @@ class SogFiles(FilesOfScene):
         """Return an image [height, width, 4] uint8. Arguments are those of `dimensions`."""
         size, data = self.image(name, least, most)
         try:
-            with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-                if image.size != size or getattr(image, "n_frames", 1) != 1:
-                    raise ValueError("it is animated, or its sizes differ")
+            with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
+                if image.size != size or getattr(image, "n_frames", 1) != 1 or image.mode.startswith("I"):
+                    raise ValueError("it is animated, its sizes differ, or it has more than 8 bits")
                 return np.asarray(image.convert("RGBA"))
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise SceneError(
-                f"{self.path}: {self.folder}{name} is not a readable WebP image: {error}. Export the scene again."
+                f"{self.path}: {self.folder}{name} is not a readable WebP or PNG image: {error}. Export the scene "
+                "again."
             ) from error
 
 
@@ -186,6 +194,7 @@ def sog_header(files: SogFiles) -> SogHeader:
 
 def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
     """Parse meta.json. Errors of `WRONG_JSON` mean that a value is missing or wrong."""
+    refuse_changed_meaning(files.path, (*meta, str(meta.get("format"))))
     version = meta.get("version", 1)
     if version not in (1, 2):
         raise SceneError(
@@ -202,18 +211,24 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
     table = _codebook if version == 2 else _steps
     scales, colors = table(meta["scales"], 3), table(meta["sh0"], 4)
     opacities = OPACITY_LOGITS if version == 2 else colors[3]
-    coefficients, harmonics = 0, None
+    coefficients, harmonics, vectors = 0, None, None
     if "shN" in names:
         width, _ = files.dimensions(names["shN"][0], 1, _PALETTE_PIXELS)
         if width not in _COEFFICIENTS_BY_WIDTH:
             raise ValueError(f"width of {names['shN'][0]}: {width}")
         coefficients, harmonics = _COEFFICIENTS_BY_WIDTH[width], table(meta["shN"], 1)[0]
+        vectors = meta["shN"].get("count")
+        if vectors is not None and (type(vectors) is not int or vectors < 1):
+            raise ValueError(f"count of shN: {vectors}")
         if COEFFICIENTS.get(meta["shN"].get("bands"), coefficients) != coefficients:
             raise ValueError(f"bands: {meta['shN']['bands']} with {coefficients} coefficients")
     extras = meta["extras"] if isinstance(meta.get("extras"), dict) else {}
-    tag = extras_tag({**extras, "model": meta.get("model", "default")}, "meta.json")
-    bytes_of = (scales[:3], colors[:3], opacities, harmonics)
-    return SogHeader(SOG, count, coefficients, names, bounds, *bytes_of, notes=files.surplus, tag=tag)
+    model = meta.get("model", "antialiased" if meta.get("antialias") is True else "default")
+    tag = extras_tag({**extras, "model": model}, "meta.json")
+    more = {name for name, value in meta.items() if isinstance(value, dict) and "files" in value} - names.keys()
+    notes = (f"{', '.join(sorted(more))[:80]} of meta.json are unknown and left out",) if more else ()
+    bytes_of = (scales[:3], colors[:3], opacities, harmonics, vectors)
+    return SogHeader(SOG, count, coefficients, names, bounds, *bytes_of, notes=(*files.surplus, *notes), tag=tag)
 
 
 def _codebook(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
@@ -239,18 +254,16 @@ def _steps(entry: dict[str, Any], channels: int) -> NDArray[np.float64]:
         return low + (high - low) * (np.arange(VALUES) / 255)
 
 
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
     assert isinstance(header, SogHeader)
-    return read_sog(SogFiles(file.path), header, into)
+    read_sog(SogFiles(file.path), header, into)
 
 
-def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> tuple[str, ...]:
-    """Fill the arrays of a scene, and return the note on pixels after the last Gaussian that are no padding."""
+def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> None:
+    """Fill the arrays of a scene."""
     where = f"{files.path}: {files.folder}"
     read_positions(files, header, into["means"])
-    quats = _pixels(files, header, "quats")
-    surplus = int((quats[header.count :, 3] >= _FIRST_TAG).sum())  # padding has no valid rotations
-    quats = quats[: header.count]
+    quats = _pixels(files, header, "quats")[: header.count]
     for block in blocks(header.count):
         index = quats[block, 3].astype(np.int64) - _FIRST_TAG
         if index.min() < 0:
@@ -263,16 +276,16 @@ def read_sog(files: SogFiles, header: SogHeader, into: Arrays) -> tuple[str, ...
         into["sh_dc"][:] = _colors(header, colors)
         into["opacities"][:] = header.opacities.astype(np.float32)[colors[:, 3]]
         if header.harmonics is not None:
-            vectors = files.pixels(header.names["shN"][0], 1, _PALETTE_PIXELS)[..., :3]
-            entries = header.harmonics.astype(np.float32)[vectors.reshape(-1, header.coefficients, 3)]
+            stored = files.pixels(header.names["shN"][0], 1, _PALETTE_PIXELS)[..., :3]
+            entries = header.harmonics.astype(np.float32)[stored.reshape(-1, header.coefficients, 3)]
             labels = _pixels(files, header, "shN", 1)[: header.count, :2].astype(np.int64) @ np.array([1, 256])
-            if labels.max() >= len(entries):
+            vectors = min(len(entries), header.vectors or len(entries))
+            if labels.max() >= vectors:
                 raise SceneError(
-                    f"{where}{header.names['shN'][1]} refers to vector {labels.max()} of {len(entries)}. Export the "
-                    "scene again."
+                    f"{where}{header.names['shN'][1]} refers to vector {labels.max()} of {vectors}. Export the scene "
+                    "again."
                 )
             into["sh_rest"][:] = entries[labels]
-    return about_surplus(surplus, "Gaussian")
 
 
 def _pixels(files: SogFiles, header: SogHeader, name: str, index: int = 0) -> NDArray[np.uint8]:

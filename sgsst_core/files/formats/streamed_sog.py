@@ -218,15 +218,14 @@ def _part(path: Path, opened: _Opened, folder: str, level: int | None, ranges: l
 
 def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
     assert isinstance(header, StreamedHeader)
-    notes: tuple[str, ...] = ()
     with _opened(file.path) as opened:
         for part, rows in header.rows:
             arrays = {name: array[rows] for name, array in into.items()}
             if "sh_rest" in arrays:
                 arrays["sh_rest"][:, part.header.coefficients :] = 0
                 arrays["sh_rest"] = arrays["sh_rest"][:, : part.header.coefficients]
-            notes += read_sog(opened.part(part.folder), part.header, arrays)
-    return notes
+            read_sog(opened.part(part.folder), part.header, arrays)
+    return tuple(dict.fromkeys(note for part, _ in header.rows for note in part.header.notes))
 
 
 def pack(index: Path, target: Path) -> None:

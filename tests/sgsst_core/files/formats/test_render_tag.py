@@ -53,6 +53,11 @@ def ply(tmp_path: Path, *comments: str, newline: bytes = b"\n") -> Path:
         (["SplatRenderMode: mip", "eps2d 1e9"], AA),
         (["SplatRenderMode: mip", "eps2d -0.1"], AA),
         (["not antialiased 1", "antialiased 12"], CLASSIC),
+        (["postshot.anti_aliasing=1"], AA),
+        (["postshot.anti_aliasing=0"], CLASSIC),
+        (["Anti-Aliasing: on"], AA),
+        (["rasterize_mode=antialiased", "kernel_size: 0.1"], MIP),
+        (["mip_splatting true"], AA),
         ([], CLASSIC),
     ],
 )
@@ -65,13 +70,17 @@ def test_comments_of_programs_state_the_render_mode(tmp_path: Path, comments: li
 def test_doubtful_comments_give_warnings(tmp_path: Path) -> None:
     for comment, said in (
         ("SplatRenderMode: banana", "unknown"),
+        ("trained with anti-aliasing", "unknown"),
+        ("antialiased 12", "unknown"),
+        ("Mip-Splatting, 30,000 steps", "unknown"),
+        ("eps2d nan", "unknown"),
         ("SplatRenderMode: 2dgs", "without thickness"),
         ("trained with 3DGUT", "another projection"),
         (f"{FVDB}projection_method|str|unscented", "another projection"),
     ):
         (warning,) = read_scene(ply(tmp_path, comment)).tag.warnings
         assert said in " ".join(warning)
-    assert read_scene(ply(tmp_path, "gut feeling", "SplatRenderMode: mip")).tag.warnings == ()
+    assert read_scene(ply(tmp_path, "gut feeling", "mipless", "SplatRenderMode: mip")).tag.warnings == ()
 
 
 @pytest.mark.parametrize("rendering", [CLASSIC, AA, MIP, Rendering("2dgs")], ids=lambda each: each.text)

@@ -99,14 +99,24 @@ def test_values_match_those_computed_by_hand(tmp_path: Path, version: int, metho
 
 
 def test_padding_may_have_any_colors(tmp_path: Path) -> None:
-    """Writers may change the colors of transparent pixels, with which images are padded."""
-    padding = [[9, 8, 7, 0], [5, 6, 7, 0]]
+    """Writers may change the colors of transparent pixels, with which images are padded, or pad with white."""
+    padding = [[9, 8, 7, 0], [255] * 4]
     files = by_hand(2)
     for name in ("low", "high", "quats", "scales", "sh0", "labels"):
         pixels = np.asarray(Image.open(io.BytesIO(files[name])).convert("RGBA"))
         files[name] = webp(np.concatenate([pixels, [padding]]))
     (tmp_path / "scene.sog").write_bytes(zipped(files))
     assert read_scene(tmp_path / "scene.sog").notes == ()
+
+
+def test_unknown_images_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "scene.sog").write_bytes(changed(normals={"files": ["low"]}, note="files"))
+    assert read_scene(tmp_path / "scene.sog").notes == ("normals of meta.json are unknown and left out",)
+
+
+def test_older_form_of_the_render_mode_is_read(tmp_path: Path) -> None:
+    (tmp_path / "scene.sog").write_bytes(changed(antialias=True))
+    assert read_scene(tmp_path / "scene.sog").scene.rendering.antialiased
 
 
 def test_missing_first_value_of_a_codebook_is_extrapolated(tmp_path: Path) -> None:
@@ -135,6 +145,10 @@ def test_folder_is_read_by_its_meta_json(tmp_path: Path) -> None:
     folder.mkdir()
     for name, content in unzipped(data).items():
         (folder / name).write_bytes(content)
+    assert_close(read_scene(folder / "meta.json").scene, read_scene(tmp_path / "good").scene, opacities=0, others=0)
+    for name in unzipped(data):
+        if name.endswith(".webp"):  # the specification allows images of other formats
+            Image.open(folder / name).save(folder / name, "PNG")
     assert_close(read_scene(folder / "meta.json").scene, read_scene(tmp_path / "good").scene, opacities=0, others=0)
     (folder / "quats.webp").unlink()
     refused(
@@ -218,11 +232,16 @@ def many_channels() -> bytes:
         (changed(quats__files=["sh0"]), "sh0 has no valid rotations"),
         (changed(shN__files=["labels", "palette"]), "width of labels: 2"),
         (changed(shN__files=["palette", "low"]), "low refers to vector 65535 of 64"),
+        (changed(shN__count=1), "labels refers to vector 1 of 1"),
+        (changed(shN__count=0), "count of shN: 0"),
+        (changed(motion={"degree": 1, "files": ["low", "high"]}), "property 'motion', so it is a dynamic scene"),
+        (changed(trbf={"files": ["low"]}), "dynamic scene"),
+        (changed(format="sogst", version=1), "dynamic scene"),
         (changed(quats__files=["nothing"]), "without nothing"),
         (bomb(), "low has more than"),
-        (zipped(by_hand(2) | {"sh0": by_hand(2)["sh0"][:-8]}), "sh0 is not a readable WebP image"),
+        (zipped(by_hand(2) | {"sh0": by_hand(2)["sh0"][:-8]}), "sh0 is not a readable WebP or PNG image"),
         (changed(count=10**8, means__files=["huge", "huge"]), "100000000 Gaussians, more than [0-9]+ bytes can hold"),
-        (zipped(by_hand(2) | {"sh0": b"RIFF" + bytes(100)}), "sh0 is not a lossless WebP image"),
+        (zipped(by_hand(2) | {"sh0": b"RIFF" + bytes(100)}), "sh0 is no lossless WebP or PNG image"),
         (zipped(by_hand(2) | {"scales": webp(np.zeros((5000, 5000, 3)), "RGB")}), "5000 x 5000 pixels"),
     ],
 )

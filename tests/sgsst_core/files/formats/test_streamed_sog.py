@@ -105,7 +105,7 @@ def test_nothing_is_written_if_a_coarse_level_is_damaged(tmp_path: Path, target:
     original = unpacked(tmp_path / "scene", files)
     scene = read_scene(original).scene
     (tmp_path / "out").mkdir()
-    with pytest.raises(SceneError, match="is not a readable WebP image"):
+    with pytest.raises(SceneError, match="is not a readable WebP or PNG image"):
         write_levels(tmp_path / "out" / target, replace(scene, sh_dc=scene.sh_dc + 1), original)
     assert list((tmp_path / "out").iterdir()) == []
 
