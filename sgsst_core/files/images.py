@@ -28,7 +28,7 @@ from torch import Tensor
 from sgsst_core.errors import ImageError
 from sgsst_core.files.advice import POINTER, refuse_known
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.color_profiles import MAX_PROFILE_BYTES, ColorProfile
+from sgsst_core.files.color_profiles import MAX_PROFILE_BYTES, ColorProfile, png_profile
 
 #: Maximum number of pixels: Pillow's limit against decompression bombs, which is twice its warning threshold. These 179
 #: megapixels exceed the largest camera sensors, and take 2 GB as float32.
@@ -65,6 +65,8 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_TEXT_BYTES = 16 << 20
 #: Chunks before the pixels that determine them, or the number of frames.
 _COPIED = (b"IHDR", b"PLTE", b"tRNS", b"acTL", b"fcTL")
+#: Chunks that state colors without a profile.
+_COLOR_CHUNKS = (b"cICP", b"sRGB", b"gAMA", b"cHRM")
 #: Texts that may hold the orientation.
 _USED_TEXTS = (b"XML:com.adobe.xmp", b"Raw profile type exif")
 #: Additional bytes of a compressed value that is as long as the limit.
@@ -87,13 +89,13 @@ def load_image(
 ) -> Tensor:
     """Read an image in one of `FORMATS` or HEIC, or the first frame of an animated one.
 
-    Colors are converted to sRGB by the image's ICC profile; images without one are taken for sRGB. Palettes, gray, 16
-    bits and CMYK are converted to RGB.
+    Colors are converted to sRGB by the image's ICC profile, or a PNG's chunks cICP, gAMA and cHRM; images without them
+    are taken for sRGB. Palettes, gray, 16 bits and CMYK are converted to RGB.
 
     Args:
         background: sRGB color behind transparent parts, in 0..1; white by default.
         oriented: Whether the EXIF orientation is applied.
-        color_managed: Whether the ICC profile is applied. Masks hold no colors.
+        color_managed: Whether colors are converted. Masks hold no colors.
         warn: Callback for a color profile or frames that are ignored; None to issue an `ImageWarning`.
         max_pixels: Number of pixels above which the image is reduced, by averaging squares of whole pixels, before it
             is converted to floats, which take four times the memory.
@@ -257,7 +259,11 @@ def _heif_format(path: Path) -> tuple[str, ...]:
 def _profile_of(path: Path, image: Image.Image, warn: Callable[[str], None]) -> ColorProfile | None:
     """Return the color profile of an image; None if it has none that changes colors."""
     data = image.info.get("icc_profile")
-    if not data:
+    try:
+        data = png_profile(data) if isinstance(data, dict) else data
+    except ValueError as error:
+        warn(f"{path.name}: its colors are taken for sRGB, because {error}")
+    if not data or isinstance(data, dict):
         return None
     gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
     mode = "L" if gray else "CMYK" if image.mode == "CMYK" else "RGB"
@@ -329,16 +335,18 @@ class _PngMetadata:
     Attributes:
         chunks: Chunks for Pillow, complete.
         profile: Color profile, of which at most one byte more than allowed is inflated; None if there is none.
+        colors: Contents of the chunks that state colors without a profile.
         text_left: Bytes of compressed texts that are still allowed.
     """
 
     chunks: list[bytes] = field(default_factory=list)
     profile: bytes | None = None
+    colors: dict[bytes, bytes] = field(default_factory=dict)
     text_left: int = MAX_TEXT_BYTES
 
 
-def _open_png(path: Path, *, pixels: bool) -> tuple[io.BytesIO, bytes | None]:
-    """Return a PNG for Pillow, and its color profile; None if it has none that can be inflated.
+def _open_png(path: Path, *, pixels: bool) -> tuple[io.BytesIO, bytes | dict[bytes, bytes]]:
+    """Return a PNG for Pillow, and its color profile, or the chunks that state its colors without one.
 
     Args:
         path: File that starts with `_PNG_SIGNATURE`.
@@ -372,7 +380,8 @@ def _open_png(path: Path, *, pixels: bool) -> tuple[io.BytesIO, bytes | None]:
         file.seek(start)
         data = file.read(stop - start if pixels else 8) if start else b""
     end = _PNG_END if start and stop <= size else b""
-    return io.BytesIO(b"".join([_PNG_SIGNATURE, *metadata.chunks, data, end])), metadata.profile
+    profile = metadata.colors if b"cICP" in metadata.colors else metadata.profile or metadata.colors
+    return io.BytesIO(b"".join([_PNG_SIGNATURE, *metadata.chunks, data, end])), profile
 
 
 def _read_chunk(path: Path, kind: bytes, length: int, file: BinaryIO, metadata: _PngMetadata) -> None:
@@ -382,6 +391,8 @@ def _read_chunk(path: Path, kind: bytes, length: int, file: BinaryIO, metadata: 
     elif kind == b"iCCP":
         value = file.read(min(length, MAX_PROFILE_BYTES + _OVERHEAD)).partition(b"\0")[2]
         metadata.profile = _inflated(value[1:], MAX_PROFILE_BYTES) or metadata.profile
+    elif kind in _COLOR_CHUNKS:
+        metadata.colors[kind] = file.read(min(length, 32))
     elif kind in (b"tEXt", b"zTXt", b"iTXt"):
         keyword, _, value = file.read(min(length, MAX_TEXT_BYTES + _OVERHEAD)).partition(b"\0")
         compressed = kind == b"zTXt"

@@ -58,6 +58,7 @@ def write_usd(path: Path, scene: Scene) -> None:
 
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Gaussians")
     stage.SetDefaultPrim(splats.GetPrim())
     splats.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(bounds.astype(np.float32)))

@@ -22,6 +22,7 @@ from sgsst_core.files.photos import check_photos, find_masks, load_photo
 from sgsst_core.scene.camera import Camera
 from tests.icc_profiles import (
     ADOBE_RGB,
+    D65,
     DISPLAY_P3,
     PROPHOTO,
     SRGB,
@@ -74,6 +75,67 @@ def test_images_without_a_profile_or_in_srgb_are_bit_identical(tmp_path: Path, p
     image = load_image(save(tmp_path / "a.png", stored, profile))
     expected = torch.from_numpy(stored.reshape(24, 36, -1)).float() / 255
     assert torch.equal(image, expected.expand(24, 36, 3))
+
+
+def chunked(path: Path, chunks: dict[bytes, bytes], profile: bytes = b"") -> Path:
+    """Write the image of `colors` as a PNG with color chunks."""
+    data = save(path, colors(), profile).read_bytes()
+    body = b"".join(
+        struct.pack(">I", len(value)) + kind + value + struct.pack(">I", zlib.crc32(kind + value))
+        for kind, value in chunks.items()
+    )
+    path.write_bytes(data[:33] + body + data[33:])  # after the header
+    return path
+
+
+def chrm(red: tuple, green: tuple, blue: tuple, white: tuple, _gamma: float) -> bytes:
+    return struct.pack(">8I", *(round(1e5 * value) for point in (white, red, green, blue) for value in point))
+
+
+P3, ADOBE, SRGB_CHUNK = {b"cICP": bytes((12, 13, 0, 1))}, {b"cHRM": chrm(*ADOBE_RGB)}, {b"sRGB": b"\0"}
+LINEAR, ROUNDED = {b"gAMA": struct.pack(">I", 100_000)}, {b"gAMA": struct.pack(">I", 45455)}
+
+
+@pytest.mark.parametrize(
+    ("chunks", "profile", "same_as"),
+    [
+        (ADOBE | ROUNDED, b"", rgb_profile(*ADOBE_RGB)),
+        (ADOBE, b"", rgb_profile(*ADOBE_RGB[:4], 0.0)),
+        (LINEAR, b"", rgb_profile(*SRGB[:4], 1.0)),
+        ({b"cICP": bytes((9, 8, 0, 1))}, b"", rgb_profile((0.708, 0.292), (0.17, 0.797), (0.131, 0.046), D65, 1.0)),
+        (P3 | SRGB_CHUNK | LINEAR, b"", rgb_profile(*DISPLAY_P3)),
+        (P3, rgb_profile(*PROPHOTO), rgb_profile(*DISPLAY_P3)),
+        (SRGB_CHUNK | LINEAR, rgb_profile(*PROPHOTO), rgb_profile(*PROPHOTO)),
+        (SRGB_CHUNK | LINEAR | ADOBE, b"", b""),
+        (ROUNDED, b"", b""),  # how many programs state sRGB
+        (ROUNDED | {b"cHRM": chrm(*SRGB)}, b"", b""),
+    ],
+)
+def test_color_chunks_of_a_png_count_by_their_precedence(
+    tmp_path: Path, chunks: dict[bytes, bytes], profile: bytes, same_as: bytes
+) -> None:
+    image = load_image(chunked(tmp_path / "a.png", chunks, profile))
+    expected = load_image(save(tmp_path / "b.png", colors(), same_as))
+    assert float((image - expected).abs().max()) <= (2.1 / 255 if same_as else 0)
+
+
+@pytest.mark.parametrize(
+    "chunks",
+    [
+        {b"cICP": bytes((9, 16, 0, 1))},
+        {b"cICP": b"\1"},
+        {b"gAMA": bytes(4)},
+        {b"gAMA": b"\0\0\0\1"},
+        {b"gAMA": b"\1"},
+        {b"cHRM": bytes(32)},
+        {b"cHRM": struct.pack(">8I", *[33333] * 8)},
+        {b"cHRM": struct.pack(">8I", *range(2**32 - 8, 2**32))},
+    ],
+)
+def test_color_chunks_that_cannot_be_converted_give_a_warning(tmp_path: Path, chunks: dict[bytes, bytes]) -> None:
+    with pytest.warns(ImageWarning, match="taken for sRGB, because their (cICP|gAMA or cHRM) chunk"):
+        image = load_image(chunked(tmp_path / "a.png", chunks))
+    assert torch.equal(image, torch.from_numpy(colors()).float() / 255)
 
 
 def test_gray_of_8_and_16_bits_is_converted_equally(tmp_path: Path) -> None:

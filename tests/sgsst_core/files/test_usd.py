@@ -25,7 +25,7 @@ def test_written_values_match_the_scene(tmp_path: Path, suffix: str, degree: int
     scene, path = cloud(300, degree=degree), tmp_path / f"scene{suffix}"
     write_usd(path, scene)
     stage = Usd.Stage.Open(str(path))
-    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1)
     splats = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
     assert splats
 
