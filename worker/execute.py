@@ -105,7 +105,7 @@ def _write_views(job: Job, warn: Warn) -> None:
     Without an orbit, those of an earlier job of the same name are deleted.
     """
     path = job.outputs.views
-    if job.request.source.orbit is None:
+    if job.request.source.cameras is not None:
         with suppress(OSError):  # on Windows, another program may hold it open
             path.unlink(missing_ok=True)  # or the report of this job would show it
         return

@@ -12,6 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from sgsst_core.errors import CameraError, SettingsError
+from sgsst_core.files.camera_folder import cameras_beside
 from sgsst_core.settings import Color, Settings
 from worker.options import Backbone, ViewOptions
 from worker.region_requests import RegionRequest
@@ -26,7 +27,7 @@ class SceneRequest(ViewOptions):
 
     Attributes:
         scene: Path of the 3DGS scene, in any of `FORMATS`.
-        cameras: Camera file or folder; None for an orbit.
+        cameras: Camera file or folder; None for an orbit, whose number of views is automatic unless `orbit` has it.
     """
 
     scene: Path
@@ -110,24 +111,33 @@ class Resume:
     run: str | None = None
 
 
-def check_choice(source: SceneRequest, images: Path | None = None) -> None:
-    """Check that cameras come from exactly one source, and that photos are given only with camera files.
+def default_cameras(scene: Path, options: ViewOptions) -> tuple[Path | None, str]:
+    """Return the cameras of a scene for which none are given, and a line that says so.
+
+    They are those beside the scene, or else an orbit (None), whose options exclude a search.
 
     Raises:
-        CameraError: If the options contradict each other or no cameras are given.
+        CameraError: If it is unclear which file is meant; see `cameras_beside`.
     """
-    if source.cameras is None and source.orbit is None:
-        raise CameraError(
-            "There are no cameras. Give a camera file with --cameras, or --orbit N for N views around the scene."
-        )
+    if options.orbit is not None or options.elevation is not None or options.radius is not None:
+        return None, ""
+    if (found := cameras_beside(scene)) is not None:
+        return found, f"The cameras are those of {found}; --cameras and --orbit choose others."
+    return None, f"There are no cameras beside {scene}, so its views are on an orbit (--orbit auto)."
+
+
+def check_choice(source: SceneRequest, images: Path | None = None) -> None:
+    """Check that cameras come from one source, and that photos are given only with camera files.
+
+    Raises:
+        CameraError: If the options contradict each other.
+    """
     if source.cameras is not None and source.orbit is not None:
         raise CameraError("Both --cameras and --orbit are given. Use only one of them.")
-    if source.orbit is None and (source.elevation is not None or source.radius is not None):
-        raise CameraError("--elevation and --radius require --orbit. Add it, or omit them.")
-    if images is not None and source.orbit is not None:
-        raise CameraError(
-            "--images requires --cameras, and cannot be combined with --orbit. Use --cameras, or omit --images."
-        )
+    if source.cameras is not None and (source.elevation is not None or source.radius is not None):
+        raise CameraError("--elevation and --radius place an orbit. Omit --cameras or them.")
+    if images is not None and source.cameras is None:
+        raise CameraError("--images requires the cameras of the photos. Add --cameras, or omit --images.")
 
 
 def check_steps(settings: Settings) -> None:

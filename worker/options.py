@@ -45,7 +45,7 @@ class ViewOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    orbit: Annotated[Views | None, Option(unit="views", metavar="N", default="cameras from files")] = Field(
+    orbit: Annotated[Views | None, Option(unit="views", metavar="N", default="cameras from files, else auto")] = Field(
         None,
         description="Create N views around the scene instead of reading camera files; auto: as many as its surface "
         "needs. They form rings at as many elevations as needed.",

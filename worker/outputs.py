@@ -142,7 +142,7 @@ def check_request(request: JobSpec) -> Outputs:
     """Check a request as far as possible without reading the inputs, and return the output files. Creates nothing.
 
     Raises:
-        InvalidInputError: If there are no steps or no cameras, or the outputs cannot be written.
+        InvalidInputError: If there are no steps, options contradict each other, or the outputs cannot be written.
     """
     check_steps(request.settings)
     check_choice(request.source, request.images)

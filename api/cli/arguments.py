@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from api.cli.console import error_console
+from api.client.inputs import path_or_url
 from sgsst_core.errors import OutputError, SettingsError
-from sgsst_core.files.formats import SUFFIXES
-from worker.options import ESSENTIALS, REGIONS, VIEWS, StylizeOptions
+from sgsst_core.files.formats import SUFFIXES, scene_path
+from worker.options import ESSENTIALS, REGIONS, VIEWS, StylizeOptions, ViewOptions
 from worker.outputs import check_file, check_folder
 from worker.region_requests import SHAPES, RegionOptions, region_options, region_requests
 from worker.styles import parse_styles
 
 if TYPE_CHECKING:
-    from worker.job import JobSpec
+    from worker.job import JobSpec, SceneRequest
 
 
 def local_path(text: str) -> Path:
@@ -26,8 +28,6 @@ def local_path(text: str) -> Path:
     Raises:
         SettingsError: If `text` is a URL.
     """
-    from api.client.inputs import path_or_url
-
     path = path_or_url(text)
     if isinstance(path, str):
         raise SettingsError(f"{text}: only `sgsst submit` takes URLs. Download the file, and give its path.")
@@ -62,7 +62,8 @@ def path_to_read(help: str, **how: Any) -> Any:
 _SCENE: dict[str, Any] = {"metavar": "SCENE", "help": f"3DGS scene: {SUFFIXES}.", "show_default": False}
 _CAMERAS: dict[str, Any] = {
     "metavar": "PATH",
-    "help": "cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender).",
+    "help": "cameras.json (INRIA), folder of a COLMAP sparse model, or transforms.json (nerfstudio, Blender). "
+    "[default: those beside the scene, else an orbit]",
     "rich_help_panel": ESSENTIALS,
 }
 SceneArgument = Annotated[Path, typer.Argument(parser=local_path, **_SCENE)]
@@ -71,6 +72,26 @@ _STYLE = path_to_read("Style image.", show_default=False, rich_help_panel=ESSENT
 StyleOption = Annotated[Path, _STYLE]
 OptionalStyleOption = Annotated[Path | None, _STYLE]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def cameras_of(scene: str | Path, given: Any, options: ViewOptions) -> Any:
+    """Return the given cameras of a scene; without any, those of `default_cameras`, and print which they are."""
+    from worker.job import default_cameras
+
+    path = path_or_url(scene)
+    if given is not None or isinstance(path, str):
+        return given
+    cameras, line = default_cameras(scene_path(path), options)
+    if line:
+        error_console.print(line)
+    return cameras
+
+
+def source_of(scene: Path, cameras: Path | None, options: ViewOptions) -> SceneRequest:
+    """Return the request for a scene, whose cameras are those of `cameras_of`."""
+    from worker.job import SceneRequest
+
+    return SceneRequest.of(scene, cameras_of(scene, cameras, options), options)
 
 
 def _of_region(metavar: str, help: str) -> Any:
@@ -151,13 +172,13 @@ class JobInputs:
         Raises:
             SettingsError: If options are malformed or contradict each other, or a file is a URL.
         """
-        from worker.job import JobSpec, SceneRequest
+        from worker.job import JobSpec
 
         for style in self.style:
             local_path(style)
         cameras = None if self.cameras is None else local_path(self.cameras)
         return JobSpec(
-            source=SceneRequest.of(local_path(self.scene), cameras, options),
+            source=source_of(local_path(self.scene), cameras, options),
             styles=parse_styles(self.style),
             images=self.images,
             out=out,

@@ -158,8 +158,7 @@ def batch(
     pairs = list(product(zip(_names(scenes), scenes, strict=True), zip(_names(style), style, strict=True)))
     names = different_names([Path(f"{scene_name}_{style_name}") for (scene_name, _), (style_name, _) in pairs])
     for name, ((_, scene), (_, image)) in zip(names, pairs, strict=True):
-        beside = cameras or (None if options.orbit else scene_path(scene).parent)
-        inputs = JobInputs(str(scene), [str(image)], str(beside) if beside else None)
+        inputs = JobInputs(str(scene), [str(image)], str(cameras) if cameras else None)
         jobs[name] = inputs.request(options, results.result(name))
         for each in scenes:
             check_is_not_input(results.result(name), scene_path(each), "scene of another result")

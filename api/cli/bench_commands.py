@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from api.cli.arguments import CamerasOption, SceneArgument, StyleOption, folder_to_write
+from api.cli.arguments import CamerasOption, SceneArgument, StyleOption, folder_to_write, source_of
 from api.cli.console import error_console, out_console, print_field
 from api.cli.options import with_arguments, with_options
 from worker.options import StylizeOptions, ViewOptions
@@ -39,9 +39,8 @@ class VariantsInputs:
     def request(self, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path) -> VariantsRequest:
         """Return the request for these variants, which are separated by commas."""
         from api.cli.bench import VariantsRequest
-        from worker.job import SceneRequest
 
-        source = SceneRequest.of(self.scene, self.cameras, options)
+        source = source_of(self.scene, self.cameras, options)
         settings = {**chosen.given_settings(), "near": options.near}
         names = [name.strip() for name in variants.split(",") if name.strip()]
         return VariantsRequest(source, self.style, out, names, self.seconds, chosen.backbone, settings)

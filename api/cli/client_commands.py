@@ -15,7 +15,7 @@ from rich.progress import BarColumn, ProgressColumn, TextColumn
 from rich.table import Table
 
 from api.cli import INTERRUPTED
-from api.cli.arguments import JobInputs, JsonOption, file_to_write, path_to_write
+from api.cli.arguments import JobInputs, JsonOption, cameras_of, file_to_write, path_to_write
 from api.cli.console import (
     EARLY_ENDS,
     JOB_FAILED,
@@ -109,7 +109,8 @@ def submit(
     if webhook_events and not webhook:
         raise SettingsError("--webhook-events requires --webhook. Add it, or omit the events.")
     styles, masks, settings = _styles_masks_and_parameters(inputs, options, parameters)
-    files: dict[str, Any] = {"cameras": inputs.cameras, "photos": inputs.images, "masks": masks}
+    cameras = cameras_of(inputs.scene, inputs.cameras, JobParameters.model_construct(**settings))
+    files: dict[str, Any] = {"cameras": cameras, "photos": inputs.images, "masks": masks}
     with open_client(url, key) as client:
         if dry_run:
             with _sending_and_planning() as (progress, planning):

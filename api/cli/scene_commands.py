@@ -21,6 +21,7 @@ from api.cli.arguments import (
     folder_to_write,
     path_to_read,
     path_to_write,
+    source_of,
 )
 from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
@@ -88,9 +89,8 @@ def check(
 ) -> None:
     """Report extreme values in a scene, its views and its style, and their consequences."""
     from api.cli.scene_tools import look_for_extremes
-    from worker.job import SceneRequest
 
-    source = SceneRequest.of(scene, cameras, options)
+    source = source_of(scene, cameras, options)
     with spinner("Checking the scene and every view"):
         findings = look_for_extremes(source, style)
     if not findings:
@@ -136,10 +136,12 @@ def render(
     """Render all views of a scene as images, or a video along a camera path."""
     from worker.job import SceneRequest
 
-    source, background = SceneRequest.of(scene, cameras, options), chosen.settings().background
+    background = chosen.settings().background
     given = [*video_options.model_fields_set, *(["compare"] if compare else []), *(["transparent"] * transparent)]
     if (out is None) == (video is None):
         raise SettingsError("Give --out FOLDER for images of the views, or --video FILE for a video, but not both.")
+    around = video is not None and video_options.path == "orbit"
+    source = (SceneRequest.of if around else source_of)(scene, cameras, options)
     if video is not None:
         from worker.video import VideoRequest
 

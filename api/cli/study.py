@@ -40,11 +40,11 @@ def make_study(
     Raises:
         InvalidInputError: If an input cannot be used; the first one is reported.
     """
-    named = [_named(text) for text in variants]
-    check_names([name for name, _ in named])
+    scenes = [named(text) for text in variants]
+    check_names([name for name, _ in scenes])
     if page.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{page}: not the name of an HTML file. Give one, such as study.html.")
-    sources = [source.model_copy(update={"scene": path}) for _, path in named]
+    sources = [source.model_copy(update={"scene": path}) for _, path in scenes]
     for each in sources:
         check_choice(each)
     image = load_image(style)
@@ -55,10 +55,10 @@ def make_study(
         return _render(sources[index], cameras, background)
 
     page.parent.mkdir(parents=True, exist_ok=True)
-    write_study(page, key_path(page), [name for name, _ in named], image, len(cameras), render)
+    write_study(page, key_path(page), [name for name, _ in scenes], image, len(cameras), render)
 
 
-def _named(text: str) -> tuple[str, Path]:
+def named(text: str) -> tuple[str, Path]:
     """Return the name and the path of a variant, given as NAME=FILE, or as FILE, which is its own name."""
     name, equals, path = text.partition("=")
     return (name, local_path(path)) if equals and not Path(text).exists() else (text, local_path(text))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.arguments import CamerasOption, StyleOption, file_to_write
+from api.cli.arguments import CamerasOption, StyleOption, file_to_write, source_of
 from api.cli.console import out_console, print_field, spinner
 from api.cli.options import with_options
 from worker.options import StylizeOptions, ViewOptions
@@ -36,10 +36,9 @@ def make(
 
     The page is one file, works offline and saves the votes as JSON. Keep the key, which is written beside it.
     """
-    from api.cli.study import key_path, make_study
-    from worker.job import SceneRequest
+    from api.cli.study import key_path, make_study, named
 
-    source = SceneRequest.of(Path(), cameras, options)
+    source = source_of(named(variants[0])[1], cameras, options)
     if options.views is None and options.orbit is None:
         source = source.model_copy(update={"views": _VIEWS})
     with spinner("Rendering the views"):

@@ -86,7 +86,7 @@ class AsyncClient:
 
         Args:
             style: Style image, or several that are mixed with the weights of the parameter `style_weights`.
-            cameras: Camera file or folder, as for `sgsst stylize --cameras`; None requires the parameter `orbit`.
+            cameras: Camera file or folder, as for `sgsst stylize --cameras`; None for an orbit.
             photos: Folder of photos for the content term; None for unstylized renders.
             masks: Mask files, or folders of mask images, by the names that the parameter `regions` gives them
                 (`mask=NAME`, `masks=NAME`).

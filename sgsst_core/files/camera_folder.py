@@ -44,20 +44,37 @@ def find_cameras(path: Path, warn: Warn) -> Path:
     if not path.is_dir():
         is_model = path.suffix in (".bin", ".txt") and path.name.startswith(("cameras", "images", "points3D"))
         return _model(path.parent, warn) if is_model else path
-    for model in (path, path / "sparse" / "0", path / "sparse", *_numbered(path / "sparse")):
-        if has_model(model):
-            return _model(model, warn)
-    for name in _JSON_NAMES:
-        if (path / name).is_file():
-            return path / name
-    if has_model(path / "colmap" / "sparse" / "0"):
-        return _model(path / "colmap" / "sparse" / "0", warn)
-    return _only_json(path)
+    named = _named(path) or _only_json(path)
+    return _model(named, warn) if named.is_dir() else named
+
+
+def cameras_beside(scene: Path) -> Path | None:
+    """Return the folder or JSON file of the cameras that belong to a scene; None if none lie beside it.
+
+    They are in the folder of the scene, or in RUN if the scene is RUN/point_cloud/iteration_N/point_cloud.ply, as the
+    original 3DGS code writes it. The names are those of `find_cameras`.
+
+    Raises:
+        CameraError: If a folder holds several files with cameras, none of which has a usual name.
+    """
+    folder = scene.absolute().parent
+    folders = (folder, folder.parent.parent) if folder.parent.name == "point_cloud" else (folder,)
+    held = (find_cameras(each, lambda text: None) for each in folders if _named(each) or _holding(each))
+    return next(held, None)
 
 
 def has_model(folder: Path) -> bool:
     """Return whether a folder holds the cameras of a COLMAP model."""
     return (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
+
+
+def _named(folder: Path) -> Path | None:
+    """Return the first COLMAP model or JSON file in a folder that has one of the usual names; None if there is none."""
+    sparse = folder / "sparse"
+    models = [model for model in (folder, sparse / "0", sparse, *_numbered(sparse)) if has_model(model)]
+    files = [folder / name for name in _JSON_NAMES if (folder / name).is_file()]
+    other = [model for model in (folder / "colmap" / "sparse" / "0",) if has_model(model)]
+    return next(iter([*models, *files, *other]), None)
 
 
 def load_json(path: Path) -> Any:
@@ -109,8 +126,7 @@ def _image_count(model: Path) -> int:
 
 def _only_json(folder: Path) -> Path:
     """Return the only JSON file in a folder that holds cameras."""
-    files = [path for path in sorted(folder.glob("*.json"))[:_SEARCHED_ENTRIES] if path.is_file()]
-    holding = [path for path in files if _holds_cameras(path)]
+    files, holding = _json_files(folder), _holding(folder)
     if len(holding) > 1:
         names = ", ".join(path.name for path in holding)
         raise CameraError(f"{folder}: holds several files with cameras: {names}. Give one of them.")
@@ -124,6 +140,16 @@ def _only_json(folder: Path) -> Path:
         return files[0]  # its reader says what is wrong with it
     looked_at = f" (looked at {', '.join(path.name for path in files)})" if files else ""
     raise CameraError(f"{folder}: holds no cameras in a known format{looked_at}. Give {FORMATS}.")
+
+
+def _json_files(folder: Path) -> list[Path]:
+    """Return the JSON files in a folder that are searched."""
+    return [path for path in sorted(folder.glob("*.json"))[:_SEARCHED_ENTRIES] if path.is_file()]
+
+
+def _holding(folder: Path) -> list[Path]:
+    """Return the JSON files in a folder that hold cameras."""
+    return [path for path in _json_files(folder) if _holds_cameras(path)]
 
 
 def _holds_cameras(path: Path) -> bool:

@@ -568,13 +568,20 @@ def _everything(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
 
 
-def test_missing_cameras_error_names_cameras_and_orbit(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    command = files.stylize()
-    at = command.index("--cameras")
-    assert main(command[:at] + command[at + 2 :]) == 2
-    error = capsys.readouterr().err
-    assert "--cameras" in error
-    assert "--orbit" in error
+def test_default_cameras_are_those_beside_the_scene_or_else_an_orbit(
+    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "views"
+    command = ["render", str(files.ply), "--out", str(out), "--views", "2", "--resolution", "32"]
+    for options in ([], ["--elevation", "20"]):
+        assert main([*command, *options]) == 0
+        assert (f"those of {files.cameras};" in capsys.readouterr().err) == (not options)
+        assert len(list(out.iterdir())) == 2
+        shutil.rmtree(out)
+    files.cameras.unlink()
+    assert main(command) == 0
+    assert "There are no cameras beside" in capsys.readouterr().err
+    assert len(list(out.iterdir())) == 2
 
 
 def test_unwritable_folder_is_rejected_before_work_starts(
@@ -721,7 +728,6 @@ def test_comparison_starts_with_the_unstylized_scene(files: Files, tmp_path: Pat
         (["--out", "views", "--fps", "10"], "--fps requires --video"),
         (["--out", "views", "--compare", "scene.ply"], "--compare requires --video"),
         (["--video", "video.mp4", "--orbit", "4"], "a view per frame"),
-        (["--video", "video.mp4", "--path", "cameras"], "There are no cameras"),
         (["--video", "video.mp4", "--seconds", "0"], "--seconds"),
         (["--video", "video.mp4", "--compare", "missing.ply"], "missing.ply"),
         (["--video", "video.mp4", "--resolution", "16000"], "at most 8192"),
@@ -740,7 +746,8 @@ def test_video_options_that_contradict_each_other_are_refused(
 @pytest.mark.slow
 def test_interrupted_video_leaves_nothing(files: Files, tmp_path: Path) -> None:
     video = tmp_path / "video.mp4"
-    command = [sys.executable, "-m", "api.cli", "render", str(files.ply), "--video", str(video), "--seconds", "600"]
+    options = ["--video", str(video), "--path", "orbit", "--seconds", "600"]
+    command = [sys.executable, "-m", "api.cli", "render", str(files.ply), *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert "Rendering 18000 frames" in process.stderr.readline()

@@ -20,6 +20,7 @@ from PIL import Image
 from sgsst_core.errors import CameraError
 from sgsst_core.files.advice import advice_for_name
 from sgsst_core.files.camera_files import read_cameras
+from sgsst_core.files.camera_folder import cameras_beside
 from sgsst_core.files.photos import check_photos
 from sgsst_core.scene.camera import Camera, undistorted
 from tests.sgsst_core.files.test_camera_files import HEIGHT, WIDTH, colmap, inria, nerfstudio, views
@@ -39,6 +40,31 @@ def assert_close(actual: list[Camera], expected: list[Camera], world: torch.Tens
         if world is not None:
             pose[:3, :3] = pose[:3, :3] @ world.T
         assert torch.allclose(a.world_to_camera, pose, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("tool", "scene", "cameras"),
+    [
+        ("inria", "scene.ply", "cameras.json"),
+        ("nerfstudio", "scene.ply", "transforms.json"),
+        ("metashape", "scene.ply", "sparse/0"),
+        ("inria", "point_cloud/iteration_30000/point_cloud.ply", "cameras.json"),
+        ("inria", "exports/1/scene.ply", None),
+    ],
+)
+def test_cameras_beside_a_scene_are_found(tmp_path: Path, tool: str, scene: str, cameras: str | None) -> None:
+    shutil.copytree(CAPTURES / tool, tmp_path, dirs_exist_ok=True)
+    assert cameras_beside(tmp_path / scene) == (None if cameras is None else tmp_path / cameras)
+
+
+def test_only_file_with_cameras_beside_a_scene_is_found(tmp_path: Path) -> None:
+    (tmp_path / "plan.json").write_text("{}")
+    assert cameras_beside(tmp_path / "scene.ply") is None
+    shutil.copy(CAPTURES / "inria" / "cameras.json", tmp_path / "views.json")
+    assert cameras_beside(tmp_path / "scene.ply") == tmp_path / "views.json"
+    shutil.copy(CAPTURES / "inria" / "cameras.json", tmp_path / "others.json")
+    with pytest.raises(CameraError, match="several files"):
+        cameras_beside(tmp_path / "scene.ply")
 
 
 @pytest.mark.parametrize(
