@@ -377,7 +377,7 @@ FILE_DAMAGED = ProblemType(
 DATABASE_UNAVAILABLE = ProblemType(
     "database-unavailable",
     503,
-    "The service's database does not answer. Try again later.",
+    "The service's database is not available. Try again later.",
     retry_after=5,
     error=DatabaseUnavailableError,
 )

@@ -52,6 +52,17 @@ class Postgres:
         """Start the server, and wait until it accepts connections."""
         self._control("-o", self._started, "-l", str(self._folder / "log"), "-w", "start")
 
+    @contextmanager
+    def standby(self) -> Iterator[None]:
+        """Restart the server as a standby, as a failover does, and promote it after the block."""
+        self._control("-m", "fast", "-w", "stop")
+        (Path(self._data) / "standby.signal").touch()
+        self.start()
+        try:
+            yield
+        finally:
+            self._control("-w", "promote")
+
     def signal(self, number: int) -> None:
         """Send a signal to all processes of the server."""
         main = psutil.Process(int((Path(self._data) / "postmaster.pid").read_text().split()[0]))

@@ -16,7 +16,7 @@ import threading
 import time
 from types import FrameType
 
-from service.errors import DamagedWeightsError, DatabaseUnavailableError, LeaseLostError
+from service.errors import DamagedWeightsError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.scheduling.clock_watch import ClockWatch
@@ -33,7 +33,7 @@ from service.startup import keep_private, set_up
 from service.store import Store, open_store
 from service.weights import check_weights
 
-#: Delay before the next round after the store could not be reached, in seconds.
+#: Delay before the next pass after one has failed, in seconds.
 _OUTAGE_SECONDS = 2.0
 #: Interval between checks of ending attempts during the shutdown, in seconds.
 _SHUTDOWN_SECONDS = 0.2
@@ -71,16 +71,17 @@ class Dispatcher:
 
     def run(self) -> None:
         """Run jobs until `stop`."""
-        self._take_over_from_the_dead()
         self._work.mkdir(parents=True, exist_ok=True)
         for helper in (self._lease_keeper, *self._helpers):
             helper.start()
         _log.info("dispatcher started: name=%s capacity=%d", self.name, self._capacity.size)
+        work = self._take_over_from_the_dead
         while not self._stop.is_set():
             try:
-                self._work_once()
-            except (DatabaseUnavailableError, OSError):  # the database is down or locked; if it stays so, leases expire
-                _log.exception("store unavailable, retrying: seconds=%.0f", _OUTAGE_SECONDS)
+                work()
+                work = self._work_once
+            except Exception:  # the database is away or locked, or a bug; if it stays so, leases expire
+                _log.exception("pass failed, retrying: seconds=%.0f", _OUTAGE_SECONDS)
                 self._stop.wait(_OUTAGE_SECONDS)
             self._stop.wait(self._settings.poll_seconds)
         self._shut_down()
@@ -125,10 +126,10 @@ class Dispatcher:
         _log.info("dispatcher stopping: running_jobs=%d", len(self._running))
         for attempt in self._running.values():
             attempt.release()
-        with contextlib.suppress(DatabaseUnavailableError):
+        with contextlib.suppress(Exception):
             self._store.operations.remove_dispatcher(self.name)
         while any(attempt.alive for attempt in self._running.values()):
-            with contextlib.suppress(DatabaseUnavailableError, LeaseLostError):
+            with contextlib.suppress(Exception):
                 self._lease_keeper.update()
             time.sleep(_SHUTDOWN_SECONDS)
         for helper in (self._lease_keeper, *self._helpers):

@@ -9,8 +9,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, SQLColumnExpression, and_, bindparam, case, delete, func, literal, select
+from sqlalchemy import ColumnElement, SQLColumnExpression, and_, bindparam, case, delete, func, literal, select, text
 
+from service import problems
 from service.states import ACTIVE, JobStatus
 from service.store.database import Database, upsert
 from service.store.job_inputs import counts_and_named
@@ -21,6 +22,9 @@ _JOBS = Base.metadata.tables[JobRow.__tablename__]
 #: clock.
 _IS_ALIVE = DispatcherRow.seen_at.between(bindparam("since"), bindparam("until"))
 _ALIVE = select(func.count()).select_from(DispatcherRow).where(_IS_ALIVE)
+
+#: Whether a PostgreSQL server accepts no writes; a standby does not.
+_READ_ONLY = text("SHOW transaction_read_only")
 
 
 @dataclass(frozen=True)
@@ -90,10 +94,12 @@ class Operations:
         """Query the database for a health check, and return the number of live dispatchers.
 
         Raises:
-            DatabaseUnavailableError: If the database does not respond within some seconds.
+            DatabaseUnavailableError: If the database does not respond within some seconds, or accepts no writes.
         """
         span = self._span()
         with self._database.reserved_connection() as connection:
+            if not self._database.sqlite and connection.scalar(_READ_ONLY) == "on":
+                raise problems.DATABASE_UNAVAILABLE()
             return connection.execute(_ALIVE, span).scalar_one()
 
     def heartbeats(self) -> dict[str, float]:

@@ -1,13 +1,14 @@
-"""Errors of the database that are no bugs: it is down or locked, or another transaction has removed a row."""
+"""Errors of the database that are no bugs: it is away or locked, or another transaction has removed a row."""
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy.exc import DBAPIError, InterfaceError, NoResultFound, OperationalError
+from sqlalchemy.exc import InterfaceError, NoResultFound, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service import problems
@@ -15,13 +16,16 @@ from service.errors import DatabaseUnavailableError, ServiceError
 
 #: Time in seconds that a transaction waits for a probing transaction before it is rejected.
 _PROBE_SECONDS = 0.2
-#: Names of SQLite errors for a locked database and for an unusable file; all other errors are bugs of the service.
-_SQLITE_BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED")
-_SQLITE_AWAY = ("SQLITE_CANTOPEN", "SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY")
-#: Classes of PostgreSQL errors for conflicting transactions.
-_POSTGRESQL_BUSY = ("40", "55")
+#: Names of SQLite's errors, and classes of PostgreSQL's, for locks and conflicting transactions.
+_BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "40", "55")
+#: The same for errors that concern a statement or its values, so they are bugs of the service. All others are outages,
+#: in whatever words: a server that is a standby, shuts down, or has no memory or connections left.
+_BUGS = (*(f"SQLITE_{each}" for each in ("CONSTRAINT", "ERROR", "MISMATCH", "MISUSE", "RANGE", "TOOBIG")),)
+_BUGS += ("21", "22", "23", "42", "44", "54")
 #: Names of SQLite's and codes of PostgreSQL's errors for rows that refer to a missing one or exist already.
 _CHANGED = (*(f"SQLITE_CONSTRAINT_{each}" for each in ("FOREIGNKEY", "PRIMARYKEY", "UNIQUE")), "23503", "23505")
+
+_log = logging.getLogger(__name__)
 
 
 class Gate:
@@ -50,6 +54,8 @@ class Gate:
             with translated():
                 yield
         except DatabaseUnavailableError as error:
+            if refusal is None:
+                _log.warning("database unavailable: %s", error.__cause__ or error)
             self._refusal = error
             raise
         except BaseException:
@@ -76,25 +82,23 @@ def translated() -> Iterator[None]:
         raise problems.DATABASE_BUSY() from error
     except NoResultFound as error:
         raise problems.CHANGED_MEANWHILE() from error
-    except DBAPIError as error:
+    except Exception as error:  # SQLAlchemy does not wrap all errors of drivers
         refusal = _refusal(error)
         if refusal is None:
             raise
         raise refusal from error
 
 
-def _refusal(error: DBAPIError) -> ServiceError | None:
+def _refusal(error: Exception) -> ServiceError | None:
     """Convert a driver's error to an exception for callers; return None if the error is a bug of the service."""
-    sqlite: str | None = getattr(error.orig, "sqlite_errorname", None)
-    sqlstate: str = getattr(error.orig, "sqlstate", None) or ""
-    if (sqlite or "").startswith(_SQLITE_BUSY) or sqlstate.startswith(_POSTGRESQL_BUSY):
+    cause = getattr(error, "orig", error)
+    code: str = getattr(cause, "sqlite_errorname", None) or getattr(cause, "sqlstate", None) or ""
+    if code.startswith(_BUSY):
         return problems.DATABASE_BUSY()
-    if sqlite in _CHANGED or sqlstate in _CHANGED:
+    if code in _CHANGED:
         return problems.CHANGED_MEANWHILE()
-    away = isinstance(error, OperationalError | InterfaceError) if sqlite is None else sqlite.startswith(_SQLITE_AWAY)
-    if not away and not error.connection_invalidated:
-        return None
-    return problems.DATABASE_UNAVAILABLE()
+    away = not code.startswith(_BUGS) if code else isinstance(error, OperationalError | InterfaceError)
+    return problems.DATABASE_UNAVAILABLE() if away or getattr(error, "connection_invalidated", False) else None
 
 
 def impatient_connection(seconds: float) -> Any:

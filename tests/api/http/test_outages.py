@@ -51,7 +51,11 @@ class Outage:
 
     @contextlib.contextmanager
     def kind(self, name: str) -> Iterator[None]:
-        """Make the database unavailable within the block."""
+        """Make the database unavailable within the block, or read-only as a standby."""
+        if name == "standby":
+            with self.postgres.standby():
+                yield
+            return self.back(name)
         self.postgres.signal(signal.SIGSTOP if name == "stopped" else signal.SIGKILL)
         try:
             yield
@@ -62,7 +66,7 @@ class Outage:
         """Restore the database, and wait until the service uses it again."""
         if name == "stopped":
             self.postgres.signal(signal.SIGCONT)
-        else:
+        elif name == "killed":
             self.postgres.start()
         with self.client() as client:
             wait_for(lambda: client.get(f"/v1/jobs/{self.job_id}").status_code == 200, "reads", self.service.said)
@@ -162,6 +166,17 @@ def test_every_operation_reports_unavailable_database(outage: Outage, files: dic
     with outage.client() as client, outage.kind(kind), ThreadPoolExecutor(len(operations())) as pool:
         for answer in pool.map(lambda each: request(client, each[0], each[1], outage, files), operations()):
             check_away(answer)
+        check_health(outage.service, 503)
+    check_health(outage.service, 200)
+    assert "Traceback" not in outage.service.said()
+
+
+def test_standby_is_read_and_reported_as_unavailable(outage: Outage) -> None:
+    with outage.client() as client, outage.kind("standby"):
+        wait_for(lambda: client.get(f"/v1/jobs/{outage.job_id}").status_code == 200, "reads", outage.service.said)
+        for _ in range(2):
+            refused(create_upload(client), 503, "database-unavailable")
+            check_away(client.post(f"/v1/jobs/{outage.job_id}/cancel"))
         check_health(outage.service, 503)
     check_health(outage.service, 200)
     assert "Traceback" not in outage.service.said()

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from sqlalchemy import text
 
 from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
@@ -52,6 +53,22 @@ def test_running_dispatcher_is_registered(settings: ServiceSettings, store: Stor
         dispatchers = wait_for(store.operations.dispatchers, "the dispatcher to be known")
         assert [(row.name, row.slots, row.free) for row in dispatchers] == [(dispatcher.name, 2, 2)]
     assert store.operations.dispatchers() == []
+
+
+def test_dispatcher_survives_an_unexpected_error(
+    settings: ServiceSettings, store: Store, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A missing table is no outage: its error is that of a bug."""
+
+    def rename(old: str, new: str) -> None:
+        with store.database.writing() as session:
+            session.execute(text(f"ALTER TABLE {old} RENAME TO {new}"))
+
+    rename("dispatchers", "lost")
+    with at_work(settings, store):
+        wait_for(lambda: "no such table" in caplog.text, "an error")
+        rename("lost", "dispatchers")
+        wait_for(store.operations.dispatchers, "the dispatcher to be known")
 
 
 def test_attempt_whose_files_hang_ends_by_the_store(

@@ -18,17 +18,14 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from sqlalchemy import event, func, inspect, select
 
 from service import problems
-from service.errors import (
-    ConflictError,
-    LeaseLostError,
-    NotFoundError,
-)
+from service.errors import ConflictError, LeaseLostError, NotFoundError, ProblemType
 from service.states import ACTIVE, FINISHED, Published
 from service.store import Store, open_store
 from service.store.history import GROWTH, add_point
 from service.store.inputs import GRACE_SECONDS
 from service.store.jobs import Idempotency
 from service.store.leases import MAX_PROGRESS_EVENTS, Lease
+from service.store.outages import translated
 from service.store.retries import MAX_LOSSES
 from service.store.tables import Base, JobRow, ProgressPointRow, ShareRow
 from sgsst_core.progress import Progress
@@ -95,6 +92,24 @@ def test_rows_that_vanish_are_conflicts(store: Store) -> None:
         session.add(ShareRow(id="shr_1", job_id="job_1", sha256="0" * 64, created_at=0.0, expires_at=1.0))
     with raises_problem(problems.CHANGED_MEANWHILE), store.database.reading() as session:
         session.get_one(JobRow, "job_1")
+
+
+@pytest.mark.parametrize(
+    ("problem", "codes"),
+    [
+        (problems.DATABASE_UNAVAILABLE, "08006 0A000 25006 28P01 53200 53300 57P01 57P03 58030 XX000 F00D1"),
+        (problems.DATABASE_BUSY, "40001 40P01 55P03"),
+        (problems.CHANGED_MEANWHILE, "23503 23505"),
+        (None, "22003 23502 42601 42P01 54000"),
+    ],
+)
+def test_codes_of_the_server_decide_what_an_error_means(problem: ProblemType | None, codes: str) -> None:
+    """A standby, a server that shuts down, and codes that nobody has foreseen are outages, whatever their class."""
+    psycopg = pytest.importorskip("psycopg")
+    for code in codes.split():
+        error = type("Error", (psycopg.DatabaseError,), {"sqlstate": code})
+        with raises_problem(problem) if problem else pytest.raises(error), translated():
+            raise error
 
 
 def test_idempotency_key_creates_one_job(store: Store) -> None:
