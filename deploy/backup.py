@@ -25,13 +25,13 @@ from pathlib import Path
 from sqlalchemy import delete, inspect, select
 from sqlalchemy.engine import URL
 
-from service.errors import ServiceError
 from service.files.blobs import BLOBS
 from service.files.objects import ObjectStore
 from service.files.staging import CHECKPOINT
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, read_settings
 from service.store import Store
 from service.store.tables import ArtifactRow, BlobRow, JobRow, UploadPartRow
+from sgsst_core.errors import SgsstError
 
 #: Number of files copied concurrently.
 _AT_A_TIME = 8
@@ -53,11 +53,11 @@ def main() -> int:
     parser.add_argument("what", choices=("save", "restore"))
     parser.add_argument("folder", type=Path)
     options = parser.parse_args()
-    settings = ServiceSettings()
     os.umask(0o077)
     try:
+        settings = read_settings()
         (save if options.what == "save" else restore)(settings, options.folder)
-    except (BackupError, ServiceError, OSError, subprocess.CalledProcessError) as error:
+    except (BackupError, SgsstError, OSError, subprocess.CalledProcessError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0

@@ -32,10 +32,10 @@ def main() -> int:
                 print(f"{url}: {error}", file=sys.stderr)
                 return 1
         case ["dispatcher"]:
-            from service.settings import ServiceSettings
+            from service.settings import read_settings
             from service.store import Store
 
-            return 0 if dispatcher_is_healthy(Store(ServiceSettings(), answer_seconds=_ANSWER_SECONDS)) else 1
+            return 0 if dispatcher_is_healthy(Store(read_settings(), answer_seconds=_ANSWER_SECONDS)) else 1
     print("usage: python -m service.health api|dispatcher", file=sys.stderr)
     return 2
 

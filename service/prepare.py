@@ -12,8 +12,7 @@ import time
 
 from service.errors import DatabaseUnavailableError, StoreError
 from service.files.objects import ObjectStore
-from service.settings import ServiceSettings
-from service.startup import keep_private, set_up
+from service.startup import start
 from service.store import open_store
 from sgsst_core.errors import SettingsError
 
@@ -22,9 +21,7 @@ _RETRY_SECONDS = 2.0
 
 def main() -> int:
     """Prepare the database and the bucket, and return the exit status: 0 on success."""
-    settings = ServiceSettings()
-    set_up(settings.log_format)
-    keep_private(settings)
+    settings = start()
     try:
         open_store(settings, patience=settings.start_seconds).close()
         _make_bucket(ObjectStore(settings.artifacts_url), settings.start_seconds)

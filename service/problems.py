@@ -325,6 +325,7 @@ STORED_BYTES_EXCEEDED = ProblemType(
     example={"used": 120_000_000_000, "limit": 100_000_000_000, "quota": "stored-bytes"},
 )
 BUSY = ProblemType("busy", 503, "Too many files are being checked. Try again later.", retry_after=10)
+STOPPING = ProblemType("busy", 503, "The service is stopping. Try again later.", retry_after=5)
 
 # --- faults of the service ------------------------------------------------------------------------------------------
 

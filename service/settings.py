@@ -6,15 +6,20 @@ import ipaddress
 import re
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.outgoing import parse_origins
+from sgsst_core.errors import SettingsError
+from sgsst_core.options import reason
 
 GB = 1_000_000_000
 #: Maximum number of characters of a path at which a proxy offers the service.
 _MAX_SUBPATH = 200
+#: Drivers of the databases that the store knows.
+_DRIVERS = ("pysqlite", "psycopg")
 
 
 def is_loopback(host: str) -> bool:
@@ -87,7 +92,54 @@ class ServiceSettings(BaseSettings):
     url_seconds: float = Field(120, gt=0)
     url_private_addresses: bool = False
     embed_origins: str = ""
-    log_format: str = "text"
+    log_format: Literal["text", "json"] = "text"
+
+    @field_validator("data")
+    @classmethod
+    def _check_data(cls, path: Path) -> Path:
+        try:
+            return path.expanduser()
+        except RuntimeError as error:
+            raise ValueError("its home folder is unknown") from error
+
+    @field_validator("database")
+    @classmethod
+    def _check_database(cls, url: str | None) -> str | None:
+        """Check the URL as SQLAlchemy and the driver parse it."""
+        from sqlalchemy.engine import make_url
+
+        try:
+            parsed = make_url(url or "sqlite://")
+            dialect = parsed.get_dialect()()
+            if dialect.driver not in _DRIVERS:
+                raise ValueError(f"the driver {dialect.driver!r} is not supported")
+            driver = dialect.import_dbapi()
+            if dialect.driver == "psycopg":
+                driver.conninfo.make_conninfo("", **dialect.create_connect_args(parsed)[1])
+        except Exception as error:
+            known = "postgresql+psycopg://USER@HOST/NAME (extra `postgresql`) or sqlite:////PATH"
+            raise ValueError(f"{str(error).strip()}. Give a URL such as {known}") from error
+        return url
+
+    @field_validator("artifacts")
+    @classmethod
+    def _check_artifacts(cls, url: str | None) -> str | None:
+        """Check the URL as fsspec and its file systems parse it."""
+        from service.files.objects import ObjectStore
+
+        try:
+            ObjectStore(url or "file:///")
+        except Exception as error:
+            raise ValueError(f"{error}. Give a URL such as s3://BUCKET/PREFIX (extra `s3`) or file:///PATH") from error
+        return url
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _check_proxies(cls, text: str) -> str:
+        for part in filter(None, map(str.strip, text.split(","))):
+            if part != "*":
+                ipaddress.ip_network(part)  # another text would never match
+        return text
 
     @field_validator("url_hosts", "embed_origins")
     @classmethod
@@ -106,7 +158,7 @@ class ServiceSettings(BaseSettings):
     @cached_property
     def folder(self) -> Path:
         """Absolute path of `data`, because processes may have different working directories."""
-        return self.data.expanduser().absolute()
+        return self.data.absolute()
 
     @property
     def database_url(self) -> str:
@@ -143,3 +195,18 @@ class ServiceSettings(BaseSettings):
     def keys_required(self) -> bool:
         """Whether a request without an API key is rejected."""
         return not self.on_loopback if self.require_keys is None else self.require_keys
+
+
+def read_settings() -> ServiceSettings:
+    """Return the settings from the environment.
+
+    Raises:
+        SettingsError: If one cannot be used; the message names its variable.
+    """
+    try:
+        return ServiceSettings()
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        value = "" if name in ("database", "artifacts") else f" = {first['input']!r}"  # URLs may hold passwords
+        raise SettingsError(f"Environment variable SGSST_{name.upper()}{value}: {reason(first)}.") from error

@@ -15,7 +15,8 @@ from pathlib import Path
 from sqlalchemy.engine import make_url
 
 from service.files.objects import ObjectStore
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, read_settings
+from sgsst_core.errors import SettingsError
 
 #: Suffixes of the files that SQLite creates for a database.
 _BESIDE = ("", "-wal", "-shm")
@@ -77,6 +78,17 @@ def set_up(log_format: str) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
     for noisy in ("httpx2", "httpcore", "alembic", "botocore", "uvicorn.access"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def start() -> ServiceSettings:
+    """Return the settings of this process, once its log and its files are set up; end it if they cannot be used."""
+    try:
+        settings = read_settings()
+    except SettingsError as error:
+        sys.exit(f"error: {error}")
+    set_up(settings.log_format)
+    keep_private(settings)
+    return settings
 
 
 def keep_private(settings: ServiceSettings) -> None:

@@ -161,19 +161,11 @@ def _service_settings(data: Path | None) -> ServiceSettings:
             "The service does not run on Windows itself. Run this command in WSL2 (`wsl --install`), or run the "
             "container image; `sgsst submit` and the page reach both from here."
         )
-    from pydantic import ValidationError
-
-    from service.settings import ServiceSettings
-    from sgsst_core.options import reason
+    from service.settings import read_settings
 
     if data is not None:
         os.environ["SGSST_DATA"] = str(data.absolute())
-    try:
-        return ServiceSettings()
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = "SGSST_" + ".".join(str(part) for part in first["loc"]).upper()
-        raise SettingsError(f"Environment variable {name} = {first['input']!r}: {reason(first)}.") from error
+    return read_settings()
 
 
 def _open_store(data: Path | None) -> Store:

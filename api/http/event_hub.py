@@ -8,6 +8,7 @@ import logging
 from collections import deque
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
+from typing import Any
 
 from pydantic_core import to_jsonable_python
 
@@ -55,14 +56,18 @@ class Hub:
         self._channels: dict[str, _Channel] = {}
         self._task: asyncio.Task[None] | None = None
         self._closing = asyncio.Event()
+        #: Work that clients wait for, which is canceled when the service stops.
+        self.working: set[asyncio.Task[Any]] = set()
 
     def start(self) -> None:
         """Start polling."""
         self._task = asyncio.create_task(self._poll())
 
     async def close(self) -> None:
-        """End all streams; watchers reconnect with the id of their last event."""
+        """End all streams and cancel work; watchers reconnect with the id of their last event."""
         self._closing.set()
+        for task in self.working:
+            task.cancel()
         for channel in self._channels.values():
             channel.changed.set()
         if self._task is not None:

@@ -57,6 +57,9 @@ class Observed:
 
         try:
             await self._app(request, receive, observed)
+        except asyncio.CancelledError:  # the server is stopping, and has waited for this request for long enough
+            if not status:
+                await from_service(problems.STOPPING())(request, receive, observed)
         except BaseException:
             if status < 500:
                 note(500)

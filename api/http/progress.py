@@ -66,7 +66,12 @@ class Work(Protocol):
 
 
 async def answer_work(
-    request: Request, work: Work, progress: str, result: str, checked: asyncio.Event | None = None
+    request: Request,
+    work: Work,
+    progress: str,
+    result: str,
+    working: set[asyncio.Task[Any]],
+    checked: asyncio.Event | None = None,
 ) -> Response:
     """Return the result as JSON, or a stream of events if the request accepts one.
 
@@ -78,14 +83,17 @@ async def answer_work(
         work: Function that makes the result.
         progress: Name of the progress events.
         result: Name of the event with the result.
+        working: Tasks of all such work, which are canceled when the service stops.
         checked: Event after which an error is reported in the stream; None to start the stream immediately.
     """
+    reports: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+    # Started here rather than in `_events`, so that the work releases its resources even if no event is read.
+    task = asyncio.create_task(work(reports.put_nowait))
+    task.add_done_callback(lambda _: reports.put_nowait(None))
+    working.add(task)
+    task.add_done_callback(working.discard)
     if _EVENTS in request.headers.get("accept", ""):
         response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        reports: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
-        # Started here rather than in `_events`, so that the work releases its resources even if no event is read.
-        task = asyncio.create_task(work(reports.put_nowait))
-        task.add_done_callback(lambda _: reports.put_nowait(None))
         if checked is not None:
             waiting = [asyncio.create_task(wait) for wait in (checked.wait(), _wait_for_disconnect(request))]
             try:
@@ -100,17 +108,28 @@ async def answer_work(
                 task.cancel()
                 return Response(status_code=_CLIENT_CLOSED)
             if not checked.is_set():
-                await task  # raises its error
+                _result(task)  # raises its error
         return StreamingResponse(_events(task, reports, progress, result), 200, response_headers, _EVENTS)
-    working, leaving = asyncio.create_task(work(lambda now: None)), asyncio.create_task(_wait_for_disconnect(request))
+    leaving = asyncio.create_task(_wait_for_disconnect(request))
     try:
-        await asyncio.wait((working, leaving), return_when=asyncio.FIRST_COMPLETED)
-        if not working.done():
+        await asyncio.wait((task, leaving), return_when=asyncio.FIRST_COMPLETED)
+        if not task.done():
             return Response(status_code=_CLIENT_CLOSED)
-        return JSONResponse(working.result().model_dump(mode="json"))
+        return JSONResponse(_result(task).model_dump(mode="json"))
     finally:
-        working.cancel()
+        task.cancel()
         leaving.cancel()
+
+
+def _result(task: asyncio.Task[BaseModel]) -> BaseModel:
+    """Return the result of work that has ended.
+
+    Raises:
+        STOPPING: If it was canceled because the service stops.
+    """
+    if task.cancelled():
+        raise problems.STOPPING()
+    return task.result()
 
 
 async def _wait_for_disconnect(request: Request) -> None:
@@ -134,7 +153,7 @@ async def _events(
                 break
             yield _event(progress, report)
         try:
-            yield _event(result, task.result().model_dump(mode="json"))
+            yield _event(result, _result(task).model_dump(mode="json"))
         except ServiceError as error:
             yield _event("problem", json.loads(bytes(from_service(error).body)))
         except Exception as error:

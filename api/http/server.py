@@ -13,11 +13,19 @@ import uvicorn
 
 from api.http.app import create_app
 from api.http.connection import Connection, Reader
-from service.settings import ServiceSettings
-from service.startup import keep_private, set_up
+from service.startup import start
 
 #: Seconds that open requests have to finish at a shutdown.
 _GRACE = 10
+
+
+class _Server(uvicorn.Server):
+    """Server that ends event streams before it waits for open requests: their watchers reconnect."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop serving."""
+        await self.config.app.state.context.hub.close()  # type: ignore[union-attr]
+        await super().shutdown(sockets)
 
 
 def main() -> None:
@@ -26,9 +34,7 @@ def main() -> None:
         from worker.processes import die_with_parent
 
         die_with_parent()
-    settings = ServiceSettings()
-    set_up(settings.log_format)
-    keep_private(settings)
+    settings = start()
     # uvicorn gets a socket object rather than a descriptor. It would take a descriptor for a Unix socket and leave
     # Nagle's algorithm on, so that every response waits 40 ms until the client acknowledges its head.
     listeners = [socket.socket(fileno=int(sys.argv[2]))] if sys.argv[1:2] == ["--fd"] else None
@@ -47,7 +53,7 @@ def main() -> None:
         server_header=False,
         proxy_headers=False,  # `api.http.middleware` reads them
     )
-    server = uvicorn.Server(config)
+    server = _Server(config)
     with contextlib.suppress(KeyboardInterrupt):
         server.run(listeners)
     if not server.started:

@@ -29,7 +29,7 @@ from service.scheduling.selection import JobSelector
 from service.scheduling.stager import Stager
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
-from service.startup import keep_private, set_up
+from service.startup import start
 from service.store import Store, open_store
 from service.weights import check_weights
 
@@ -143,9 +143,7 @@ def main() -> None:
 
     if os.environ.get("SGSST_DIE_WITH_PARENT"):
         die_with_parent()
-    settings = ServiceSettings()
-    set_up(settings.log_format)
-    keep_private(settings)
+    settings = start()
     dispatcher = Dispatcher(settings, open_store(settings, patience=settings.start_seconds))
 
     def handle(_number: int, _frame: FrameType | None) -> None:

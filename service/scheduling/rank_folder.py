@@ -28,7 +28,7 @@ from service.files.staging import RESULT, stage
 from service.files.stored_blobs import open_cache
 from service.scheduling.publishing import Outbox, put_patiently
 from service.scheduling.store_workplace import StoredFile, StoreWorkplace
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, read_settings
 from service.startup import keep_private
 from service.states import Published
 from sgsst_core.features.weight_files import cache_folder
@@ -183,7 +183,7 @@ def _digest(path: Path, _size: int, _changed: int) -> str:
 def node_settings() -> ServiceSettings:
     """Return the settings of this machine; the data folder is temporary unless the environment defines one."""
     if os.environ.get("SGSST_DATA"):
-        return ServiceSettings()
+        return read_settings()
     return ServiceSettings(data=Path(tempfile.gettempdir()) / f"sgsst-{os.getuid()}")
 
 

@@ -203,4 +203,4 @@ async def make_video(
     async def work(show: Any) -> ArtifactView:
         return artifact_view(await context.derived.video(job, options, caller.quotas, show))
 
-    return await answer_work(request, work, "rendering", "video")
+    return await answer_work(request, work, "rendering", "video", context.hub.working)

@@ -215,7 +215,7 @@ async def create_job(
             findings = await inspect("plan", caller.owner, inputs, rows, parameters, show, checked.set)
         return PlanView(**findings, workers=parameters.workers)
 
-    return await answer_work(request, plan, "planning", "plan", checked)
+    return await answer_work(request, plan, "planning", "plan", context.hub.working, checked)
 
 
 def _find_inputs(

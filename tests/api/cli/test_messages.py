@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from api.cli.main import main
+from service.startup import start
 from tests.api.service import ROOT
 from tests.full_disk import full_disk
 from tests.small_scenes import wall, write_files
@@ -131,3 +132,32 @@ def test_unknown_words_are_refused_with_the_valid_ones(option: str, capsys: pyte
     command = ["stylize", "scene.ply", "--style", "style.png", "--out", "out.ply", option, "foo"]
     assert main(command) == 2
     assert f"Invalid value for '{option}': 'foo' is not one of '" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wrong"),
+    [
+        ("DATABASE", "postgres://me:secret@127.0.0.1:9/db", "Can't load plugin"),
+        ("DATABASE", "mysql://me:secret@127.0.0.1:9/db", "the driver 'mysqldb' is not supported"),
+        ("DATABASE", "postgresql+psycopg://me:secret@127.0.0.1:9/db?foo=1", 'invalid connection option "foo"'),
+        ("DATABASE", "not a url", "Could not parse"),
+        ("ARTIFACTS", "gs://bucket/x", "Please install gcsfs"),
+        ("ARTIFACTS", "nowhere://x", "Protocol not known: nowhere"),
+        ("TRUSTED_PROXIES", "127.0.0.1, 10.0.0.1/8", "10.0.0.1/8 has host bits set"),
+        ("LOG_FORMAT", "xml", "'text' or 'json'"),
+        ("DATA", "~nobody-has-this-name/x", "its home folder is unknown"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_named(
+    name: str, value: str, wrong: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "psycopg" in value:
+        pytest.importorskip("psycopg")
+    monkeypatch.setenv(f"SGSST_{name}", value)
+    assert main(["keys", "list"]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith(f"error: Environment variable SGSST_{name}"), message
+    assert wrong in message
+    assert "secret" not in message
+    with pytest.raises(SystemExit, match=f"^error: Environment variable SGSST_{name}"):  # processes of the service
+        start()

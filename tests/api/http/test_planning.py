@@ -17,7 +17,9 @@ from starlette.types import Message
 
 from api.http.progress import answer_work
 from api.http.schemas import PlanView
+from service import problems
 from tests.api.service import PATIENCE, Service, wait_for
+from tests.raised import raises_problem
 from tests.small_scenes import cameras
 
 #: Region that freezes every Gaussian in view, but not those at the corners of the wall.
@@ -204,12 +206,32 @@ def test_disconnect_while_files_are_read_ends_the_work() -> None:
     async def ask() -> int:
         streamed = Request({"type": "http", "headers": [(b"accept", b"text/event-stream")]}, leave)
         answer = await asyncio.wait_for(
-            answer_work(streamed, read_files, "planning", "plan", asyncio.Event()), PATIENCE
+            answer_work(streamed, read_files, "planning", "plan", set(), asyncio.Event()), PATIENCE
         )
         await ended.wait()
         return answer.status_code
 
     assert asyncio.run(ask()) == 499
+
+
+def test_service_that_stops_ends_the_work() -> None:
+    async def wait(show: Any) -> PlanView:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    async def stay() -> Message:
+        return await asyncio.get_running_loop().create_future()
+
+    async def ask(accept: bytes) -> object:
+        working: set[asyncio.Task[Any]] = set()
+        asked = Request({"type": "http", "headers": [(b"accept", accept)]}, stay)
+        asyncio.get_running_loop().call_later(0, lambda: [task.cancel() for task in working])
+        answer = await answer_work(asked, wait, "planning", "plan", working)
+        return [part async for part in answer.body_iterator]  # type: ignore[attr-defined]
+
+    with raises_problem(problems.STOPPING):
+        asyncio.run(ask(b"application/json"))
+    assert b'"code": "busy"' in asyncio.run(ask(b"text/event-stream"))[-1]  # type: ignore[index]
 
 
 def with_many_views(files: dict[str, bytes]) -> dict[str, bytes]:
