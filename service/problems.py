@@ -136,11 +136,9 @@ NO_SHARED_FILE = ProblemType(
 # --- inputs of jobs -------------------------------------------------------------------------------------------------
 
 INVALID_INPUT = _unusable("invalid-input", example={"message": "The files cannot be read.", "input": "scene"})
-TOO_MANY_GAUSSIANS = ProblemType(
+TOO_MANY_GAUSSIANS = _unusable(
     "too-many-gaussians",
-    422,
-    "The scene has {count:,} Gaussians{note}. At most {limit:,} are allowed.",
-    members=("input", "limit"),
+    message="The scene has {count:,} Gaussians{note}. At most {limit:,} are allowed.",
     example={"count": 30_000_000, "note": "", "limit": 20_000_000, "input": "scene"},
 )
 TOO_MANY_VIEWS = _unusable(

@@ -16,7 +16,7 @@ from pathlib import PurePosixPath
 
 import httpx2
 
-from api.http.multipart import check_file
+from api.http.multipart import check_size
 from api.http.receipts import Receipt
 from api.http.request_memory import memory
 from service import problems
@@ -103,7 +103,7 @@ class Fetcher:
             URL_NOT_FETCHED: If a server does not deliver its file in time.
             TOO_LARGE: If the files are too large.
             QUOTA_EXCEEDED: If the owner's quota of bytes would be exceeded.
-            INVALID_INPUT: If a scene has no valid header.
+            INVALID_INPUT: If a file is empty.
         """
         limit = self._limit.of(receipt.owner)
         if limit.locked():
@@ -191,8 +191,7 @@ class Fetcher:
     def _keep(self, source: _Input, file: Receiver, receipt: Receipt) -> str:
         """Turn a complete file into a blob that the receipt holds, and return its SHA-256."""
         file.close()
-        name = staged_name(source.role, file_name(source.url))
-        check_file(source.role, name, file.path, file.size, self._settings)
+        check_size(source.role, staged_name(source.role, file_name(source.url)), file.size)
         return self._blobs.add(file.path, receipt.id)
 
     @contextmanager

@@ -5,12 +5,10 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
-import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, TypeVar
 
 from fastapi import Request
@@ -28,8 +26,6 @@ from service.files.blobs import Blobs, Receiver
 from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, staged_name
 from service.files.threads import FileThreads
 from service.settings import ServiceSettings
-from sgsst_core.errors import SceneError
-from sgsst_core.files.formats import read_scene_header
 from worker.region_requests import MOST_REGIONS
 
 #: Maximum bytes of a text field: JSON parameters or an id.
@@ -286,7 +282,7 @@ class _Form:
             file, self._file = self._file, None
             file.close()
             try:
-                check_file(self._role, self._name, file.path, file.size, self._settings)
+                check_size(self._role, self._name, file.size)
             except ServiceError:
                 file.discard()
                 raise
@@ -309,23 +305,15 @@ def most_files(settings: ServiceSettings) -> int:
     return settings.max_photos + MAX_CAMERA_FILES + MOST_STYLES + MOST_REGIONS + 1
 
 
-def check_file(role: str, name: str, path: Path, size: int, settings: ServiceSettings) -> None:
-    """Check the size and header of a file; the inspection process reads the file and checks the rest.
+def check_size(role: str, name: str, size: int) -> None:
+    """Check that a file is not empty; the confined inspection process reads it and checks the rest.
 
     Raises:
-        INVALID_INPUT: If the file cannot be used.
+        INVALID_INPUT: If the file is empty.
     """
     if not size:
         code = f"invalid-{'image' if role in ('style', 'photos') else role}"
         raise problems.INVALID_INPUT(f"{name}: is empty. Send the file's content.", code=code, input=role)
-    if role != "scene":
-        return
-    try:
-        count = read_scene_header(path).count
-    except SceneError as error:
-        raise problems.INVALID_INPUT(str(error).replace(os.fspath(path), name), code=error.code, input=role) from error
-    if count > settings.max_gaussians:
-        raise problems.TOO_MANY_GAUSSIANS(count=count, note="", limit=settings.max_gaussians, input="scene")
 
 
 async def read_json(request: Request, settings: ServiceSettings, most: int) -> Any:

@@ -12,7 +12,6 @@ import hashlib
 import os
 import secrets
 import shutil
-import tempfile
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -184,12 +183,6 @@ class Blobs(ABC):
             DamagedFileError: If a blob does not match its digest.
             StoreError: If the file store does not respond.
         """
-
-    @contextmanager
-    def local_files(self, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:
-        """Provide blobs as local files for the duration of the block, like `fetch`."""
-        with tempfile.TemporaryDirectory(dir=self.incoming) as folder:
-            yield self.fetch(rows, Path(folder))
 
     @abstractmethod
     def start_upload(self, upload_id: str) -> None:

@@ -18,7 +18,7 @@ from api.http.addresses import address, subpath
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
 from api.http.documentation import headers, links
 from api.http.fetching import file_name, is_url
-from api.http.multipart import MAX_TEXT, Received, check_file, media_type, most_files, parse_json, read_json, receive
+from api.http.multipart import MAX_TEXT, Received, check_size, media_type, most_files, parse_json, read_json, receive
 from api.http.progress import DRY_RUN, answer_work
 from api.http.receipts import Receipt
 from api.http.routes.inputs import parse_input
@@ -193,8 +193,8 @@ async def create_job(
         recall = partial(context.inspector.recall, "validate", caller.owner, inputs, parameters)
         findings = await context.threads.run(caller.owner, recall)
         if findings is None:
-            size = sum(row.size for row in rows.values())
-            await context.threads.run(caller.owner, _check_files, context, inputs, rows, size=size)
+            for entry in inputs:
+                check_size(entry["role"], entry["name"], entry["size"])
             if not dry_run or context.inspector.is_planning:  # else the files are checked and planned in one reading
                 findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
@@ -240,13 +240,6 @@ def _find_inputs(
     elif webhook.webhook_events:
         raise problems.INVALID_REQUEST("webhook_events: there is no webhook. Give its URL, or omit the events.")
     return inputs, rows
-
-
-def _check_files(context: Context, inputs: Sequence[Mapping[str, Any]], rows: dict[str, BlobRow]) -> None:
-    """Run all checks of a job's files that need no inspection process."""
-    with context.blobs.local_files(rows) as paths:
-        for entry in inputs:
-            check_file(entry["role"], entry["name"], paths[entry["sha256"]], entry["size"], context.settings)
 
 
 def _queue_job(

@@ -53,7 +53,7 @@ from sgsst_core.scene.rendering import Rendering
 #: Name of the file that describes a scene, in an archive or a folder.
 META_NAME = "meta.json"
 #: Maximum bytes of meta.json, and of that of a part of a streamed SOG, which may have a thousand of them.
-_MAX_META_BYTES, _MAX_PART_META_BYTES = 1 << 20, 1 << 17
+_MAX_META_BYTES, _MAX_PART_META_BYTES = 1 << 20, 1 << 16
 #: Maximum number of Gaussians per byte of the images. Real scenes take ten bytes per Gaussian.
 GAUSSIANS_PER_BYTE = 16
 #: Maximum pixels of an image for a number of Gaussians. Writers round width and height up.

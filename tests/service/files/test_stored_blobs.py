@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
-from contextlib import nullcontext
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +22,7 @@ from service.files.objects import ObjectStore
 from service.files.stored_blobs import StoredBlobs
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.tables import UploadRow
+from service.store.tables import BlobRow, UploadRow
 from tests.service.files.s3 import Fault, FaultyS3, environment_of, s3_server
 from tests.stores import new_store
 
@@ -33,6 +34,13 @@ HOUR = 3600.0
 def server() -> Iterator[str]:
     with s3_server() as url:
         yield url
+
+
+@contextmanager
+def local_files(host: StoredBlobs, rows: Mapping[str, BlobRow]) -> Iterator[dict[str, Path]]:
+    """Provide blobs as local files within the block."""
+    with tempfile.TemporaryDirectory(dir=host.incoming) as folder:
+        yield host.fetch(rows, Path(folder))
 
 
 @dataclass
@@ -61,7 +69,7 @@ class Fleet:
         return host.add(receiver.path)
 
     def read(self, host: StoredBlobs, sha256: str) -> bytes:
-        with host.local_files(self.store.inputs.blobs([sha256])) as paths:
+        with local_files(host, self.store.inputs.blobs([sha256])) as paths:
             return paths[sha256].read_bytes()
 
     def upload(self, length: int) -> UploadRow:
@@ -215,7 +223,7 @@ def test_cache_is_evicted_for_incoming_files(fleet: Fleet, monkeypatch: pytest.M
         return SimpleNamespace(free=10_000 - sum(path.stat().st_size for path in folder.glob("*/*")))
 
     monkeypatch.setattr("service.files.blobs.shutil.disk_usage", free)
-    with host.local_files(fleet.store.inputs.blobs([used])):
+    with local_files(host, fleet.store.inputs.blobs([used])):
         host.ensure_space(2000)
         assert (folder / newest[:2] / newest).exists()
         host.ensure_space(7000)

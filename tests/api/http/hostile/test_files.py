@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import io
 import json
 import re
 import struct
+import sys
 import zipfile
 import zlib
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import httpx2
@@ -17,9 +20,12 @@ import pytest
 from backports import zstd
 from PIL import Image, ImageCms, PngImagePlugin
 
+from api.http.app import create_app
+from service.settings import ServiceSettings
 from service.store import Store
 from sgsst_core.files.formats import FORMATS
 from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.streamed_sog import STREAMED_SOG
 from tests.api.http.sending import (
     MB,
     NAMES,
@@ -185,6 +191,29 @@ def test_false_scene_headers_are_rejected(
     if problem["code"] != "inspection-limit":
         assert problem["input"] == "scene"
     assert count_jobs(store) == before
+
+
+def test_api_process_leaves_reading_to_the_confined_one(tmp_path: Path, files: Files, packed: Files) -> None:
+    """Headers alone may take seconds and gigabytes; a scene without a style is refused before any other process."""
+    reading: list[object] = []
+
+    def hook(event: str, arguments: tuple[object, ...]) -> None:
+        if event == "open" and str(arguments[0]).startswith(str(tmp_path)):
+            frame: FrameType | None = sys._getframe()
+            while frame := frame and frame.f_back:
+                if frame.f_globals.get("__name__", "").startswith("sgsst_core.files"):
+                    reading.append(arguments[0])
+
+    async def submit(scene: bytes) -> int:
+        app = create_app(ServiceSettings(data=tmp_path, min_free_bytes=0))
+        async with app.router.lifespan_context(app):
+            transport = httpx2.ASGITransport(app)
+            async with httpx2.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+                return (await client.post("/v1/jobs", files={"scene": scene})).status_code
+
+    sys.addaudithook(hook)
+    assert [asyncio.run(submit(scene)) for scene in (files["scene"], packed[STREAMED_SOG.name])] == [422, 422]
+    assert not reading
 
 
 @pytest.mark.parametrize("what", [format.name for format in FORMATS if format is not PLY])
