@@ -338,11 +338,15 @@ def jobs(
     console.print(table)
 
 
-def mcp(url: UrlOption = None, key: KeyOption = None) -> None:
+def mcp(
+    root: Annotated[Path, typer.Option(help="Folder that the tools read files from and write files to.")] = Path(),
+    url: UrlOption = None,
+    key: KeyOption = None,
+) -> None:
     """Serve the tools of a language model on standard input and output, by the Model Context Protocol."""
     from api.cli.mcp_server import serve
 
-    serve(url, key)
+    serve(root, url, key)
 
 
 COMMANDS: tuple[Callable[..., None], ...] = (

@@ -5,8 +5,9 @@ The SDK evaluates the annotations of the tools, so that all of their names are i
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +22,7 @@ from pydantic import BaseModel, Field
 
 from api.client import AsyncClient
 from api.client.answers import Job
+from api.client.inputs import IMAGE_SUFFIXES, JobFiles, input_files, path_or_url
 from service.parameters import JobParameters
 from sgsst_core.errors import SgsstError
 from sgsst_core.files import formats
@@ -33,6 +35,13 @@ ended, and `result` for a preview and the stylized scene. `blend` mixes the scen
 """
 #: Artifact with the stylized scene.
 _RESULT = "stylized.ply"
+#: Suffixes of the files that are read, by role.
+_SUFFIXES = {
+    "scene": tuple(each.suffix for each in formats.FORMATS),
+    "style": IMAGE_SUFFIXES,
+    "cameras": (".json", ".bin", ".txt"),
+    "photos": IMAGE_SUFFIXES,
+}
 _READS = ToolAnnotations(read_only_hint=True, open_world_hint=False)
 _CREATES = ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
 
@@ -40,7 +49,7 @@ Scene = Annotated[str, Field(description=f"Scene: path of a file ({formats.SUFFI
 Styles = Annotated[list[str], Field(min_length=1, description="Style images: paths or URLs. Several are mixed.")]
 Cameras = Annotated[
     str | None,
-    Field(description="Cameras: path of a cameras.json, transforms.json or COLMAP model. Null needs `orbit`."),
+    Field(description="Cameras: path of a cameras.json, transforms.json or COLMAP model; null for an orbit."),
 ]
 Photos = Annotated[str | None, Field(description="Folder of the photos of the cameras; null if there are none.")]
 Options = Annotated[
@@ -110,17 +119,22 @@ class Link(BaseModel):
 
 
 class Tools:
-    """Tools of the MCP server. Expected errors become messages to the model."""
+    """Tools of the MCP server. Expected errors become messages to the model.
 
-    def __init__(self, client: AsyncClient) -> None:
-        self._client = client
+    Args:
+        root: Folder below which files are read and written; relative paths start there.
+    """
+
+    def __init__(self, client: AsyncClient, root: Path) -> None:
+        self._client, self._root = client, root.resolve()
 
     async def estimate(
         self, scene: Scene, style: Styles, cameras: Cameras = None, photos: Photos = None, options: Options = None
     ) -> Estimate:
         """Check the files of a job and estimate its time and memory, without queueing it."""
         with _messages():
-            plan = await self._client.plan(scene, style, cameras=cameras, photos=photos, **_known(options))
+            files = await anyio.to_thread.run_sync(self._files, scene, style, cameras, photos)
+            plan = await self._client.plan(**files, **_known(options))
         return Estimate(**{name: plan[name] for name in Estimate.model_fields})
 
     async def submit(
@@ -128,9 +142,8 @@ class Tools:
     ) -> State:
         """Queue a job that stylizes a scene. It continues on the service whatever happens here."""
         with _messages():
-            return self._state(
-                await self._client.submit(scene, style, cameras=cameras, photos=photos, **_known(options))
-            )
+            files = await anyio.to_thread.run_sync(self._files, scene, style, cameras, photos)
+            return self._state(await self._client.submit(**files, **_known(options)))
 
     async def status(self, job_id: JobId) -> State:
         """Show the status and progress of a job."""
@@ -140,11 +153,10 @@ class Tools:
     async def result(self, job_id: JobId, out: Out = None) -> Annotated[CallToolResult, JobResult]:
         """Show the newest image of a job and the addresses of its files, and write its scene to a file."""
         with _messages():
-            if out:
-                formats.download_of_name(out)
+            target = self._new_file(out, [f".{name}" for name in formats.DOWNLOADS])
             job = await self._client.job(job_id)
             artifacts = await self._client.artifacts(job_id)
-            path = await self._write(job_id, _RESULT, out) if out else None
+            path = target and str(await self._client.download(job_id, target, _RESULT))
             preview = job.data["preview"]
             image = None
             if preview:
@@ -168,8 +180,10 @@ class Tools:
     ) -> Blended:
         """Blend the scene of a finished job with its result, and with results of other jobs of the scene."""
         with _messages():
-            name = await self._client.blend(job_id, weight, others, _format(out) or PLY.name)
-            path = await self._write(job_id, name, out) if out else None
+            target = self._new_file(out, [each.suffix for each in formats.RESULT_FORMATS])
+            format = formats.format_of_name(target.name) if target else None
+            name = await self._client.blend(job_id, weight, others, (format or PLY).name)
+            path = target and str(await self._client.download(job_id, target, name))
         return Blended(url=self._address(job_id, name), path=path)
 
     async def share(
@@ -203,28 +217,39 @@ class Tools:
             page=f"{self._client.url}/#/jobs/{job.id}",
         )
 
-    async def _write(self, job_id: str, name: str, out: str) -> str:
-        """Download an artifact to a new file, and return the file's absolute path."""
-        target = await anyio.to_thread.run_sync(_new_file, out)
-        return str(await self._client.download(job_id, target, name))
+    def _files(self, scene: str, style: list[str], cameras: str | None, photos: str | None) -> dict[str, Any]:
+        """Return the files of a job as arguments of the client, after checking each of them."""
+        styles = [self._input(each) for each in style]
+        files = JobFiles(self._input(scene), styles, cameras and self._input(cameras), photos and self._inside(photos))
+        for file in input_files(files):
+            if isinstance(file.source, Path):
+                self._inside(file.source)
+                if not file.name.lower().endswith(_SUFFIXES[file.role]):
+                    raise ToolError(f"{file.source}: does not end in {', '.join(_SUFFIXES[file.role])}.")
+        return {"scene": files.scene, "style": styles, "cameras": files.cameras, "photos": files.photos}
 
+    def _input(self, text: str) -> str | Path:
+        """Return a URL as it is, or the path of a file or folder below the root."""
+        path = path_or_url(text)
+        return path if isinstance(path, str) else self._inside(path)
 
-def _new_file(out: str) -> Path:
-    """Return the absolute path of a file that does not exist yet."""
-    path = Path(out).absolute()
-    if path.exists():
-        raise ToolError(f"{path}: exists. Name another file.")
-    return path
+    def _new_file(self, out: str | None, suffixes: Sequence[str]) -> Path | None:
+        """Return the path of a file that does not exist yet, has one of some suffixes and lies below the root."""
+        if out is None:
+            return None
+        if not out.lower().endswith(tuple(suffixes)):
+            raise ToolError(f"{out}: does not end in {formats.listed(suffixes)}. Name the file to write.")
+        path = self._inside(out)
+        if os.path.lexists(self._root / out):
+            raise ToolError(f"{path}: exists. Name another file.")
+        return path
 
-
-def _format(out: str | None) -> formats.ResultName | None:
-    """Return the format of a file to write, from its name; None for no file."""
-    if out is None:
-        return None
-    format = formats.format_of_name(Path(out).name)
-    if format is None or not format.write:
-        raise ToolError(f"{out}: has no extension of a scene. Use {formats.RESULT_SUFFIXES}.")
-    return format.name
+    def _inside(self, path: str | Path) -> Path:
+        """Return a path without links, after checking that it lies below the root."""
+        resolved = (self._root / path).resolve()
+        if not resolved.is_relative_to(self._root):
+            raise ToolError(f"{path}: is not below {self._root}. Name another file, or start `sgsst mcp` with --root.")
+        return resolved
 
 
 def _known(options: dict[str, Any] | None) -> dict[str, Any]:
@@ -244,12 +269,12 @@ def _messages() -> Iterator[None]:
         raise ToolError(str(error)) from error
 
 
-def make_server(client: AsyncClient) -> MCPServer[None]:
-    """Return the server with its tools."""
+def make_server(client: AsyncClient, root: Path) -> MCPServer[None]:
+    """Return the server with its tools, which read and write files below `root`."""
     server: MCPServer[None] = MCPServer(
         "sgsst", instructions=_INSTRUCTIONS, version=version("sgsst-service"), log_level="WARNING"
     )
-    tools = Tools(client)
+    tools = Tools(client, root)
     server.add_tool(tools.estimate, annotations=_READS)
     server.add_tool(tools.submit, annotations=_CREATES)
     server.add_tool(tools.status, annotations=_READS)
@@ -259,11 +284,11 @@ def make_server(client: AsyncClient) -> MCPServer[None]:
     return server
 
 
-def serve(url: str | None, key: str | None) -> None:
-    """Serve on standard input and output until the input ends."""
-    anyio.run(_serve, url, key)
+def serve(root: Path, url: str | None, key: str | None) -> None:
+    """Serve on standard input and output until the input ends; files are below `root`."""
+    anyio.run(_serve, root, url, key)
 
 
-async def _serve(url: str | None, key: str | None) -> None:
+async def _serve(root: Path, url: str | None, key: str | None) -> None:
     async with AsyncClient(url, key) as client:
-        await make_server(client).run_stdio_async()
+        await make_server(client, root).run_stdio_async()

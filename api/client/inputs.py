@@ -11,7 +11,7 @@ from api.client.answers import RequestError
 from sgsst_core.files.camera_folder import find_cameras, issue_warning
 from sgsst_core.files.colmap_model import label
 
-_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".heic", ".heif", ".hif"}
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".heic", ".heif", ".hif")
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def image_files(folder: Path) -> list[tuple[Path, str]]:
     """
     _check_exists(folder)
     visible = (path for path in folder.rglob("*") if not path.name.startswith("."))
-    images = sorted(path for path in visible if path.suffix.lower() in _IMAGE_SUFFIXES and path.is_file())
+    images = sorted(path for path in visible if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     if not images:
         raise RequestError(f"{folder}: contains no images. Give a folder of image files.")
     return [(path, label(os.fsencode(path.relative_to(folder).as_posix()))) for path in images]

@@ -17,7 +17,7 @@ import stamina
 
 from api.client.answers import ApiError, RequestError, checked, is_temporary, refusal
 from sgsst_core.errors import OutputError
-from sgsst_core.files.atomic import disk_errors, replace
+from sgsst_core.files.atomic import disk_errors, replace, temporary_path
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 #: Maximum number of attempts of a request, with waits of 1, 2, 4 ... seconds between them.
@@ -44,7 +44,8 @@ T = TypeVar("T")
 class Download:
     """Protocol of one download to a target path, for `Transport.fetch`.
 
-    A partial file is resumed, and the complete file is checked by its SHA-256.
+    A partial file is resumed, also that of an earlier process: its name has the SHA-256 of the complete file, by which
+    that is checked.
 
     Attributes:
         path: Path of the file on the service.
@@ -53,19 +54,23 @@ class Download:
     def __init__(self, path: str, target: Path, progress: Progress) -> None:
         self.path = path
         self._target, self._progress = target, progress
-        self._part = target.with_name(target.name + ".part")
-        self._stamp = target.with_name(target.name + ".part.etag")
+        self._expected = ""
         self._done = self._size = 0
         #: Hash of the first `_hashed` bytes of the partial file.
         self._digest, self._hashed = hashlib.sha256(), 0
 
+    @property
+    def _part(self) -> Path:
+        return temporary_path(self._target, self._expected)
+
     def headers(self) -> dict[str, str]:
         """Return headers that resume the partial file, if there is one, and that keep proxies from compressing."""
-        self._done = self._part.stat().st_size if self._part.exists() else 0
-        if not self._done or not self._stamp.exists():
-            return {"Accept-Encoding": "identity"}
-        tag = f'"{self._stamp.read_text()}"'
-        return {"Accept-Encoding": "identity", "Range": f"bytes={self._done}-", "If-Range": tag}
+        for path in self._target.parent.glob(temporary_path(self._target, "*").name):
+            if (stated := _SHA256.search(path.name)) and path.is_file() and not path.is_symlink():
+                self._expected, self._done = stated[0], path.stat().st_size
+                tag = f'"{self._expected}"'
+                return {"Accept-Encoding": "identity", "Range": f"bytes={self._done}-", "If-Range": tag}
+        return {"Accept-Encoding": "identity"}
 
     def begin(self, response: httpx2.Response) -> bool:
         """Process the headers of a successful response, or of status 416, which means that all bytes were received.
@@ -86,11 +91,11 @@ class Download:
                 "which headers a proxy removes."
             )
         if response.status_code != httpx2.codes.PARTIAL_CONTENT:
+            self.discard()
             self._done = self._hashed = 0
-            self._digest = hashlib.sha256()
+            self._digest, self._expected = hashlib.sha256(), stated[0]
             with disk_errors(self._target, self._part):
-                self._part.write_bytes(b"")
-                self._stamp.write_text(stated[0])
+                self._part.open("xb").close()
         self._size = self._done + int(response.headers.get("content-length", 0))
         return True
 
@@ -118,22 +123,19 @@ class Download:
             ApiError: If the SHA-256 differs from the service's. The partial file is then deleted.
             OutputError: If another program holds the target open.
         """
-        expected = self._stamp.read_text() if self._stamp.exists() else ""
-        self._stamp.unlink(missing_ok=True)
         with self._part.open("rb") as file:
             file.seek(self._hashed)  # bytes that an earlier process has written have not been hashed
             while block := file.read(BLOCK):
                 self._digest.update(block)
                 self._hashed += len(block)
-        if self._digest.hexdigest() != expected:
-            self._part.unlink()
+        if self._digest.hexdigest() != self._expected:
+            self.discard()
             raise ApiError(f"{self.path}: the download was damaged in transit. Try again.", 460)
         replace(self._part, self._target)
 
     def discard(self) -> None:
         """Delete the partial file."""
         self._part.unlink(missing_ok=True)
-        self._stamp.unlink(missing_ok=True)
 
 
 class Transport:

@@ -7,6 +7,7 @@ import hashlib
 import http.client
 import json
 import os
+import secrets
 import threading
 import time
 import urllib.error
@@ -31,17 +32,27 @@ class UnreachableError(ServiceError):
     """Request that the service did not answer."""
 
 
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """Handler that follows no redirect: a key, and what is sent with it, are for the given address alone."""
+
+    def redirect_request(self, *ignored: Any) -> None:
+        """Return no request to follow a redirect with."""
+
+
 class Service:
     """Connection to the service at a URL.
 
     Args:
         url: Address of the service; None or empty for SGSST_URL, or this machine.
-        key: API key; None or empty for SGSST_KEY, or no key.
+        key: API key; None or empty for SGSST_KEY if the service is that of SGSST_URL (or this machine), or no key.
     """
 
     def __init__(self, url: str | None = None, key: str | None = None) -> None:
-        self.url = (url or os.environ.get("SGSST_URL") or "http://127.0.0.1:8000").rstrip("/")
-        key = key or os.environ.get("SGSST_KEY")
+        trusted = os.environ.get("SGSST_URL") or "http://127.0.0.1:8000"
+        self.url = (url or trusted).rstrip("/")
+        if not key and self.url.split("/")[:3] == trusted.split("/")[:3]:  # a key belongs to one origin
+            key = os.environ.get("SGSST_KEY")
+        self._open = urllib.request.build_opener(_NoRedirects).open
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
 
     def stylize(self, scene: Path, style: Path, out: Path, cameras: list[Path] | None = None, **options: Any) -> str:
@@ -119,16 +130,17 @@ class Service:
         Raises:
             ServiceError: If the connection was lost, or the SHA-256 of the file is not the one of its ETag.
         """
-        part = out.with_name(out.name + ".part")
-        digest = hashlib.sha256()
-        with self.request("GET", f"/v1/jobs/{job_id}/artifacts/{name}") as answer, part.open("wb") as file:
-            while block := answer.read(1 << 20):
-                file.write(block)
-                digest.update(block)
-        if digest.hexdigest() not in answer.headers.get("ETag", ""):
-            part.unlink()
-            raise ServiceError(f"The download of {name} was truncated or damaged. Try again.")
-        part.replace(out)
+        part, digest = out.with_name(f".sgsst-{secrets.token_hex(8)}.part"), hashlib.sha256()
+        try:
+            with self.request("GET", f"/v1/jobs/{job_id}/artifacts/{name}") as answer, part.open("xb") as file:
+                while block := answer.read(1 << 20):
+                    file.write(block)
+                    digest.update(block)
+            if digest.hexdigest() not in answer.headers.get("ETag", ""):
+                raise ServiceError(f"The download of {name} was truncated or damaged. Try again.")
+            part.replace(out)
+        finally:
+            part.unlink(missing_ok=True)
 
     def json(self, method: str, path: str, body: object = None, headers: dict[str, str] | None = None) -> Any:
         """Send a request and return the JSON of its response; the arguments are those of `request`."""
@@ -143,7 +155,7 @@ class Service:
             data, headers["Content-Type"] = json.dumps(body).encode(), "application/json"
         try:
             request = urllib.request.Request(self.url + path, data, headers, method=method)
-            return urllib.request.urlopen(request, timeout=_PATIENCE)
+            return self._open(request, timeout=_PATIENCE)
         except urllib.error.HTTPError as error:
             raise ServiceError(self._reason(error)) from error
         except (OSError, http.client.HTTPException) as error:
@@ -157,8 +169,10 @@ class Service:
         if error.code == 401:
             return (
                 f"The service at {self.url} requires another API key. Create one with `sgsst keys create NAME` on its "
-                "machine, and enter it in the settings or as SGSST_KEY."
+                "machine, and enter it in the settings, or set SGSST_URL to this address and SGSST_KEY to the key."
             )
+        if "Location" in error.headers:
+            return f"{self.url} redirects to {error.headers['Location']}. Enter the address of the service itself."
         try:
             return str(json.load(error)["detail"])
         except (ValueError, KeyError, TypeError):

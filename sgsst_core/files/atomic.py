@@ -79,7 +79,8 @@ def replace(temporary: Path, final: Path) -> None:
         time.sleep(0.1)
     new = final.with_name(f"{final.stem}.new{final.suffix}")
     try:
-        temporary.replace(new)
+        os.link(temporary, new)  # unlike a rename, it never replaces a file
+        temporary.unlink()
     except OSError:
         new = temporary
     raise HeldOpenError(
@@ -136,7 +137,7 @@ def disk_errors(target: Path, temporary: Path, size: int = 0) -> Iterator[None]:
 def remove_leftovers(target: Path) -> None:
     """Delete temporary files that killed processes left for `target`; no process may be writing `target` meanwhile."""
     final = Path(os.path.realpath(target))
-    for path in final.parent.glob(f".sgsst-{_tag(final)}-*.part*"):
+    for path in final.parent.glob(temporary_path(final, "*", "*").name):
         path.unlink(missing_ok=True)
 
 
@@ -157,7 +158,7 @@ def ensure_writable_folder(path: Path) -> None:
 
 def _reserve(final: Path) -> Path:
     """Create an empty file beside `final`, with the default permissions of a new file."""
-    temporary = final.with_name(f".sgsst-{_tag(final)}-{secrets.token_hex(6)}.part{final.suffix}")
+    temporary = temporary_path(final, secrets.token_hex(6), final.suffix)
     try:
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     except OSError as error:
@@ -169,12 +170,13 @@ def _reserve(final: Path) -> Path:
     return temporary
 
 
-def _tag(final: Path) -> str:
-    """Return the common part of the names of a target's temporary files.
+def temporary_path(final: Path, unique: str, suffix: str = "") -> Path:
+    """Return the path of a temporary file beside a target, given what only its name has.
 
-    It is a hash of the target's name, because the name plus a suffix could exceed the maximum length of file names.
+    It has a hash of the target's name, because the name plus a suffix could exceed the maximum length of file names.
     """
-    return hashlib.sha256(os.fsencode(final.name)).hexdigest()[:8]
+    tag = hashlib.sha256(os.fsencode(final.name)).hexdigest()[:8]
+    return final.with_name(f".sgsst-{tag}-{unique}.part{suffix}")
 
 
 def _flush_folder(folder: Path) -> None:

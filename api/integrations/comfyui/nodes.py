@@ -29,7 +29,8 @@ def _service_input() -> Any:
         default="",
         optional=True,
         advanced=True,
-        tooltip="Address of the service; empty for SGSST_URL, or http://127.0.0.1:8000. A key is read from SGSST_KEY.",
+        tooltip="Address of the service; empty for SGSST_URL, or http://127.0.0.1:8000. The key in SGSST_KEY is only "
+        "sent to the service of SGSST_URL.",
     )
 
 

@@ -9,6 +9,7 @@ const [scene = "", style = "", out = ""] = process.argv.slice(2);
 const key = process.env.SGSST_KEY;
 const service = createClient<paths>({
   baseUrl: process.env.SGSST_URL ?? "http://127.0.0.1:8000",
+  redirect: "error", // the key is for this address alone
   headers: key ? { Authorization: `Bearer ${key}` } : {},
 });
 const parameters: Partial<components["schemas"]["JobParameters"]> = { preset: "preview", orbit: 24 };

@@ -151,7 +151,7 @@ class SgsstPanel(lf.ui.Panel):
     running: Running | None = None
 
     def __init__(self) -> None:
-        self._service, self._style = "http://127.0.0.1:8000", ""
+        self._service, self._style = Service().url, ""
         self._preset, self._minutes, self._views, self._up = 1, 10.0, 0, 0
         self._painting: Painting | None = None
         self._message = ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import shutil
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -38,9 +39,9 @@ def service(whole_service: Service) -> Service:
 
 
 @asynccontextmanager
-async def tools(url: str) -> AsyncIterator[McpClient]:
+async def tools(url: str, root: Path = ROOT) -> AsyncIterator[McpClient]:
     """Start `sgsst mcp` as an application with a language model would, and connect to it."""
-    arguments = ["-m", "api.cli", "mcp", "--url", url]
+    arguments = ["-m", "api.cli", "mcp", "--url", url, "--root", str(root)]
     command = StdioServerParameters(command=sys.executable, args=arguments, env={"PYTHONPATH": str(ROOT)})
     async with McpClient(command) as client:
         yield client
@@ -83,7 +84,7 @@ def test_scene_is_estimated_stylized_and_blended(service: Service, files: dict[s
     inputs = {**files, "style": [files["style"]], "options": {"steps_coarse": 0, "steps_sos": 20}}
 
     async def run() -> None:
-        async with tools(service.url) as client, AsyncClient(service.url) as direct:
+        async with tools(service.url, tmp_path.parent) as client, AsyncClient(service.url) as direct:
             before = [job.id async for job in direct.jobs()]
             estimate = await call(client, "estimate", **inputs)
             assert (estimate["gaussians"], estimate["views"]) == (616, 3)
@@ -122,27 +123,63 @@ def test_refusals_are_messages(service: Service, files: dict[str, str], tmp_path
     inputs = {**files, "style": [files["style"]]}
 
     async def run() -> None:
-        async with tools(service.url) as client:
+        async with tools(service.url, tmp_path.parent) as client:
             assert "no job" in await refusal(client, "status", job_id=missing)
-            assert "Check the path" in await refusal(client, "submit", **inputs | {"scene": "/missing.ply"})
+            assert "Check the path" in await refusal(client, "submit", **inputs | {"scene": "missing.ply"})
             assert "switched off" in await refusal(client, "submit", **inputs | {"scene": "https://evil.test/a.ply"})
             assert "Unknown options: webhook" in await refusal(client, "submit", **inputs, options={"webhook": "x"})
             assert "seed" in await refusal(client, "estimate", **inputs, options={"seed": -1})
-            assert "extension" in await refusal(client, "blend", job_id=missing, weight=1, out="a.txt")
+            assert "does not end in" in await refusal(client, "blend", job_id=missing, weight=1, out="a.txt")
         async with tools("http://127.0.0.1:1") as client:
             assert "cannot be reached" in await refusal(client, "status", job_id=missing)
 
     anyio.run(run)
 
 
-def test_existing_files_are_kept(service: Service, files: dict[str, str], tmp_path: Path) -> None:
-    existing = tmp_path / "existing.ply"
-    existing.write_bytes(b"mine")
+def test_files_are_scenes_below_the_root_and_new(files: dict[str, str], tmp_path: Path) -> None:
+    root, outside = tmp_path / "root", tmp_path / "outside"
+    for folder in (root / "photos", outside):
+        folder.mkdir(parents=True)
+    for name, path in files.items():
+        shutil.copy(path, outside / Path(path).name)
+        shutil.copy(path, root / Path(path).name)
+        (root / f"link_{name}{Path(path).suffix}").symlink_to(outside / Path(path).name)
+    (root / "photos" / "0.png").symlink_to(outside / Path(files["style"]).name)
+    (root / "existing.ply").write_bytes(b"mine")
+    (root / "secret.txt").write_bytes(b"mine")
+    (root / "dangling.ply").symlink_to(root / "nothing.ply")
+    (root / "new").symlink_to(outside)
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    own = {name: Path(path).name for name, path in files.items()}
+    inputs = [
+        ({"scene": str(outside / own["scene"])}, "is not below"),
+        ({"scene": f"../outside/{own['scene']}"}, "is not below"),
+        ({"scene": "link_scene.ply"}, "is not below"),
+        ({"style": [f"link_style{Path(own['style']).suffix}"]}, "is not below"),
+        ({"cameras": "link_cameras.json"}, "is not below"),
+        ({"photos": "photos"}, "is not below"),
+        ({"scene": "secret.txt"}, "does not end in"),
+        ({"style": ["secret.txt"]}, "does not end in"),
+    ]
+    outputs = [
+        ("existing.ply", "exists"),
+        ("dangling.ply", "exists"),
+        ("new/a.ply", "is not below"),
+        ("../a.ply", "is not below"),
+        (str(outside / "a.ply"), "is not below"),
+        (".bash_profile", "does not end in"),
+        ("a", "does not end in"),
+    ]
 
     async def run() -> None:
-        async with tools(service.url) as client:
-            job_id = (await call(client, "submit", **files | {"style": [files["style"]]}))["job_id"]
-            assert "Name another file" in await refusal(client, "result", job_id=job_id, out=str(existing))
+        async with tools("http://127.0.0.1:1", root) as client:
+            for changed, message in inputs:
+                given = {**own, "style": [own["style"]], **changed}
+                for tool in ("estimate", "submit"):
+                    assert message in await refusal(client, tool, **given), changed
+            for out, message in outputs:
+                assert message in await refusal(client, "result", job_id="job_1", out=out), out
+                assert message in await refusal(client, "blend", job_id="job_1", weight=1, out=out), out
 
     anyio.run(run)
-    assert existing.read_bytes() == b"mine"
+    assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before

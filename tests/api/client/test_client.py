@@ -28,6 +28,7 @@ from api.client.transport import TRIES
 from service.files.artifacts import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store
+from sgsst_core.files.atomic import temporary_path
 from tests.api.service import Service
 from tests.http_servers import serve
 from tests.nginx import Nginx
@@ -420,28 +421,28 @@ def test_download_through_compressing_proxies(
 
 
 @both
-def test_foreign_partial_file_is_discarded(
+def test_partial_file_is_resumed_or_discarded_and_no_other_touched(
     connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
         job_id = client.submit(files["scene"], files["style"], orbit=2).id
         content = finish(store, service, job_id, job_id.encode() * 1000, tmp_path)
-        tag = f'"{hashlib.sha256(content).hexdigest()}"'
+        tag = hashlib.sha256(content).hexdigest()
         for number, (left, stamp) in enumerate(
             [
-                (b"an older download", None),
-                (b"of an older result", f'"{"0" * 64}"'),
+                (b"mine", None),
+                (b"of an older result", "0" * 64),
                 (b"damaged on this disk", tag),
                 (content[:1000], tag),
                 (content, tag),
             ]
         ):
             target = tmp_path / f"{number}.ply"
-            target.with_name(f"{number}.ply.part").write_bytes(left)
-            if stamp is not None:
-                target.with_name(f"{number}.ply.part.etag").write_text(stamp)
+            foreign = target.with_name(f"{number}.ply.part")
+            part = foreign if stamp is None else temporary_path(target, stamp)
+            part.write_bytes(left)
             assert client.download(job_id, target).read_bytes() == content
-        assert not list(tmp_path.glob("*.part*"))
+        assert [path.read_bytes() for path in tmp_path.glob("*.part*")] == [b"mine"]
 
 
 @both

@@ -41,12 +41,44 @@ def odd() -> Iterator[sgsst_rest.Service]:
         server.shutdown()
 
 
+def test_key_is_for_one_origin(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = []
+
+    class Redirecting(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            sent.append(self.headers["Authorization"])
+            self.send_response(302)
+            self.send_header("Location", f"http://localhost:{self.server.server_address[1]}/")
+            self.end_headers()
+
+        def log_message(self, *arguments: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Redirecting) as server:
+        serve(server)
+        own, other = (f"http://{host}:{server.server_port}" for host in ("127.0.0.1", "localhost"))
+        monkeypatch.setenv("SGSST_URL", own)
+        monkeypatch.setenv("SGSST_KEY", "secret")
+        given = [(None, None), (f"{own}/below", None), (other, None), (f"{own}@localhost", None), (other, "own")]
+        for url, key in given:
+            with pytest.raises(sgsst_rest.ServiceError):
+                sgsst_rest.Service(url, key).json("GET", "/v1/jobs")
+        with pytest.raises(sgsst_rest.ServiceError, match=f"redirects to {other}"):
+            sgsst_rest.Service().json("GET", "/v1/jobs")
+        server.shutdown()
+    assert sent == ["Bearer secret", "Bearer secret", None, "Bearer own", "Bearer secret"]
+
+
 def test_truncated_download_is_no_result(odd: sgsst_rest.Service, tmp_path: Path) -> None:
     with pytest.raises(sgsst_rest.ServiceError, match="truncated or damaged"):
         odd.download("job", "truncated", tmp_path / "out.ply")
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "out.ply.part").write_bytes(b"mine")
     odd.download("job", "whole", tmp_path / "out.ply")
-    assert (tmp_path / "out.ply").read_bytes() == b"content"
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
+        "out.ply": b"content",
+        "out.ply.part": b"mine",
+    }
 
 
 def test_each_failure_says_what_to_do(odd: sgsst_rest.Service, services: Services) -> None:
