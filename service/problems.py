@@ -158,6 +158,16 @@ UNSURE_UP = ProblemType(
         "input": "up",
     },
 )
+UNSURE_CAMERAS = ProblemType(
+    "unsure-cameras",
+    422,
+    "The cameras hardly show this scene: {reason}.",
+    members=("input",),
+    example={
+        "reason": "a typical view has 0.9% of the Gaussians in its frame and shows nothing in 40% of its pixels",
+        "input": "cameras",
+    },
+)
 TOO_MANY_PIXELS = _unusable(
     "too-many-pixels",
     message="All views have {count:,} pixels. At most {limit:,} are allowed.",

@@ -152,6 +152,7 @@ _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
         problems.TOO_MANY_GAUSSIANS,
         problems.TOO_MANY_VIEWS,
         problems.UNSURE_UP,
+        problems.UNSURE_CAMERAS,
         problems.TOO_MANY_PIXELS,
         problems.IMAGE_TOO_LARGE,
         problems.TOO_MANY_FILES,

@@ -4,10 +4,7 @@ import { words } from "./words.js";
 
 /** Error answer of the service, with its message. */
 export class Problem extends Error {
-  /**
-   * @param {number} status
-   * @param {any} body body of the answer
-   */
+  /** @param {number} status @param {any} body body of the answer */
   constructor(status, body) {
     super(typeof body?.detail === "string" ? body.detail : words.api.status(status));
     this.status = status;
@@ -57,11 +54,7 @@ export async function ask(method, path, { body, json, headers = {}, signal } = {
   throw new Problem(answer.status, told);
 }
 
-/**
- * @param {string} path
- * @param {AbortSignal} [signal]
- * @returns {Promise<any>}
- */
+/** @param {string} path @param {AbortSignal} [signal] @returns {Promise<any>} */
 export const get = async (path, signal) => (await ask("GET", path, { signal })).json();
 
 /** Yield the events of an answer that is an event stream. @param {Response} answer @returns {AsyncGenerator<{event: string, data: any}>} */

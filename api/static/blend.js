@@ -34,19 +34,15 @@ export class Blend {
     this.weigh();
   }
 
-  /**
-   * @param {string} name
-   * @param {number} most maximum in percent
-   * @param {(value: number) => void} set
-   */
+  /** @param {string} name @param {number} most maximum in percent @param {(value: number) => void} set */
   slider(name, most, set) {
-    const id = newId(), output = h("output", { htmlFor: id });
-    const input = h("input", { id, type: "range", min: 0, max: most, step: 1, oninput: () => {
+    const id = newId(), output = h("output", { htmlFor: id }), mark = h("datalist", { id: `${id}m` }, h("option", { value: 100 }));
+    const input = h("input", { id, type: "range", list: most > 100 ? mark.id : null, min: 0, max: most, step: 1, oninput: () => {
       set(Number(input.value) / 100);
       this.weigh();
       this.changed();
     } });
-    return { input, output, element: h("div.slider", h("label", { htmlFor: id }, name), input, output) };
+    return { input, output, element: h("div.slider", h("label", { htmlFor: id }, name), input, output, mark) };
   }
 
   /**

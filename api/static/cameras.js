@@ -46,10 +46,7 @@ function transformsCamera(values) {
   });
 }
 
-/**
- * @param {ArrayBuffer} images
- * @param {ArrayBuffer} intrinsics
- */
+/** @param {ArrayBuffer} images @param {ArrayBuffer} intrinsics */
 function colmapCameras(images, intrinsics) {
   /** @type {Map<number, number[]>} */
   const models = new Map();
@@ -82,10 +79,7 @@ function colmapCameras(images, intrinsics) {
   return found.sort((a, b) => (a.name < b.name ? -1 : 1));
 }
 
-/**
- * @param {JobCamera} camera
- * @returns {JobCamera}
- */
+/** @param {JobCamera} camera @returns {JobCamera} */
 function checked(camera) {
   const { position, axes, fx, fy, width, height } = camera;
   const numbers = [...position, ...axes.flat(), fx, fy, width, height];

@@ -126,11 +126,7 @@ export class LossChart {
   }
 }
 
-/**
- * Return the label of a value, such as 0.05 or 3×10¹⁰.
- *
- * @param {number} value
- */
+/** Return the label of a value, such as 0.05 or 3×10¹⁰. @param {number} value */
 function short(value) {
   if (value < 1e6 && value >= 1e-3) return rough(value);
   const [digit, power] = Number(value.toPrecision(2)).toExponential().split("e");

@@ -1,6 +1,6 @@
 // @ts-check
 /** View that compares runs of one scene: their images side by side, and two of them on both sides of the wipe. */
-import { artifactPath, get } from "./api.js";
+import { artifactPath, get, Problem } from "./api.js";
 import { h, put } from "./dom.js";
 import { badge } from "./job.js";
 import { labels } from "./names.js";
@@ -33,7 +33,7 @@ export class CompareView {
       else this.showStage(jobs.filter((job) => job.status === "succeeded"));
     } catch (error) {
       if (this.leaving.signal.aborted) return;
-      put(this.element, h("div.empty", h("h1", words.page.error), h("p", error instanceof Error ? error.message : say.notThere), h("a.button.quiet", { href: "#/jobs" }, words.page.jobs)));
+      put(this.element, h("div.empty", h("h1", error instanceof Problem && error.status === 404 ? words.job.gone : words.page.error), h("p", error instanceof Error && !(error instanceof Problem && error.status === 404) ? error.message : say.notThere), h("a.button.quiet", { href: "#/jobs" }, words.page.jobs)));
     }
   }
 

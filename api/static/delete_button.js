@@ -19,9 +19,15 @@ export function deleteButton(name, act, failed, label) {
   const ask_ = () => {
     const yes = h("button.danger", { type: "button", onclick: () => act().catch(failed) }, say.remove);
     holder.classList.add("asking");
-    put(holder, h("span", say.removeSure), yes, h("button.quiet", { type: "button", onclick: () => (holder.classList.remove("asking"), put(holder, first), first.focus()) }, say.keep));
+    put(holder, h("span", say.removeSure), yes, h("button.quiet", { type: "button", onclick: leave }, say.keep));
     yes.focus();
   };
+  const leave = () => {
+    holder.classList.remove("asking");
+    put(holder, first);
+    first.focus();
+  };
+  holder.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && holder.classList.contains("asking") && leave());
   put(holder, first);
   return holder;
 }

@@ -56,12 +56,7 @@ function fill(made, properties, children, set) {
   made.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false).map((child) => (child instanceof Node ? child : String(child))));
 }
 
-/**
- * Replace the children of an element.
- *
- * @param {Element} element
- * @param {...(Child | Child[])} children
- */
+/** Replace the children of an element. @param {Element} element @param {...(Child | Child[])} children */
 export function put(element, ...children) {
   element.replaceChildren();
   fill(element, null, children, () => {});

@@ -11,7 +11,9 @@ import { strengthName } from "./strength.js";
  * @property {string | undefined} preset
  * @property {boolean} orbiting
  * @property {Record<string, Chosen[]>} files by role; after a reload, only those that the service has
- * @property {Record<string, string[]>} expired names of files to choose again, by role
+ * @property {Record<string, string[]>} expired names of files that the service has deleted, by role
+ * @property {Record<string, string[]>} [lost] names of files to choose again since a reload, by role
+ * @property {boolean} [again] whether it started from an earlier job
  * @property {any[]} regions
  * @property {Record<string, string>} weights shares of the paintings in a blend, by their names
  * @property {boolean} apart whether each painting is a job
@@ -24,10 +26,11 @@ let kept = null;
 /** @param {Draft} draft */
 export function keepDraft(draft) {
   kept = draft;
-  const files = Object.fromEntries(Object.entries(draft.files).map(([role, all]) => [role, all.filter((file) => file instanceof StoredFile)]));
+  const parts = (/** @type {boolean} */ stored) => Object.entries(draft.files).map(([role, all]) => /** @type {const} */ ([role, all.filter((file) => file instanceof StoredFile === stored)]));
+  const files = Object.fromEntries(parts(true)), lost = Object.fromEntries(parts(false).map(([role, all]) => [role, [...all.map(({ name }) => name), ...(draft.lost?.[role] ?? [])]]));
   const regions = draft.regions.map(({ mask, select, ...region }) => ({ ...region, ...(mask && !(mask.file instanceof StoredFile) ? {} : { select }) }));
   try {
-    sessionStorage.setItem(STORED, JSON.stringify({ ...draft, files, regions }));
+    sessionStorage.setItem(STORED, JSON.stringify({ ...draft, files, lost, regions }));
   } catch {
     // private windows may have no storage
   }
@@ -67,7 +70,7 @@ export async function startFrom(job, { painting = true } = {}) {
   for (const color of ["background", "style_background"]) if (Array.isArray(values[color])) values[color] = values[color].map((/** @type {number} */ part) => Math.round(255 * part));
   const gone = job.status === "expired", nothing = { scene: [], style: [], cameras: [], photos: [] };
   keepDraft({
-    values, preset, orbiting: orbit !== null && orbit !== undefined, regions: regions ?? [], apart: false,
+    values, preset, orbiting: orbit !== null && orbit !== undefined, regions: regions ?? [], apart: false, again: true,
     files: gone ? nothing : inputs, expired: gone ? Object.fromEntries(Object.entries(inputs).map(([role, all]) => [role, all.map(({ name }) => name)])) : {},
     weights: Object.fromEntries(weights ? own.map(({ name }, i) => [name, String(weights[i])]) : []),
   });

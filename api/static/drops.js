@@ -1,10 +1,17 @@
 // @ts-check
-/** Files that are dropped on the page, sorted by what they are. */
+/** Files of a new job: dropped on the page, sorted by their names, and checked by their content as far as the page can. */
 import { h } from "./dom.js";
 import { sceneSuffix } from "./scene_formats.js";
 import { words } from "./words.js";
 
-const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp|heic|heif|hif)$/i, CAMERAS = /\.(json|bin|txt)$/i;
+const say = words.contents;
+/** Starts of images that browsers decode, and the suffixes that promise one. */
+const STARTS = ["\xff\xd8\xff", "\x89PNG", "RIFF", "GIF8", "BM"], DECODED = /\.(png|jpe?g|webp|gif|bmp)$/i;
+/** Bytes above which an image is not decoded for the check. */
+const LARGE = 5e7;
+/** Names of the files of a COLMAP model. */
+const MODEL = /^(cameras|images|points3D|frames|rigs)[^/]*\.(bin|txt)$/i;
+const PICTURE = /\.(png|jpe?g|webp|tiff?|bmp|heic|heif|hif)$/i;
 
 /**
  * Sort dropped files into slots. Up to four images are styles; more are photos.
@@ -16,9 +23,9 @@ export function sorted(files) {
   const pictures = files.filter((file) => PICTURE.test(file.name)), many = pictures.length > 4;
   const [scene, ...others] = files.filter((file) => sceneSuffix(file.name));
   return {
-    scene: scene ? [scene] : [], cameras: files.filter((file) => CAMERAS.test(file.name)),
+    scene: scene ? [scene] : [], cameras: files.filter((file) => namesCameras(file.name)),
     style: many ? [] : pictures, photos: many ? pictures : [],
-    unknown: [...others, ...files.filter(({ name }) => !PICTURE.test(name) && !CAMERAS.test(name) && !sceneSuffix(name))],
+    unknown: [...others, ...files.filter(({ name }) => !PICTURE.test(name) && !namesCameras(name) && !sceneSuffix(name))],
   };
 }
 
@@ -65,4 +72,22 @@ export function listenToDrops(take, signal) {
     hint.remove();
     if (event.dataTransfer) take(await droppedFiles(event.dataTransfer));
   }, { signal });
+}
+
+/** Return whether a file may hold cameras, by its name. @param {string} name */
+export const namesCameras = (name) => /\.json$/i.test(name) || MODEL.test(name);
+
+/** @param {File} file @returns {Promise<string>} "" if nothing is wrong */
+export async function imageProblem(file) {
+  const start = String.fromCharCode(...new Uint8Array(await file.slice(0, 4).arrayBuffer()));
+  if (!STARTS.some((each) => start.startsWith(each))) return DECODED.test(file.name) ? say.notImage(file.name) : "";
+  if (file.size > LARGE) return "";
+  return createImageBitmap(file).then((image) => (image.close(), ""), () => say.brokenImage(file.name));
+}
+
+/** @param {File} file @returns {Promise<string>} "" if nothing is wrong */
+export async function camerasProblem(file) {
+  if (!namesCameras(file.name)) return say.notCameras(file.name);
+  if (MODEL.test(file.name)) return "";
+  return file.text().then(JSON.parse).then(() => "", () => say.notJson(file.name));
 }

@@ -5,6 +5,8 @@ import { fetched, painting } from "./gallery.js";
 import { words } from "./words.js";
 
 const say = words.example;
+/** Name of the example's scene. */
+export const EXAMPLE = "motorcycle.sog";
 
 export class ExamplePart {
   /** @param {() => void} start called when a user wants the example */
@@ -14,13 +16,13 @@ export class ExamplePart {
     this.offers = this.buttons.map((button) => h("div.example", button, h("small", say.credit)));
   }
 
-  /** Return the files of the example. The service builds its scene at the first request. */
+  /** Return the files of the example by role. The service builds its scene at the first request. */
   async files() {
     for (const button of this.buttons) button.textContent = say.preparing;
     try {
-      const parts = ["motorcycle.sog", "cameras.json"].map((name) => fetched(new URL(`./example/${name}`, import.meta.url).href, name));
+      const parts = [EXAMPLE, "cameras.json"].map((name) => fetched(new URL(`./example/${name}`, import.meta.url).href, name));
       const [scene, cameras, style] = await Promise.all([...parts, painting("starry_night")]);
-      return { scene, cameras, style };
+      return { scene: [scene], style: [style], cameras: [cameras] };
     } finally {
       for (const button of this.buttons) button.textContent = say.start;
     }

@@ -25,11 +25,7 @@ export class Gallery {
     this.element = h("details.fold.gallery", { ontoggle: () => this.loadUsed() }, h("summary", say.title), example, this.used, h("p.help", say.bundled), h("div.paintings", bundled));
   }
 
-  /**
-   * @param {string} url
-   * @param {string} title
-   * @param {() => Chosen | Promise<Chosen>} take
-   */
+  /** @param {string} url @param {string} title @param {() => Chosen | Promise<Chosen>} take */
   painting(url, title, take) {
     return h("button.painting", { type: "button", title, "aria-label": say.use(title), onclick: async () => this.choose(await take()) },
       h("img", { src: url, alt: "", loading: "lazy", decoding: "async" }));

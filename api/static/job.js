@@ -74,6 +74,7 @@ export class JobView {
       await this.refresh();
     } catch (error) {
       if (this.leaving.signal.aborted) return;
+      if (error instanceof Problem && error.status === 404) return this.showDeleted();
       const retry = h("button.quiet", { type: "button", onclick: () => this.begin() }, words.page.retry);
       return void put(this.element, h("div.empty", h("h1", words.page.error), h("p", error instanceof Error ? error.message : ""), retry));
     }
@@ -101,10 +102,11 @@ export class JobView {
   }
 
   showDeleted() {
+    const text = this.job ? say.deleted : say.gone;
     this.leaving.abort();
-    document.title = words.page.title(say.deleted);
-    announce(say.deleted);
-    put(this.element, h("div.empty", h("h1", say.deleted), h("a.button.quiet", { href: "#/jobs" }, words.page.jobs)));
+    document.title = words.page.title(text);
+    announce(text);
+    put(this.element, h("div.empty", h("h1", text), h("a.button.quiet", { href: "#/jobs" }, words.page.jobs)));
   }
 
   async refresh() {
@@ -201,7 +203,7 @@ export class JobView {
     put(this.badge, badge(job.status));
     this.planTitle.textContent = UNFINISHED.has(job.status) ? words.plan.decided : words.plan.ran;
     const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
-    this.meta.textContent = [say.made(time(job.created_at)), took && job.attempt === 1 && say.took(took), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
+    this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
     const outcome = job.status === "succeeded" ? outcomeOf(job.result) : "";
     this.outcome.hidden = !outcome;
     put(this.outcome, h("li", outcome));

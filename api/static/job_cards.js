@@ -8,10 +8,7 @@ import { size, words } from "./words.js";
 
 const say = words.job;
 
-/**
- * @param {string} id id of the job
- * @param {number} bytes size of the PLY
- */
+/** @param {string} id id of the job @param {number} bytes size of the PLY */
 export function downloadCard(id, bytes) {
   const link = h("a.button.primary", { download: "" }, icon("down"), h("span", say.download)), note = h("p.help");
   const chooser = h("select", { "aria-label": say.format, onchange: () => choose() },
@@ -25,10 +22,7 @@ export function downloadCard(id, bytes) {
   return [h("h2", say.result), h("div.row.download", link, chooser), note];
 }
 
-/**
- * @param {string} id id of the job
- * @param {any[]} list its artifacts
- */
+/** @param {string} id id of the job @param {any[]} list its artifacts */
 export function filesCard(id, list) {
   const report = list.some(({ name }) => name === "report.html");
   return [h("h2", say.files), report ? h("p", h("a.button.quiet", { href: artifactPath(id, "report.html"), target: "_blank", rel: "noopener" }, say.openReport)) : null,

@@ -21,10 +21,7 @@ export class JobName {
     this.control = h("span.renaming");
   }
 
-  /**
-   * @param {string} name
-   * @param {string} title the name, or a text for none
-   */
+  /** @param {string} name @param {string} title the name, or a text for none */
   show(name, title) {
     this.name = name;
     this.heading.textContent = title;

@@ -100,10 +100,13 @@ export class JobsView {
   deleter(job, name) {
     return deleteButton(words.job.remove, async () => {
       await ask("DELETE", `v1/jobs/${job.id}`);
+      const at = [...this.list.children].findIndex((each) => each.contains(document.activeElement));
       this.jobs = this.jobs.filter((each) => each.id !== job.id);
       this.chosen.delete(job.id);
       announce(say.removed);
       this.show();
+      const links = [...this.list.querySelectorAll("li > a")], next = links[Math.min(at, links.length - 1)] ?? this.element.querySelector("a");
+      /** @type {HTMLElement | null} */ (next)?.focus();
     }, (error) => {
       this.problem.hidden = false;
       this.problem.textContent = error instanceof Error ? error.message : String(error);

@@ -1,5 +1,6 @@
 // @ts-check
 /** Names of jobs, and labels that tell jobs apart. */
+import { paintingsOf } from "./regions.js";
 import { sceneSuffix } from "./scene_formats.js";
 import { time, words } from "./words.js";
 
@@ -18,8 +19,12 @@ export function defaultName(scene, styles) {
   return styles.length ? `${plain} · ${styles.map(stem).join(" + ")}` : plain;
 }
 
-/** @param {any} job @returns {string} names of the job's style images */
-export const stylesOf = (job) => job.inputs.filter((/** @type {any} */ input) => input.role === "style").map((/** @type {any} */ input) => stem(input.name)).join(" + ");
+/** Return the names of a job's style images, and those of its regions: "night; sky: wave". @param {any} job @returns {string} */
+export function stylesOf(job) {
+  const painted = (job.parameters?.regions ?? []).filter((/** @type {any} */ region) => region.style), taken = new Set(painted.flatMap(paintingsOf));
+  const own = job.inputs.filter((/** @type {any} */ { role, name }) => role === "style" && !taken.has(name)).map((/** @type {any} */ { name }) => stem(name));
+  return [own.join(" + "), ...painted.map((/** @type {any} */ region) => `${region.name}: ${paintingsOf(region).map(stem).join(" + ")}`)].filter(Boolean).join("; ");
+}
 
 /** @param {any} job @returns {string} */
 export const nameOf = (job) => job.name || words.job.unnamed;

@@ -84,13 +84,7 @@ export function problemOf(kinds, value) {
   return "";
 }
 
-/**
- * Return the value of a parameter of a job as text.
- *
- * @param {string} name
- * @param {any} value
- * @returns {string}
- */
+/** Return the value of a parameter of a job as text. @param {string} name @param {any} value @returns {string} */
 export function valueText(name, value) {
   if (name === "content_weight") return strengthName(value);
   if (name === "within") return seconds(value);
@@ -113,11 +107,7 @@ export function plainly(message) {
   return message.replace(/^Value error, /, "");
 }
 
-/**
- * @param {HTMLElement} input
- * @param {HTMLElement} error
- * @param {string} text
- */
+/** @param {HTMLElement} input @param {HTMLElement} error @param {string} text */
 export function showWrong(input, error, text) {
   error.hidden = !text;
   error.textContent = text;

@@ -164,6 +164,13 @@ export class OptionsPart {
     this.restore({ within: this.budget }, undefined);
   }
 
+  /** Return to the values of a new form. */
+  reset() {
+    for (const control of this.controls.values()) control.set(undefined);
+    this.choose(this.schema?.preset.default);
+    this.useBudget();
+  }
+
   /** Fill in values. @param {Record<string, any>} values by name @param {string | undefined} preset */
   restore(values, preset) {
     for (const [name, value] of Object.entries(values)) {

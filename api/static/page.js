@@ -3,7 +3,7 @@
 import { ask, get, whenKeyIsNeeded } from "./api.js";
 import { CompareView } from "./compare.js";
 import { announce, h, icon, put } from "./dom.js";
-import { forgetDraft } from "./draft.js";
+import { forgetDraft, keptDraft } from "./draft.js";
 import { JobView } from "./job.js";
 import { JobsView } from "./jobs.js";
 import { SignInView } from "./signin.js";
@@ -14,7 +14,7 @@ import { words } from "./words.js";
 
 const say = words.page;
 const main = h("main", { id: "main", tabIndex: -1 });
-const links = [["#/", say.new], ["#/jobs", say.jobs]].map(([href, text]) => h("a", { href }, text));
+const links = [["#/", say.new], ["#/jobs", say.jobs]].map(([href, text]) => h("a", { href, onclick: () => href === "#/" && renew() }, text));
 const out = h("button.tool.wide", { type: "button", hidden: true, onclick: signOut }, icon("out"), h("span", say.signOut));
 /** @type {View | null} */
 let view = null;
@@ -51,6 +51,15 @@ function show(next) {
 function enter() {
   show(viewOf());
   scrollTo(0, 0);
+}
+
+/** Forget what an earlier job has filled into the form: "New" is new. */
+function renew() {
+  if (!keptDraft()?.again) return;
+  view?.end();
+  view = null;
+  forgetDraft();
+  if (location.hash === "#/") enter(); // else the address changes
 }
 
 async function signOut() {

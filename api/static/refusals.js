@@ -21,9 +21,9 @@ export class Refusals {
     this.element = h("p.wrong.block", { hidden: true, role: "alert" });
   }
 
-  /** Remove all marks. @param {string} broken why the scene cannot be used; "" if it can */
-  clear(broken) {
-    for (const [role, slot] of Object.entries(this.slots)) slot.wrong(role === "scene" ? broken : "");
+  /** Remove all marks but those of files that cannot be used. */
+  clear() {
+    for (const slot of Object.values(this.slots)) slot.wrong("");
     for (const control of this.options.controls.values()) control.wrong("");
     this.regions.clearWrong();
     this.element.hidden = true;
@@ -46,7 +46,7 @@ export class Refusals {
   askAgain(role) {
     const slot = this.slots[role ?? ""];
     slot?.askAgain(slot.files.filter((file) => file instanceof StoredFile).map(({ name }) => name));
-    slot?.changed();
+    slot?.dropStored();
   }
 
   /**

@@ -24,11 +24,7 @@ export const titles = sceneFormats.filter(({ suffix }) => suffix.lastIndexOf("."
 /** Value of the attribute `accept` of a file input: the last part of each suffix. */
 export const accepted = [...new Set(sceneFormats.map(({ suffix }) => suffix.slice(suffix.lastIndexOf("."))))].join();
 
-/**
- * Return the suffix of a scene file, by its name; "" for other files.
- *
- * @param {string} name
- */
+/** Return the suffix of a scene file, by its name; "" for other files. @param {string} name */
 export function sceneSuffix(name) {
   const fitting = sceneFormats.map(({ suffix }) => suffix).filter((suffix) => name.toLowerCase().endsWith(suffix));
   return fitting.reduce((longest, suffix) => (suffix.length > longest.length ? suffix : longest), "");

@@ -17,8 +17,6 @@ export class ScenePart {
     this.stage = stage;
     this.loaded = loaded;
     this.reload = reload;
-    /** Why the scene cannot be used, as far as the page knows; "" if it can. */
-    this.broken = "";
     /** @type {SplatScene | null} */
     this.opened = null;
   }
@@ -51,8 +49,7 @@ export class ScenePart {
       viewer.draw();
       const { message, cut } = /** @type {import("./viewer/splat_scene.js").SceneFailure} */ (error);
       this.stage.message(message);
-      this.broken = cut ? message : "";
-      this.slot.wrong(this.broken);
+      if (cut || message === words.scene.notScene) this.slot.fail(message);
     }
   }
 

@@ -27,6 +27,8 @@ export class SelectPanel {
     /** Points of the current stroke or lasso, in CSS pixels of the canvas. @type {number[]} */
     this.drawn = [];
     this.change = 0;
+    /** Number of selected Gaussians. */
+    this.total = 0;
     this.erasing = false;
     /** Points of a stroke to send at the next frame, and its request. @type {number[]} */
     this.waiting = [];
@@ -106,9 +108,15 @@ export class SelectPanel {
     this.element.hidden = false;
     this.stage.setHelp(say.help);
     this.choose("brush");
-    this.element.scrollIntoView({ block: "nearest" });
-    /** @type {HTMLInputElement} */ (this.parts.toolRadios.querySelector("input:checked")).focus();
+    this.stage.element.scrollIntoView({ block: matchMedia("(max-width: 1000px)").matches ? "start" : "nearest" });
+    /** @type {HTMLInputElement} */ (this.parts.toolRadios.querySelector("input:checked")).focus({ preventScroll: true });
     return true;
+  }
+
+  /** Use the selection if it has Gaussians, else leave it. */
+  async settle() {
+    if (this.total) await this.done();
+    else this.close(null);
   }
 
   async done() {
@@ -122,6 +130,7 @@ export class SelectPanel {
   close(mask) {
     if (!this.selection) return;
     const { finish } = this;
+    this.total = 0;
     this.choose("move");
     this.selection.end();
     this.selection = null;
@@ -137,7 +146,7 @@ export class SelectPanel {
     const input = this.parts.toolRadios.querySelector(`[value=${tool}]`);
     if (input) input.checked = true;
     const shaped = tool === "box" || tool === "sphere", drawing = tool === "brush" || tool === "lasso";
-    this.parts.toolHelp.textContent = say.toolHelp[tool];
+    this.parts.toolHelp.textContent = tool === "brush" && matchMedia("(pointer: coarse)").matches ? say.brushTouch : say.toolHelp[tool];
     this.surface.hidden = !(drawing || tool === "similar");
     this.parts.radius.element.hidden = tool !== "brush";
     this.parts.through.element.hidden = !drawing;
@@ -151,6 +160,7 @@ export class SelectPanel {
   /** @param {Changed} changed */
   changed({ total, past, future }) {
     if (!this.selection) return;
+    this.total = total;
     this.counted.textContent = say.selected(total, this.selection.count);
     this.parts.undo.disabled = !past;
     this.parts.redo.disabled = !future;
@@ -286,7 +296,7 @@ export class SelectPanel {
     /** @type {Record<string, () => void>} */
     const actions = controlled
       ? { y: () => this.ask("redo"), z: () => this.ask(event.shiftKey ? "redo" : "undo"), i: () => this.ask("invert") }
-      : { v: () => this.choose("move"), b: () => this.choose("brush"), l: () => this.choose("lasso"), r: () => this.choose("box"), "[": () => (input.value -= 4), "]": () => (input.value = Number(input.value) + 4) };
+      : { v: () => this.choose("move"), b: () => this.choose("brush"), l: () => this.choose("lasso"), r: () => this.choose("box"), escape: () => this.close(null), "[": () => (input.value -= 4), "]": () => (input.value = Number(input.value) + 4) };
     if (!actions[key]) return;
     event.preventDefault();
     actions[key]();

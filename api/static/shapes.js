@@ -15,11 +15,7 @@ const STEPS = 48;
 /** @type {Record<string, [number, number]>} */
 const KEYS = { ArrowLeft: [-8, 0], ArrowRight: [8, 0], ArrowUp: [0, -8], ArrowDown: [0, 8] };
 
-/**
- * Return the outline of a shape as pairs of points [n * 2 * 3].
- *
- * @param {Shape} shape
- */
+/** Return the outline of a shape as pairs of points [n * 2 * 3]. @param {Shape} shape */
 export function outline({ kind, center, sizes }) {
   /** @type {number[]} */
   const points = [];
@@ -87,12 +83,7 @@ export class ShapeHandles {
     });
   }
 
-  /**
-   * Return a handle that moves one side of a box, or resizes a sphere.
-   *
-   * @param {number} axis
-   * @param {number} sign
-   */
+  /** Return a handle that moves one side of a box, or resizes a sphere. @param {number} axis @param {number} sign */
   sizing(axis, sign) {
     const direction = times(AXES[axis], sign);
     return this.handle(say.resize(["X", "Y", "Z"][axis], sign), () => sum(this.at, times(direction, this.sizes[axis])), (dx, dy, unit) => {

@@ -9,10 +9,7 @@ import { words } from "./words.js";
 const say = words.signIn;
 
 export class SignInView {
-  /**
-   * @param {() => void} done
-   * @param {string} why why a key is asked for
-   */
+  /** @param {() => void} done @param {string} why why a key is asked for */
   constructor(done, why) {
     this.title = say.title;
     const id = newId();

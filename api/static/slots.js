@@ -14,12 +14,7 @@ const HEIC = /\.(heic|heif|hif)$/i;
 /** Number of files that a slot lists. */
 const SHOWN = 12;
 
-/**
- * Add files to others; a file replaces one of the same name.
- *
- * @param {Chosen[]} old
- * @param {Chosen[]} more
- */
+/** Add files to others; a file replaces one of the same name. @param {Chosen[]} old @param {Chosen[]} more */
 export function withoutDoubles(old, more) {
   const names = new Set(more.map(({ name }) => name));
   return [...old.filter(({ name }) => !names.has(name)), ...more];
@@ -41,15 +36,21 @@ export class Slot {
   /**
    * @param {string} name
    * @param {string} hint
-   * @param {{accept?: string, multiple?: boolean, pictures?: boolean, add?: (old: Chosen[], more: Chosen[]) => Chosen[], changed: () => void}} how
-   *   `add` returns the files after some were chosen
+   * @param {{accept?: string, multiple?: boolean, pictures?: boolean, add?: (old: Chosen[], more: Chosen[]) => Chosen[], problem?: (file: File) => Promise<string>, changed: () => void}} how
+   *   `add` returns the files after some were chosen, `problem` why a file cannot be used
    */
-  constructor(name, hint, { accept = "", multiple = false, pictures = false, add = withoutDoubles, changed }) {
+  constructor(name, hint, { accept = "", multiple = false, pictures = false, add = withoutDoubles, problem = async () => "", changed }) {
     this.hint = hint;
     this.multiple = multiple;
     this.pictures = pictures;
+    this.problem = problem;
     this.changed = changed;
     this.combined = add;
+    /** Why the files cannot be used, as far as the page knows; "" if they can. */
+    this.broken = "";
+    /** Names of files to choose again, and the text that asks for them. @type {string[]} */
+    this.missing = [];
+    this.ask = say.expired;
     /** @type {Chosen[]} */
     this.files = [];
     /** @type {string[]} */
@@ -71,18 +72,41 @@ export class Slot {
     if (!files.length) return;
     const unread = installed.heif ? [] : files.filter(({ name }) => HEIC.test(name)), read = files.filter((file) => !unread.includes(file));
     if (read.length) this.files = this.multiple ? this.combined(this.files, read) : [read[0]];
+    this.missing = this.multiple ? this.missing.filter((name) => !files.some((file) => file.name === name)) : [];
     this.input.value = "";
-    this.show();
-    this.changed();
+    this.update();
     if (unread.length) this.wrong(say.noHeic(unread[0].name));
   }
 
   /** @param {Chosen} file */
   remove(file) {
     this.files = this.files.filter((each) => each !== file);
+    this.update();
+    this.input.focus();
+  }
+
+  /** Follow a change of the files. */
+  update() {
+    this.broken = "";
     this.show();
     this.changed();
-    this.input.focus();
+    this.check();
+  }
+
+  /** Say which own file cannot be used. */
+  async check() {
+    const { files } = this;
+    for (const file of files) {
+      const wrong = file.size ? file instanceof File && (await this.problem(file)) : words.contents.empty(file.name);
+      if (files !== this.files) return;
+      if (wrong) return this.fail(wrong);
+    }
+  }
+
+  /** @param {string} text why the files cannot be used */
+  fail(text) {
+    this.broken ||= text;
+    this.wrong("");
   }
 
   show() {
@@ -93,7 +117,8 @@ export class Slot {
     this.element.classList.toggle("filled", files.length > 0);
     this.action.textContent = files.length && !this.multiple ? say.change : say.choose;
     const total = files.reduce((sum, file) => sum + file.size, 0);
-    this.say(!files.length ? this.hint : files.length === 1 ? size(total) : `${say.nFiles(files.length)} · ${size(total)}`);
+    const told = files.length > 1 ? `${say.nFiles(files.length)} · ${size(total)}` : files.length ? size(total) : this.missing.length ? "" : this.hint;
+    this.say([told, this.missing.length && this.ask(this.missing)].filter(Boolean).join(" · "));
     put(this.thumbs, files.slice(0, SHOWN).map((file) => this.thumb(file)), files.length > SHOWN ? h("span.quiet", say.moreFiles(files.length - SHOWN)) : null,
       files.length > 1 ? h("button.quiet.small", { type: "button", onclick: () => this.clear() }, say.removeAll) : null);
   }
@@ -104,8 +129,7 @@ export class Slot {
       const made = await editPainting(await contentOf(file), file.name);
       if (!made || !this.files.includes(file)) return;
       this.files = this.files.map((each) => (each === file ? made : each));
-      this.show();
-      this.changed();
+      this.update();
     } catch (error) {
       this.wrong(error instanceof Error ? error.message : String(error));
     }
@@ -120,15 +144,19 @@ export class Slot {
 
   clear() {
     this.files = [];
-    this.show();
-    this.changed();
+    this.update();
     this.input.focus();
   }
 
-  /** Ask for files that have expired on the service again. @param {string[]} names */
-  askAgain(names) {
-    this.hint = say.expired(names);
+  /** Drop the files of an earlier job. */
+  dropStored() {
     this.files = this.files.filter((file) => !(file instanceof StoredFile));
+    this.update();
+  }
+
+  /** Ask for files again. @param {string[]} names @param {(names: string[]) => string} [ask] text that asks for them */
+  askAgain(names, ask = say.expired) {
+    [this.missing, this.ask] = [names, ask];
     this.show();
   }
 
@@ -149,7 +177,7 @@ export class Slot {
 
   /** @param {string} text */
   wrong(text) {
-    showWrong(this.input, this.error, text);
+    showWrong(this.input, this.error, text || this.broken);
   }
 
   end() {

@@ -147,11 +147,7 @@ export class Stage {
     if (this.note.textContent !== text) this.note.textContent = text;
   }
 
-  /**
-   * @param {Side} left
-   * @param {Side} [right]
-   * @param {[string, string]} [names]
-   */
+  /** @param {Side} left @param {Side} [right] @param {[string, string]} [names] */
   show(left, right, names) {
     if (!this.viewer) return;
     this.names = right && names ? names : null;
@@ -164,11 +160,7 @@ export class Stage {
     else this.viewer.wipe(0);
   }
 
-  /**
-   * Show the original on both sides while a key is held.
-   *
-   * @param {boolean} held
-   */
+  /** Show the original on both sides while a key is held. @param {boolean} held */
   hold(held) {
     const { viewer, original } = this;
     if (!viewer?.sides || !original || held === !!this.covered) return;

@@ -6,10 +6,7 @@ const states = /** @type {any} */ ("{{job_states}}");
 
 /** Text to display for each status. */
 export const titles = states.titles;
-/**
- * Return the fraction of its steps that a job has made; undefined unless it makes steps.
- * @param {any} job
- */
+/** Return the fraction of its steps that a job has made; undefined unless it makes steps. @param {any} job */
 export const stepFraction = ({ status, progress }) => (states.stepping.includes(status) && progress?.total ? progress.fraction : undefined);
 export const UNFINISHED = new Set(states.unfinished), WORKING = new Set(states.working);
 

@@ -14,6 +14,8 @@ export class Submission {
   constructor(leaving) {
     this.leaving = leaving;
     this.stopped = false;
+    /** Whether the service refuses a job whose up direction or cameras are doubtful. */
+    this.sure = true;
     this.card = new SendingCard(() => this.stop());
     /** Idempotency keys of requests for jobs, by their bodies. @type {Map<string, string>} */
     this.keys = new Map();
@@ -86,7 +88,7 @@ export class Submission {
       const text = JSON.stringify(body), key = this.keys.get(text) ?? randomKey();
       this.keys.set(text, key); // a second attempt creates only those jobs that are missing
       try {
-        jobs.push(await (await ask("POST", "v1/jobs?sure_up=true", { json: body, headers: { "Idempotency-Key": key } })).json());
+        jobs.push(await (await ask("POST", `v1/jobs?sure_up=${this.sure}`, { json: body, headers: { "Idempotency-Key": key } })).json());
       } catch (error) {
         if (jobs.length && error instanceof Error) error.message += ` ${say.createdSome(jobs.length, bodies.length)}`;
         throw error;

@@ -4,8 +4,9 @@ import { Problem } from "./api.js";
 import { announce, h, icon, put } from "./dom.js";
 import { CropPanel } from "./crop_panel.js";
 import { forgetDraft, keepDraft, keptDraft } from "./draft.js";
-import { listenToDrops, sorted } from "./drops.js";
-import { ExamplePart } from "./example_part.js";
+import { camerasProblem, imageProblem, listenToDrops, sorted } from "./drops.js";
+import { EXAMPLE, ExamplePart } from "./example_part.js";
+import { button } from "./fields.js";
 import { defaultName } from "./names.js";
 import { optionControl } from "./options.js";
 import { OptionsPart } from "./options_part.js";
@@ -35,9 +36,9 @@ export class SubmitView {
     /** @type {Record<"scene" | "style" | "cameras" | "photos", Slot>} */
     this.slots = {
       scene: new Slot(say.scene, say.sceneHint, { accept: accepted, changed: () => this.sceneChanged() }),
-      style: new Slot(say.style, say.styleHint, { accept: "image/*", multiple: true, pictures: true, changed: () => this.styleChanged() }),
-      cameras: new Slot(say.cameras, say.camerasHint, { accept: ".json,.bin,.txt", multiple: true, add: oneModel, changed: () => this.views.filesChanged() }),
-      photos: new Slot(say.photos, say.photosHint, { accept: "image/*", multiple: true, changed: () => this.refresh() }),
+      style: new Slot(say.style, say.styleHint, { accept: "image/*", multiple: true, pictures: true, problem: imageProblem, changed: () => this.styleChanged() }),
+      cameras: new Slot(say.cameras, say.camerasHint, { accept: ".json,.bin,.txt", multiple: true, add: oneModel, problem: camerasProblem, changed: () => this.views.filesChanged() }),
+      photos: new Slot(say.photos, say.photosHint, { accept: "image/*", multiple: true, problem: imageProblem, changed: () => this.refresh() }),
     };
     this.stage = new Stage();
     this.draft = keptDraft();
@@ -49,6 +50,8 @@ export class SubmitView {
     this.busy = false;
     /** Scene that the masks of the regions belong to. @type {Chosen | undefined} */
     this.shown = undefined;
+    /** Name of the scene of the earlier job that the form started from. */
+    this.earlier = this.draft?.again ? this.draft.files.scene[0]?.name : undefined;
     this.name = optionControl("name", { type: "string" }, { title: say.name, hint: false });
     this.options = new OptionsPart(this.name);
     this.selecting = new SelectPanel(this.stage);
@@ -95,7 +98,8 @@ export class SubmitView {
     regions.earlier = draft.files.mask ?? [];
     regions.restore(draft.regions);
     this.regionFold.open = draft.regions.length > 0;
-    for (const [role, names] of Object.entries(draft.expired)) if (names.length) this.slots[/** @type {keyof typeof this.slots} */ (role)]?.askAgain(names);
+    for (const [all, ask] of /** @type {const} */ ([[draft.expired, say.expired], [draft.lost ?? {}, say.lost]]))
+      for (const [role, names] of Object.entries(all)) if (names.length) this.slots[/** @type {keyof typeof this.slots} */ (role)]?.askAgain(names, ask);
     this.styleChanged();
     const { shown } = this;
     regions.restoreMasks(() => this.shown === shown).catch(() => {}); // a region without its mask still names the file
@@ -125,9 +129,12 @@ export class SubmitView {
 
   saveDraft() {
     const { options, regions, views } = this;
+    if (this.created || this.leaving.signal.aborted) return; // what is still loading belongs to the job
+    /** @template T @param {(slot: Slot) => T} of @returns {Record<string, T>} */
+    const ofSlots = (of) => Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, of(slot)]));
     keepDraft({
       ...(options.schema || !this.draft ? { values: options.values(), preset: options.preset, orbiting: views.orbiting } : this.draft), // until the options have loaded
-      files: { ...Object.fromEntries(Object.entries(this.slots).map(([role, slot]) => [role, slot.files])), mask: regions.earlier }, expired: {}, regions: regions.kept(), ...this.paintings.kept(),
+      files: { ...ofSlots((slot) => slot.files), mask: regions.earlier }, expired: {}, lost: ofSlots((slot) => slot.missing), again: this.earlier !== undefined, regions: regions.kept(), ...this.paintings.kept(),
     });
   }
 
@@ -142,27 +149,36 @@ export class SubmitView {
 
   sceneChanged() {
     const [file] = this.slots.scene.files;
-    this.scene.broken = "";
     this.refresh();
     this.selecting.close(null);
     this.crop.close();
     if (file !== this.shown) this.regions.dropMasks();
     this.shown = file;
+    if (file && this.earlier && file.name !== this.earlier) this.leaveEarlier();
     for (const offer of [this.invite, ...this.example.offers]) offer.hidden = !!file;
     this.crop.button.hidden = !file;
     this.scene.show();
     if (file) this.views.show();
   }
 
-  /** Fill in the example scene, with its painting unless one is chosen, and start a job. */
+  /** Drop what belongs to the scene of an earlier job, after another one was chosen: of the example, everything. */
+  leaveEarlier() {
+    const { cameras, photos, style } = this.slots, example = this.earlier === EXAMPLE;
+    this.earlier = undefined;
+    for (const slot of [cameras, photos, ...(example ? [style] : [])]) slot.dropStored();
+    if (example) this.options.reset();
+  }
+
+  /** Start a job of the example, in its painting unless one is chosen. Nothing of it remains in the form. */
   async startExample() {
-    const { cameras, scene, style } = this.slots, files = await this.example.files().catch((error) => void this.refuse(error));
+    const { files: chosen } = this.slots.style, files = await this.example.files().catch((error) => void this.refuse(error));
     if (!files || this.busy || this.leaving.signal.aborted) return;
-    if (!style.files.length) style.add([files.style]);
-    cameras.add([files.cameras]);
-    scene.add([files.scene]);
-    this.options.restore({ resolution: 480 }, "preview");
-    await this.act(false);
+    this.clearWrong();
+    this.setBusy("starting");
+    await this.request(false, async () => {
+      const { scene: [scene], ...sent } = await this.submission.send({ ...files, ...(chosen.length ? { style: chosen } : {}) });
+      return [{ ...sent, scene, parameters: { preset: "preview", resolution: 480, within: this.options.budget || undefined } }];
+    });
   }
 
   styleChanged() {
@@ -196,7 +212,7 @@ export class SubmitView {
   }
 
   clearWrong() {
-    this.refusals.clear(this.scene.broken);
+    this.refusals.clear();
     this.paintings.clearWrong();
   }
 
@@ -211,9 +227,16 @@ export class SubmitView {
     this.paintings.markInvalid();
   }
 
-  /** Plan the job, or start it, which ends a plan that is being made. @param {boolean} dry whether to plan only */
-  async act(dry) {
+  /**
+   * Plan the job, or start it, which ends a plan that is being made. An open selection is used.
+   *
+   * @param {boolean} dry whether to plan only
+   * @param {boolean} [sure] whether doubtful cameras are refused
+   */
+  async act(dry, sure = true) {
     if (this.busy === "starting" || (dry && this.busy)) return;
+    await this.selecting.settle();
+    this.submission.sure = sure;
     this.clearWrong();
     this.markWrong();
     if (this.refusals.reveal()) return;
@@ -224,15 +247,18 @@ export class SubmitView {
     else await this.request(dry);
   }
 
-  /** @param {boolean} dry whether to plan first; the job is started nevertheless if the user wants that meanwhile */
-  async request(dry) {
+  /**
+   * @param {boolean} dry whether to plan first; the job is started nevertheless if the user wants that meanwhile
+   * @param {() => Promise<any[]>} [bodies] sends the files, and returns the bodies of the jobs
+   */
+  async request(dry, bodies = () => this.bodies()) {
     this.submission.restart();
     try {
       if (dry) {
-        const [body] = await this.bodies();
+        const [body] = await bodies();
         this.showPlan(body, await this.submission.plan(body));
       }
-      if (this.busy === "starting") this.enter(await this.submission.create(await this.bodies()));
+      if (this.busy === "starting") this.enter(await this.submission.create(await bodies()));
     } catch (error) {
       if (!this.leaving.signal.aborted && !this.submission.stopped) this.refuse(error);
     } finally {
@@ -262,7 +288,7 @@ export class SubmitView {
   showPlan(body, plan) {
     if (!plan || this.busy === "starting") return;
     const { jobs } = this.paintings;
-    if (plan.up) this.views.showUp(plan.up.direction);
+    if (plan.up) this.views.showPlanned(plan.up.direction, plan.views);
     this.options.showTimes(body, plan);
     if (plan.up?.sure === false) return this.askUp(plan.up.candidates, true);
     put(this.result, costCard(plan, this.options.controls.has("within") ? () => (this.options.useBudget(), this.act(true)) : null), jobs > 1 ? h("p.help", say.eachTakes(jobs)) : null);
@@ -272,6 +298,14 @@ export class SubmitView {
   /** Ask which way is up, and then continue. @param {string[]} candidates @param {boolean} dry whether to plan only */
   askUp(candidates, dry) {
     put(this.result, upQuestion(this.stage, candidates, (up) => (this.views.standUp(up), this.act(dry))));
+    this.result.scrollIntoView({ block: "nearest" });
+  }
+
+  /** Ask whether to start although the cameras hardly show the scene. @param {string} why */
+  askCameras(why) {
+    this.slots.cameras.wrong(why);
+    put(this.result, h("section.card", { role: "alert" }, h("h2", say.foreign), h("p", why),
+      h("div.row", button(say.around, () => this.views.around.input.click(), "primary"), button(say.anyway, () => this.act(false, false)))));
     this.result.scrollIntoView({ block: "nearest" });
   }
 
@@ -287,12 +321,13 @@ export class SubmitView {
   /** @param {unknown} error */
   refuse(error) {
     if (error instanceof Problem && error.code === "unsure-up") return this.askUp(error.body.candidates, false);
+    if (error instanceof Problem && error.code === "unsure-cameras") return this.askCameras(error.message);
     if (error instanceof Problem && error.code === "unknown-upload") this.submission.card.uploads.clear();
     this.refusals.show(error);
   }
 
   end() {
-    if (!this.created) this.saveDraft();
+    this.saveDraft();
     this.leaving.abort();
     this.options.forgetTimes();
     for (const part of [this.selecting, this.submission, ...Object.values(this.slots), this.stage, this.scene]) part.end();

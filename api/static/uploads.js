@@ -26,10 +26,7 @@ function kept() {
   }
 }
 
-/**
- * @param {string} print
- * @param {Kept | null} upload null to forget it
- */
+/** @param {string} print @param {Kept | null} upload null to forget it */
 function keep(print, upload) {
   const all = kept();
   delete all[print];
@@ -70,10 +67,7 @@ export async function fingerprint(file) {
 }
 
 export class Upload {
-  /**
-   * @param {File} file
-   * @param {() => void} told called after each change of the state
-   */
+  /** @param {File} file @param {() => void} told called after each change of the state */
   constructor(file, told) {
     this.file = file;
     this.told = told;
@@ -116,11 +110,7 @@ export class Upload {
     this.goOn?.();
   }
 
-  /**
-   * Send the missing parts.
-   *
-   * @returns {Promise<string>} the upload's id
-   */
+  /** Send the missing parts. @returns {Promise<string>} the upload's id */
   async run() {
     this.print = await fingerprint(this.file);
     const before = kept()[this.print];

@@ -19,6 +19,7 @@ export class VideoCard {
     const cameras = job.inputs.some((/** @type {any} */ input) => input.role === "cameras");
     this.path = h("select", { "aria-label": say.path }, ["orbit", "cameras"].map((name) => h("option", { value: name, selected: cameras === (name === "cameras") }, say.paths[name])));
     this.seconds = h("select", { "aria-label": say.length }, [4, 8, 15, 30].map((n) => h("option", { value: n, selected: n === 8 }, say.seconds(n))));
+    this.size = h("select", { "aria-label": say.size }, ["", 640, 1280, 1920].map((n) => h("option", { value: n }, say.pixels(n))));
     this.compare = h("input", { type: "checkbox" });
     this.button = h("button.quiet", { type: "submit" }, say.make);
     this.text = h("p.help", { role: "status" });
@@ -26,7 +27,7 @@ export class VideoCard {
     this.failure = h("p.failure", { role: "alert", hidden: true });
     this.player = h("div", { hidden: true });
     const form = h("form", { hidden: !installed.video, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.make()) },
-      h("div.row", this.path, this.seconds, h("label.check", this.compare, h("span", say.compare)), this.button));
+      h("div.row", this.path, this.seconds, this.size, h("label.check", this.compare, h("span", say.compare)), this.button));
     this.element = h("section.card.video", h("h2", say.title), this.player, form, this.text, this.bar, this.failure);
   }
 
@@ -46,7 +47,7 @@ export class VideoCard {
     this.button.disabled = true;
     this.failure.hidden = true;
     this.tell(say.starting);
-    const json = { path: this.path.value, seconds: Number(this.seconds.value), compare: this.compare.checked };
+    const json = { path: this.path.value, seconds: Number(this.seconds.value), resolution: Number(this.size.value) || null, compare: this.compare.checked };
     try {
       const answer = await ask("POST", `v1/jobs/${this.job.id}/video`, { json, headers: { Accept: "text/event-stream" }, signal: this.signal });
       for await (const { event, data } of eventsOf(answer)) {

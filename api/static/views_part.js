@@ -11,12 +11,7 @@ import { words } from "./words.js";
 
 const say = words.submit;
 
-/**
- * @param {string} group
- * @param {string} name
- * @param {boolean} checked
- * @param {() => void} changed
- */
+/** @param {string} group @param {string} name @param {boolean} checked @param {() => void} changed */
 export function choice(group, name, checked, changed) {
   const input = h("input", { type: "radio", name: group, checked, onchange: changed });
   return { input, element: h("label", input, h("span", name)) };
@@ -40,6 +35,8 @@ export class ViewsPart {
     this.chosen = false;
     /** Number of the last request to show the cameras. */
     this.turn = 0;
+    /** Number of views that the service has chosen for an orbit; 0 until it has. */
+    this.planned = 0;
     this.around = choice("views", say.around, false, () => this.choose());
     this.fromFiles = choice("views", say.fromFiles, true, () => this.choose());
     this.automatic = h("p.help", say.noCameras);
@@ -66,6 +63,12 @@ export class ViewsPart {
     this.showUp(up, front);
   }
 
+  /** Show the orbit that the service has planned. @param {string} up @param {number} views */
+  showPlanned(up, views) {
+    this.planned = views;
+    this.showUp(up);
+  }
+
   /** Turn the scene and its orbit to an up direction. @param {string} up @param {number[]} [front] see `Viewer.frame` */
   showUp(up, front) {
     this.stage.standUp(directionOf(up) ?? UPS["-y"], front);
@@ -85,6 +88,7 @@ export class ViewsPart {
 
   /** Show what belongs to the choice of views. Without it, a scene without cameras is orbited. */
   show() {
+    this.planned = 0;
     const { scene, cameras, photos } = this.slots, { ring } = this.options, orbits = !this.chosen && scene.files.length > 0 && !cameras.files.length;
     if (!this.chosen) (orbits ? this.around : this.fromFiles).input.checked = true;
     this.options.controls.get("views")?.element.toggleAttribute("hidden", this.orbiting); // an orbit has a number of views of its own
@@ -116,10 +120,11 @@ export class ViewsPart {
   ringNow() {
     const { controls } = this.options, middle = this.crop.remaining();
     const count = controls.get("orbit")?.value(), number = typeof count === "number" && count >= 1 ? Math.min(count, 400) : 0;
-    const told = number ? words.cameras.ring(number) : words.cameras.ringAuto;
+    const shown = number || this.planned || 24;
+    const told = number || this.planned ? words.cameras.ring(shown) : words.cameras.ringAuto(shown);
     if (!middle) return [[], told];
     const up = UPS[controls.get("up")?.value()] ?? this.stage.up;
-    return [ringCameras(middle, { count: number || 24, up, elevation: controls.get("elevation")?.value() ?? 10, radius: controls.get("radius")?.value() }), told];
+    return [ringCameras(middle, { count: shown, up, elevation: controls.get("elevation")?.value() ?? 10, radius: controls.get("radius")?.value() }), told];
   }
 
   /** Choose an orbit as in a draft. */

@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 #: Task of the inspecting process: validate a job's inputs, or plan the job as well.
 Work = Literal["validate", "plan"]
 #: Version of the validation; raising it invalidates stored findings.
-_VERSION = "6"
+_VERSION = "7"
 #: Maximum number of requests that wait for the inspecting process; further ones are rejected with `BUSY`.
 _MAX_WAITING = 64
 _MAX_ANSWER = 64 << 20

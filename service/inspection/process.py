@@ -48,6 +48,7 @@ from sgsst_core.files.images import image_size
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.choice import find_upright_subject
 from sgsst_core.paintings import STARRY_NIGHT
+from sgsst_core.planning.capture_checks import OTHER_FRAME
 from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.progress import Progress
 from sgsst_core.report.document import plan_json
@@ -141,9 +142,11 @@ def _read(request: WorkRequest) -> Inputs:
 def _findings(inputs: Inputs) -> dict[str, Any]:
     """Return `gaussians`, `dropped`, `sh_degree`, `style` (width, height), `photos`, `views`, and `pixels` of these.
 
-    `up` is that of an orbit, in the format of the API; None with cameras.
+    `up` is that of an orbit, in the format of the API; None with cameras. `foreign` says that cameras hardly show the
+    scene; None if they do.
     """
     scene, image, up = inputs.scene_file.scene, inputs.style.images[0], inputs.orbit and inputs.orbit.up
+    foreign = [f"{each.decision}; {each.reason}" for each in inputs.decisions if each.decision.startswith(OTHER_FRAME)]
     return {
         "gaussians": len(scene),
         "dropped": inputs.scene_file.dropped,
@@ -153,6 +156,7 @@ def _findings(inputs: Inputs) -> dict[str, Any]:
         "views": len(inputs.cameras),
         "pixels": _pixels(inputs.cameras),
         "up": up and {"direction": up.name, "sure": up.sure, "candidates": up.candidates, "reason": up.reason},
+        "foreign": foreign[0].removeprefix("warning: ") if foreign else None,
     }
 
 
@@ -172,6 +176,7 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
     job_plan = dry_run(spec, inputs, lambda now: _show(now, send), to_write, left)
     if job_plan.time_choice:
         settings = job_plan.time_choice.applied(settings)
+        inputs = inputs.chosen(job_plan.time_choice, settings)
     seconds = total = memory = on_device = None
     if expected := job_plan.prediction:
         steps = expected.job - expected.measuring
@@ -182,6 +187,8 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
         seconds = expected.seconds * settings.steps_sos + coarse * job_plan.steps_coarse
     return {
         **findings,
+        "views": len(inputs.cameras),
+        "pixels": _pixels(inputs.cameras),
         "plan": plan_json(job_plan),
         "estimated_seconds": seconds,
         "total_seconds": total,

@@ -40,8 +40,9 @@ _DIRECTIONS = 300
 USUAL_UP = (0.0, -1.0, 0.0)
 #: Up in programs that model scenes, such as Blender, and in most captures whose axes are not COLMAP's.
 _SECOND_UP = (0.0, 0.0, 1.0)
-#: Directions this close to a world axis are replaced by it, because captures are mostly aligned by hand.
-_SNAP = math.cos(math.radians(10))
+#: Directions this close to a world axis are replaced by it, because captures are mostly aligned by hand. The longest
+#: axis of a standing subject shows up less precisely than a ground does: a pose or a drapery tilts it.
+_SNAP, _SNAP_STANDING = math.cos(math.radians(10)), math.cos(math.radians(15))
 #: Thickness of a ground layer as a fraction of the subject's size, and its maximum distance from the subject's end, as
 #: fractions of the subject's size and of its height.
 _LAYER, _END, _END_OF_HEIGHT = 0.01, 0.12, 0.25
@@ -278,8 +279,8 @@ def _standing(subject: Subject, axes: Tensor) -> Up | None:
     if max(ends) > max(_MIN_FOOT, _WIDER * min(ends)):
         up = long if ends[0] > ends[1] else -long
         broader = f"{max(ends) / min(ends):.1f} times as broad as" if max(ends) < 100 * min(ends) else "broader than"
-        return Up(_snapped(up), f"{stands}, and its foot is {broader} the other end")
-    up = _snapped(long if _habit(long) > 0 else -long)
+        return Up(_snapped(up, _SNAP_STANDING), f"{stands}, and its foot is {broader} the other end")
+    up = _snapped(long if _habit(long) > 0 else -long, _SNAP_STANDING)
     usual = torch.tensor(USUAL_UP, dtype=torch.float64)
     reason = f"{stands}; both ends are alike, and most captures point this way"
     return Up(up, reason, sure=False, other=usual if abs(float(up @ usual)) < _SNAP else -up)
@@ -291,11 +292,11 @@ def _habit(direction: Tensor) -> float:
     return -y if abs(y) >= max(abs(x), abs(z)) else z if abs(z) >= abs(x) else x
 
 
-def _snapped(direction: Tensor) -> Tensor:
-    """Return the nearest world axis if it is close, else the direction itself."""
+def _snapped(direction: Tensor, close: float = _SNAP) -> Tensor:
+    """Return the nearest world axis if the cosine to it is at least `close`, else the direction itself."""
     direction = direction / direction.norm()
     axis = _nearest_axis(direction)
-    return axis if float(direction @ axis) >= _SNAP else direction
+    return axis if float(direction @ axis) >= close else direction
 
 
 def _nearest_axis(direction: Tensor) -> Tensor:

@@ -27,6 +27,8 @@ from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 _LITTLE_SHOWN, _MUCH_UNCOVERED = 0.25, 0.1
 #: Cameras that together see less than half of the scene are refused if a typical view is nearly empty.
 _NEARLY_NOTHING, _MOSTLY_UNCOVERED, _HALF = 0.01, 0.4, 0.5
+#: Start of the warning about cameras that show little of the scene.
+OTHER_FRAME = "warning: they may be in another coordinate frame"
 #: PSNR in dB below which photos are reported. Right photos have 26 to 31; cropped by 10 %, 20.
 _UNLIKE_PSNR = 22.0
 #: Rendered views that are looked at.
@@ -75,7 +77,7 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
             f"Cameras and scene have different coordinate frames: {text}, and all {len(cameras)} views together reach "
             f"{shown.together:.1%}. Instead, {advice}."
         )
-    return [Decision("cameras", f"warning: they may be in another coordinate frame: {text}", advice)]
+    return [Decision("cameras", f"{OTHER_FRAME}: {text}", advice)]
 
 
 def compare_photos(

@@ -172,7 +172,8 @@ async def create_job(
         bool,
         Query(
             description="Refuse an orbit whose up direction the scene does not determine with `unsure-up`, whose "
-            "`candidates` are values of `up` to choose from. A dry run answers with `up` in any case.",
+            "`candidates` are values of `up` to choose from, and cameras that hardly show the scene with "
+            "`unsure-cameras`. A dry run answers with `up` and `warnings` in any case.",
             examples=[True],
         ),
     ] = False,
@@ -198,8 +199,10 @@ async def create_job(
             if not dry_run or context.inspector.is_planning:  # else the files are checked and planned in one reading
                 findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
-            up = findings and findings["up"]
-            if sure_up and up and not up["sure"]:
+            up, foreign = (findings["up"], findings["foreign"]) if sure_up and findings else (None, None)
+            if foreign:
+                raise problems.UNSURE_CAMERAS(reason=foreign, input="cameras")
+            if up and not up["sure"]:
                 likely = " or ".join(up["candidates"])
                 raise problems.UNSURE_UP(reason=up["reason"], likely=likely, candidates=up["candidates"], input="up")
             idempotency = _idempotency(idempotency_key, inputs, parameters, webhook)

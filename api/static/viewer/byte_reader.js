@@ -64,11 +64,7 @@ export class ByteReader {
     return rest.length ? rest : (await this.reader.read()).value ?? null;
   }
 
-  /**
-   * Take all remaining bytes.
-   *
-   * @returns {Promise<Uint8Array<ArrayBuffer>>}
-   */
+  /** Take all remaining bytes. @returns {Promise<Uint8Array<ArrayBuffer>>} */
   async all() {
     const parts = [this.rest];
     for (;;) {

@@ -59,12 +59,7 @@ export class ViewCamera {
     this.number++;
   }
 
-  /**
-   * Move to a camera of the job.
-   *
-   * @param {JobCamera} camera
-   * @param {{center: Vector, radius: number} | null} middle
-   */
+  /** Move to a camera of the job. @param {JobCamera} camera @param {{center: Vector, radius: number} | null} middle */
   stand(camera, middle) {
     this.eye = [...camera.position];
     this.axes = camera.axes.map((axis) => [...axis]);
@@ -124,11 +119,7 @@ export class ViewCamera {
     this.number++;
   }
 
-  /**
-   * Move eye and target.
-   *
-   * @param {number[]} by movement along right, down and forward, world units
-   */
+  /** Move eye and target. @param {number[]} by movement along right, down and forward, world units */
   move(by) {
     const step = this.axes.map((axis, i) => times(axis, by[i])).reduce(sum);
     this.eye = sum(this.eye, step);

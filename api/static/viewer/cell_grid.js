@@ -68,11 +68,7 @@ export class CellGrid {
     this.starts = starts;
   }
 
-  /**
-   * Return the occupied cells around a cell, itself first.
-   *
-   * @param {number} cell
-   */
+  /** Return the occupied cells around a cell, itself first. @param {number} cell */
   around(cell) {
     const key = this.keys[cell], found = [];
     for (const step of AROUND) {

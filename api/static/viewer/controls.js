@@ -120,12 +120,7 @@ export class Controls {
     this.viewer.moved();
   }
 
-  /**
-   * Turn to what is visible at a point of the window.
-   *
-   * @param {number} x
-   * @param {number} y
-   */
+  /** Turn to what is visible at a point of the window. @param {number} x @param {number} y */
   async focus(x, y) {
     const { left, top } = this.viewer.canvas.getBoundingClientRect(), point = await this.viewer.pointAt(x - left, y - top);
     if (!point) return;

@@ -44,11 +44,7 @@ export function depthOrder(centers, reach, count, { axes, eye, tan, near }) {
   return sorted(found, new Uint32Array(depths.buffer), visible);
 }
 
-/**
- * @param {Uint32Array} found
- * @param {Uint32Array} bits bits of their depths
- * @param {number} count
- */
+/** @param {Uint32Array} found @param {Uint32Array} bits bits of their depths @param {number} count */
 function sorted(found, bits, count) {
   let low = 0xffffffff, high = 0;
   for (let i = 0; i < count; i++) {

@@ -27,10 +27,7 @@ const Y_UP = [[-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]];
 /** Maximum deviation of a node's matrix from a rotation, relative to its scale. */
 const TOLERANCE = 1e-4;
 
-/**
- * @param {ByteReader} reader
- * @returns {Promise<SceneFile>}
- */
+/** @param {ByteReader} reader @returns {Promise<SceneFile>} */
 export async function glb(reader) {
   const head = new DataView((await reader.take(20)).buffer), size = head.getUint32(12, true);
   if (head.getUint32(4, true) !== 2 || size > MAX_JSON) throw new SceneError(words.scene.unreadable);
@@ -70,10 +67,7 @@ function partsOf(text, bytes) {
   }
 }
 
-/**
- * @param {any} document
- * @param {number} bytes
- */
+/** @param {any} document @param {number} bytes */
 function partsIn({ accessors, bufferViews, meshes, nodes = [] }, bytes) {
   const isSplats = (/** @type {any} */ each) => Boolean(each.extensions?.[EXTENSION]);
   /** @type {{primitives: any[], pose: Pose}[]} */
@@ -131,12 +125,7 @@ function quaternionOf([[a, b, c], [d, e, f], [g, h, i]]) {
   return unit(multiples.reduce((best, each) => (Math.hypot(...each) > Math.hypot(...best) ? each : best)));
 }
 
-/**
- * @param {any} primitive
- * @param {any} accessors
- * @param {any} bufferViews
- * @param {number} bytes
- */
+/** @param {any} primitive @param {any} accessors @param {any} bufferViews @param {number} bytes */
 function partOf(primitive, accessors, bufferViews, bytes) {
   const names = [...NAMES];
   let degree = 0;

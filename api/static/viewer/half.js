@@ -22,10 +22,7 @@ for (let key = 0; key < 512; key++) {
   }
 }
 
-/**
- * @param {number} bits bits of a float32
- * @returns {number} bits of a half
- */
+/** @param {number} bits bits of a float32 @returns {number} bits of a half */
 export function halfOf(bits) {
   const key = bits >>> 23;
   const half = BASE[key] + ((((bits & 0x7fffff) | HIDDEN[key]) + ROUND[key]) >>> SHIFT[key]);

@@ -36,11 +36,7 @@ export async function canShow(mode) {
 }
 
 export class Headset {
-  /**
-   * @param {Viewer} viewer
-   * @param {Mode} mode
-   * @param {() => void} ended called after the session has ended
-   */
+  /** @param {Viewer} viewer @param {Mode} mode @param {() => void} ended called after the session has ended */
   constructor(viewer, mode, ended) {
     this.viewer = viewer;
     this.mode = mode;
@@ -87,10 +83,7 @@ export class Headset {
     this.ended();
   }
 
-  /**
-   * @param {number} time milliseconds
-   * @param {any} frame XRFrame
-   */
+  /** @param {number} time milliseconds @param {any} frame XRFrame */
   draw(time, frame) {
     const { viewer, session } = this;
     session.requestAnimationFrame((/** @type {number} */ t, /** @type {any} */ f) => this.draw(t, f));
@@ -111,11 +104,7 @@ export class Headset {
     else if (seconds && seconds < FAST) this.scale = Math.min(1, this.scale + SCALE_STEP / 20);
   }
 
-  /**
-   * Return the camera of an eye in the scene, with its part of the frame.
-   *
-   * @param {any} view XRView
-   */
+  /** Return the camera of an eye in the scene, with its part of the frame. @param {any} view XRView */
   eye(view) {
     const { x, y, width, height } = this.layer.getViewport(view), m = view.transform.matrix, p = view.projectionMatrix;
     const column = (/** @type {number} */ i) => [m[4 * i], m[4 * i + 1], m[4 * i + 2]];
@@ -194,12 +183,7 @@ export class Headset {
     this.placement.shift(times(sum(times(right, x), times(back, y)), -WALK * seconds));
   }
 
-  /**
-   * Stand at a point of the floor.
-   *
-   * @param {Vector} floor
-   * @param {Vector} head
-   */
+  /** Stand at a point of the floor. @param {Vector} floor @param {Vector} head */
   standAt(floor, head) {
     const by = difference(head, floor);
     this.placement.shift([by[0], 0, by[2]]);

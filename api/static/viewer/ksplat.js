@@ -39,10 +39,7 @@ export function isKsplat(start) {
   return sections > 0 && view.getUint32(8, true) <= sections && view.getUint32(16, true) > 0 && view.getUint16(20, true) < 3 && finite;
 }
 
-/**
- * @param {ByteReader} reader
- * @returns {Promise<SceneFile>}
- */
+/** @param {ByteReader} reader @returns {Promise<SceneFile>} */
 export async function ksplat(reader) {
   const head = new DataView((await reader.take(HEADER)).buffer), number = head.getUint32(4, true), count = head.getUint32(16, true);
   const level = head.getUint16(20, true), low = head.getFloat32(36, true) || -RANGE, high = head.getFloat32(40, true) || RANGE;
@@ -109,11 +106,7 @@ export async function ksplat(reader) {
   });
 }
 
-/**
- * @param {DataView} table
- * @param {number} o offset of the section's entry
- * @returns {Section}
- */
+/** @param {DataView} table @param {number} o offset of the section's entry @returns {Section} */
 function sectionAt(table, o) {
   const integer = (/** @type {number} */ place) => table.getUint32(o + place, true);
   const steps = integer(24) || STEPS, count = integer(0), room = integer(4);

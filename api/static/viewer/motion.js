@@ -55,10 +55,7 @@ export class Motion {
     this.held.delete(key);
   }
 
-  /**
-   * @param {boolean} fast
-   * @param {boolean} slow
-   */
+  /** @param {boolean} fast @param {boolean} slow */
   hurry(fast, slow) {
     this.factor = (fast ? FAST : 1) * (slow ? SLOW : 1);
   }
@@ -135,11 +132,7 @@ export class Motion {
     }
   }
 
-  /**
-   * @param {number} dx CSS pixels
-   * @param {number} dy
-   * @param {boolean} pans
-   */
+  /** @param {number} dx CSS pixels @param {number} dy @param {boolean} pans */
   drag(dx, dy, pans) {
     const { camera, canvas } = this.viewer;
     if (!pans) return camera.turn(dx / PIXELS_PER_RADIAN, dy / PIXELS_PER_RADIAN, this.orbit);

@@ -46,11 +46,7 @@ export class Painter {
     this.pictureSize = [0, 0];
   }
 
-  /**
-   * @param {string} vertex
-   * @param {string} fragment
-   * @returns {Program}
-   */
+  /** @param {string} vertex @param {string} fragment @returns {Program} */
   program(vertex, fragment) {
     const { gl } = this, program = gl.createProgram();
     for (const [kind, text] of /** @type {[number, string][]} */ ([[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]])) {
@@ -231,11 +227,7 @@ export class Painter {
     gl.disableVertexAttribArray(1);
   }
 
-  /**
-   * @param {(name: string) => WebGLUniformLocation | null} at
-   * @param {number} width
-   * @param {number} height
-   */
+  /** @param {(name: string) => WebGLUniformLocation | null} at @param {number} width @param {number} height */
   setView(at, width, height) {
     const { gl, viewer: { camera } } = this, [fx, fy] = camera.pixels(width, height), [sx, sy] = camera.shift(width, height);
     gl.uniform2f(at("shift"), sx, sy);
@@ -246,10 +238,7 @@ export class Painter {
     gl.uniform1f(at("near"), camera.near);
   }
 
-  /**
-   * @param {number} scale
-   * @param {boolean} through whether to keep transparency
-   */
+  /** @param {number} scale @param {boolean} through whether to keep transparency */
   composite(scale, through = false) {
     const { gl } = this, { program, at } = /** @type {Program} */ (this.compose);
     gl.useProgram(program);
@@ -263,11 +252,7 @@ export class Painter {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /**
-   * @param {Float32Array} lines pairs of points
-   * @param {number} width
-   * @param {number} height
-   */
+  /** @param {Float32Array} lines pairs of points @param {number} width @param {number} height */
   drawLines(lines, width, height) {
     const { gl } = this, { program, at } = /** @type {Program} */ (this.line);
     gl.useProgram(program);

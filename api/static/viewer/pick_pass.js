@@ -93,11 +93,7 @@ export class PickPass {
     return { axes, eye, near, focal: camera.pixels(width, height), ids, width, height };
   }
 
-  /**
-   * @param {import("./splat_scene.js").SplatScene} scene
-   * @param {number} width
-   * @param {number} height
-   */
+  /** @param {import("./splat_scene.js").SplatScene} scene @param {number} width @param {number} height */
   drawScene(scene, width, height) {
     const { viewer } = this, { gl } = viewer;
     const { program, at } = this.programs.get(scene.bits) ?? viewer.painter.program(splatVertex(0, scene.bits), pickFragment);

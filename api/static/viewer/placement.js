@@ -49,12 +49,7 @@ export class Placement {
     this.origin = sum(this.origin, by);
   }
 
-  /**
-   * Turn about the vertical through a point.
-   *
-   * @param {number} angle radians
-   * @param {Vector} about
-   */
+  /** Turn about the vertical through a point. @param {number} angle radians @param {Vector} about */
   turn(angle, about) {
     const columns = [0, 1, 2].map((i) => rotated(this.rows.map((row) => row[i]), UP, angle));
     this.rows = [0, 1, 2].map((i) => columns.map((column) => column[i]));

@@ -57,10 +57,7 @@ export function checkLength({ begin, elements, text }, size) {
   if (size && declared > size) throw new CutError(words.scene.shorter(elements.find(({ name }) => name === "vertex")?.count ?? 0, declared, size));
 }
 
-/**
- * @param {string[]} lines
- * @returns {Element[]}
- */
+/** @param {string[]} lines @returns {Element[]} */
 function elementsOf(lines) {
   const little = !lines.includes("format binary_big_endian 1.0");
   if (little && !lines.includes("format binary_little_endian 1.0") && !lines.includes(TEXT)) throw new SceneError(words.scene.notPly);
@@ -77,11 +74,7 @@ function elementsOf(lines) {
   return elements;
 }
 
-/**
- * @param {ByteReader} reader reader behind the header
- * @param {Header} header
- * @returns {SceneFile}
- */
+/** @param {ByteReader} reader reader behind the header @param {Header} header @returns {SceneFile} */
 export function plainPly(reader, { elements, comments, text }) {
   const [vertex] = elements, names = Object.keys(vertex?.columns ?? {}), rest = names.filter((name) => name.startsWith("f_rest_")).length;
   const wrong = vertex?.name !== "vertex" || !(vertex.count > 0) || !(vertex.stride > 0) || NEEDED.some((name) => !vertex.columns[name] && !(name === "scale_2" && isFlat(names)));
@@ -105,11 +98,7 @@ export function plainPly(reader, { elements, comments, text }) {
   };
 }
 
-/**
- * Yield the lines of a text that are not empty.
- *
- * @param {ByteReader} reader
- */
+/** Yield the lines of a text that are not empty. @param {ByteReader} reader */
 async function* textLines(reader) {
   for (let line = ""; ;) {
     const part = await reader.some();
@@ -163,12 +152,7 @@ function applyFilter(rows, width, at) {
   }
 }
 
-/**
- * Return rows with a last value for the missing scale_2.
- *
- * @param {Float32Array} rows
- * @param {number} width
- */
+/** Return rows with a last value for the missing scale_2. @param {Float32Array} rows @param {number} width */
 function withoutThickness(rows, width) {
   const count = rows.length / width, found = new Float32Array(count * (width + 1)).fill(SCALE_LOW);
   for (let row = 0; row < count; row++) found.set(rows.subarray(row * width, (row + 1) * width), row * (width + 1));
@@ -191,12 +175,7 @@ export function floats({ stride, columns, little }, bytes) {
   return found;
 }
 
-/**
- * @param {DataView} view
- * @param {number} at
- * @param {string} type
- * @param {boolean} little
- */
+/** @param {DataView} view @param {number} at @param {string} type @param {boolean} little */
 function stored(view, at, type, little) {
   if (type === "double" || type === "float64") return view.getFloat64(at, little);
   if (type.startsWith("float")) return view.getFloat32(at, little);

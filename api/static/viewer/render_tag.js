@@ -35,10 +35,7 @@ export function plyRendering(comments, names) {
   return { antialiased, eps2d: eps2d ?? usual };
 }
 
-/**
- * @param {any} extras value that should be a JSON object with `model` and `eps2d`
- * @returns {Rendering}
- */
+/** @param {any} extras value that should be a JSON object with `model` and `eps2d` @returns {Rendering} */
 export function extrasRendering(extras) {
   const eps2d = typeof extras?.eps2d === "number" ? usable(extras.eps2d) : null;
   return { antialiased: extras?.model === "antialiased", eps2d: eps2d ?? EPS2D };

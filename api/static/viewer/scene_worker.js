@@ -50,10 +50,7 @@ async function load(source, room) {
   port.postMessage({ kind: "done", middle: middle() });
 }
 
-/**
- * @param {File | string} source
- * @returns {Promise<[ReadableStream<Uint8Array>, number]>}
- */
+/** @param {File | string} source @returns {Promise<[ReadableStream<Uint8Array>, number]>} */
 async function opened(source) {
   if (source instanceof Blob) return [source.stream(), source.size];
   const answer = await fetch(source, { credentials: "same-origin" });
@@ -78,10 +75,7 @@ function keptDegree(file, { texels, bytes }) {
   return kept;
 }
 
-/**
- * @param {Float32Array} rows
- * @param {SceneFile} file
- */
+/** @param {Float32Array} rows @param {SceneFile} file */
 function give(rows, file) {
   const packed = pack(rows, file.width, file.at, file.degree, degree);
   centers.set(packed.centers, count * 3);

@@ -68,12 +68,7 @@ export class Selection {
     this.ask("view", view, [view.ids.buffer]);
   }
 
-  /**
-   * Return a point of the canvas in pixels of the worker's view.
-   *
-   * @param {number} x CSS pixels
-   * @param {number} y
-   */
+  /** Return a point of the canvas in pixels of the worker's view. @param {number} x CSS pixels @param {number} y */
   point(x, y) {
     const { clientWidth, clientHeight } = this.viewer.canvas;
     return [(x * this.size[0]) / clientWidth, (y * this.size[1]) / clientHeight];

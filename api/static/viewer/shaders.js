@@ -26,10 +26,7 @@ function directional(degree) {
 }`;
 }
 
-/**
- * @param {number} degree degree of spherical harmonics
- * @param {number} bits base-2 logarithm of the texels of a row
- */
+/** @param {number} degree degree of spherical harmonics @param {number} bits base-2 logarithm of the texels of a row */
 export const splatVertex = (degree, bits) => `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 layout(location = 0) in vec2 corner;

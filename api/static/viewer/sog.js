@@ -33,10 +33,7 @@ const META = "meta.json", INDEX = "lod-meta.json";
  *   writes the rows of `some` Gaussians to `into` from `o` on; `stride` is the number of coefficients in a row
  */
 
-/**
- * @param {ByteReader} reader
- * @returns {Promise<SceneFile>}
- */
+/** @param {ByteReader} reader @returns {Promise<SceneFile>} */
 export async function sog(reader) {
   const files = await unzipped(await reader.all());
   const [index] = [...files.keys()].filter((name) => `/${name}`.endsWith(`/${INDEX}`)).sort((a, b) => a.length - b.length);
@@ -70,23 +67,14 @@ async function finestParts(files, name) {
   return parts;
 }
 
-/**
- * @param {import("./zip.js").Files} files
- * @param {string} name
- * @returns {Promise<any>}
- */
+/** @param {import("./zip.js").Files} files @param {string} name @returns {Promise<any>} */
 async function json(files, name) {
   const load = files.get(name);
   if (!load) throw new SceneError(words.scene.unreadable);
   return JSON.parse(new TextDecoder().decode(await load()));
 }
 
-/**
- * Return a scene of the Gaussians of some parts.
- *
- * @param {Part[]} parts
- * @returns {SceneFile}
- */
+/** Return a scene of the Gaussians of some parts. @param {Part[]} parts @returns {SceneFile} */
 function joined(parts) {
   const coefficients = Math.max(...parts.map((part) => part.coefficients)), count = parts.reduce((sum, part) => sum + part.count, 0);
   return unpacked(count, Math.sqrt(coefficients + 1) - 1, async (begin, into, width, some) => {
@@ -99,10 +87,7 @@ function joined(parts) {
   }, parts[0].rendering);
 }
 
-/**
- * @param {import("./zip.js").Files} files
- * @returns {Promise<Part>}
- */
+/** @param {import("./zip.js").Files} files @returns {Promise<Part>} */
 async function sogPart(files) {
   const meta = await json(files, META);
   const { version = 1, means, scales, quats, sh0, shN } = meta, table = version === 2 ? codebook : steps;

@@ -26,11 +26,7 @@ export function isSplat(start, size) {
   return size % RECORD === 0 && fit > 0.9 * count;
 }
 
-/**
- * @param {ByteReader} reader
- * @param {number} size size of the file in bytes
- * @returns {SceneFile}
- */
+/** @param {ByteReader} reader @param {number} size size of the file in bytes @returns {SceneFile} */
 export function splat(reader, size) {
   return unpacked(size / RECORD, 0, async (_begin, into, width, count) => {
     const bytes = await reader.take(count * RECORD), values = new Float32Array(bytes.buffer);

@@ -84,10 +84,7 @@ export class SplatScene {
     this.tellBroken?.(wrong);
   }
 
-  /**
-   * @param {Shown} header
-   * @param {number} degree
-   */
+  /** @param {Shown} header @param {number} degree */
   allocate(header, degree) {
     const { gl } = this;
     this.header = header;
@@ -100,10 +97,7 @@ export class SplatScene {
     this.tellHeader?.(header);
   }
 
-  /**
-   * @param {number} form
-   * @param {number} texels
-   */
+  /** @param {number} form @param {number} texels */
   texture(form, texels) {
     const { gl } = this, made = gl.createTexture(), width = 1 << this.bits;
     gl.bindTexture(gl.TEXTURE_2D, made);
@@ -168,12 +162,7 @@ export class SplatScene {
     this.changed();
   }
 
-  /**
-   * Return the center of a Gaussian.
-   *
-   * @param {number} index
-   * @returns {Promise<number[]>}
-   */
+  /** Return the center of a Gaussian. @param {number} index @returns {Promise<number[]>} */
   centerOf(index) {
     this.worker.postMessage({ kind: "center", index });
     return new Promise((done) => this.centers.push(done));

@@ -60,11 +60,7 @@ export class Viewer {
     this.resized.observe(canvas);
   }
 
-  /**
-   * Start to read a scene. It is shown once it is on a side of the wipe.
-   *
-   * @param {File | string} source
-   */
+  /** Start to read a scene. It is shown once it is on a side of the wipe. @param {File | string} source */
   open(source) {
     return new SplatScene(this.gl, source, () => this.sceneChanged());
   }
@@ -99,10 +95,7 @@ export class Viewer {
     this.draw();
   }
 
-  /**
-   * @param {Side} left
-   * @param {Side} right
-   */
+  /** @param {Side} left @param {Side} right */
   show(left, right = left) {
     this.sides = { left, right };
     this.sceneChanged();
@@ -211,11 +204,7 @@ export class Viewer {
     return [Math.max(1, Math.round(this.canvas.clientWidth * ratio)), Math.max(1, Math.round(this.canvas.clientHeight * ratio))];
   }
 
-  /**
-   * Return the current view as a PNG.
-   *
-   * @returns {Promise<Blob>}
-   */
+  /** Return the current view as a PNG. @returns {Promise<Blob>} */
   picturePng() {
     this.scale = 1;
     this.painter.render(); // a canvas drops its content when the task ends

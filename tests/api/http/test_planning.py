@@ -265,6 +265,23 @@ def test_plan_of_an_orbit_says_whether_up_is_sure(service: Service, files: dict[
         assert client.post("/v1/jobs", **request(files)).json()["up"] is None
 
 
+def test_cameras_that_hardly_show_the_scene_are_refused_if_asked(service: Service, files: dict[str, bytes]) -> None:
+    views = json.loads(files["cameras"])
+    for view in views:
+        view["position"][0] += 3.2  # the wall ends at 2.4
+    foreign = {**files, "cameras": json.dumps(views).encode()}
+    with service.client() as client:
+        before = jobs(client)
+        refused = client.post("/v1/jobs", **request(foreign) | {"params": {"sure_up": True}})
+        assert (refused.status_code, refused.json()["code"], refused.json()["input"]) == (
+            422,
+            "unsure-cameras",
+            "cameras",
+        )
+        assert "of the Gaussians in its frame" in refused.json()["detail"]
+        assert jobs(client) == before
+
+
 def test_orbit_surrounds_what_a_crop_leaves(service: Service, files: dict[str, bytes]) -> None:
     without = {role: content for role, content in files.items() if role != "cameras"}
     crop = [{"name": "inside", "select": "box=-1,-1,2,0,0,4"}, {"name": "rest", "freeze": True}]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from pathlib import Path
@@ -93,6 +94,39 @@ def test_truncated_scene_is_refused_on_its_card(visit: Visit, files: dict[str, P
     choose(watched, {"scene": files["scene"]})
     slot.get_by_text("616 Gaussians · SH degree 1").wait_for()
     assert slot.locator(".wrong").is_hidden()
+    watched.check()
+
+
+def test_unusable_files_are_named_on_their_cards(visit: Visit, files: dict[str, Path], tmp_path: Path) -> None:
+    """At once, and they stop the start. A reload says which files of this device to choose again."""
+    image = io.BytesIO()
+    Image.effect_noise((300, 200), 60).save(image, "JPEG")
+    contents = {"empty.ply": b"", "photo.ply": image.getvalue(), "half.jpg": image.getvalue()[:9000]}
+    for name, content in (contents | {"notes.txt": b"text", "cut.json": files["cameras"].read_bytes()[:-20]}).items():
+        (tmp_path / name).write_bytes(content)
+    watched = visit()
+    page = watched.page
+    page.get_by_label("Use my cameras").check(force=True)
+    for role, name, text in (
+        ("Scene", "empty.ply", "empty.ply is empty (0 bytes)"),
+        ("Scene", "photo.ply", "Not a scene file"),
+        ("Style", "half.jpg", "half.jpg is incomplete or damaged"),
+        ("Photos", "half.jpg", "half.jpg is incomplete or damaged"),
+        ("Cameras", "notes.txt", "notes.txt isn't a camera file"),
+        ("Cameras", "cut.json", "cut.json is incomplete, or not JSON"),
+    ):
+        field = page.get_by_label(role, exact=True).first
+        field.set_input_files(tmp_path / name)
+        page.locator(".slot", has=field).locator(".wrong", has_text=text).wait_for()
+    page.locator(".presets input").first.wait_for()
+    page.get_by_role("button", name="Start", exact=True).click()
+    assert page.get_by_label("Scene", exact=True).evaluate("(input) => input === document.activeElement")
+    page.reload()
+    for name in ("photo.ply", "half.jpg", "cut.json"):
+        page.locator(".slot", has_text=f"Choose again: {name}").first.wait_for()
+    choose(watched, {"scene": files["scene"]})
+    page.get_by_text("616 Gaussians").wait_for()
+    assert page.get_by_text("Choose again: photo.ply").is_hidden()
     watched.check()
 
 

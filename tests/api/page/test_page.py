@@ -271,9 +271,14 @@ def test_jobs_are_listed_filtered_compared_and_deleted(visit: Visit, service: Se
     assert np.abs(watched.pixels() - left).mean() > 5
 
     page.goto(f"{service.url}/#/jobs")
-    page.get_by_role("button", name="Delete run 2 of three").click()
+    delete = page.get_by_role("button", name="Delete run 2 of three")
+    delete.click()
+    page.keyboard.press("Escape")
+    assert delete.evaluate("(button) => button === document.activeElement")
+    delete.click()
     page.get_by_role("button", name="Delete", exact=True).click()
     page.locator(".tile", has_text="run 2 of three").wait_for(state="detached")
+    assert page.locator(".tile a:focus").count() == 1, "the next job has the focus"
     assert httpx2.get(f"{service.url}/v1/jobs/{ids[2]}").status_code == 404
     watched.check()
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,19 +26,71 @@ pytestmark = pytest.mark.slow
 TOWER = ((-2.0, 1.0, 0.4), (1.0, 1.4, 1.2))
 
 
-def test_example_is_one_click_from_a_job(visit: Visit, service: Service) -> None:
+def test_example_is_one_click_from_a_job(visit: Visit, service: Service, files: dict[str, Path]) -> None:
+    """Nothing of it remains in a new job: neither in the form, nor after a reload, nor beside another scene."""
     watched = visit()
     page = watched.page
     page.locator(".presets input").first.wait_for()
     job = started(watched, service, "Try the example: a motorcycle")
     assert [each["name"] for each in job["inputs"]] == ["motorcycle.sog", "starry_night.jpg", "cameras.json"]
-    assert job["parameters"]["preset"] == "preview"
+    assert (job["parameters"]["preset"], job["parameters"]["resolution"]) == ("preview", 480)
+    page.get_by_role("link", name="New", exact=True).click()
+    assert entered(watched) == ([], "", "standard")
+    page.reload()
+    assert entered(watched) == ([], "", "standard")
+    page.goto(f"{service.url}/#/jobs/{job['id']}")
     page.get_by_role("button", name="Cancel").click()
     page.locator(".badge", has_text="Canceled").wait_for()
     page.get_by_role("button", name="Same with changes").click()
     page.get_by_role("button", name="Remove motorcycle.sog").wait_for()
     assert page.get_by_role("button", name="Try the example").count() == 0, "the example would replace the scene"
+    assert entered(watched)[1:] == ("480", "preview")
+    page.get_by_role("link", name="New", exact=True).click()
+    page.get_by_role("button", name="Remove motorcycle.sog").wait_for(state="detached")
+    assert entered(watched) == ([], "", "standard")
+    page.goto(f"{service.url}/#/jobs/{job['id']}")
+    page.get_by_role("button", name="Same with changes").click()
+    page.get_by_role("button", name="Remove motorcycle.sog").wait_for()
+    page.locator(".presets input").first.wait_for()
+    choose(watched, {"scene": files["scene"], "style": files["style"]})
+    assert entered(watched) == (["Remove scene.ply", "Remove style.png"], "", "standard")
     watched.check()
+
+
+def entered(watched: Watched) -> tuple[list[str | None], str, str | None]:
+    """Return the buttons that remove the form's files, its resolution and its preset."""
+    page = watched.page
+    preset = page.locator(".presets input:checked")
+    preset.wait_for(state="attached")
+    removes = page.locator(".thumb button[aria-label^=Remove]").all()
+    files = [button.get_attribute("aria-label") for button in removes]
+    return files, page.locator("[data-name=resolution] input").input_value(), preset.get_attribute("value")
+
+
+def test_cameras_of_another_scene_are_stopped_before_the_start(
+    visit: Visit, service: Service, files: dict[str, Path]
+) -> None:
+    views = json.loads(files["cameras"].read_text())
+    for view in views:
+        view["position"][0] += 3.2  # the wall ends at 2.4
+    files["cameras"].write_text(json.dumps(views))
+    watched = visit(width=1200, height=800)
+    page = watched.page
+    choose(watched, files)
+    set_options(watched, **STEPS)
+    before = httpx2.get(f"{service.url}/v1/jobs").json()["jobs"]
+    page.get_by_role("button", name="Start", exact=True).click()
+    page.locator(".slot", has_text="Cameras").get_by_text("The cameras hardly show this scene").wait_for()
+    assert httpx2.get(f"{service.url}/v1/jobs").json()["jobs"] == before
+    page.get_by_role("alert").get_by_role("button", name="Orbit the object").click()
+    page.get_by_role("button", name="Start anyway").wait_for(state="detached")
+    page.get_by_label("Use my cameras").check(force=True)
+    page.get_by_role("button", name="Start", exact=True).click()
+    with page.expect_response(lambda answer: answer.url.endswith("/v1/jobs?sure_up=false")) as answer:
+        page.get_by_role("button", name="Start anyway").click()
+    assert answer.value.status == 202
+    page.wait_for_url(re.compile("#/jobs/job_"))
+    watched.check(REFUSED)
 
 
 def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict[str, Path], tmp_path: Path) -> None:

@@ -207,6 +207,8 @@ def test_another_tab_sees_changes(visit: Visit, service: Service, files: dict[st
     here.page.get_by_role("button", name="Delete", exact=True).click()
     there.page.get_by_role("heading", name="This job was deleted.").wait_for()
     listed.page.locator(".tile", has_text="renamed here").wait_for(state="detached")
+    there.page.reload()
+    there.page.get_by_role("heading", name="This job doesn't exist, or was deleted.").wait_for()
     there.check("status of 404")
     for watched in (here, listed):
         watched.check()

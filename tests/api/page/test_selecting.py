@@ -189,7 +189,7 @@ def two_walls() -> Scene:
     )
 
 
-def opened(visit: Visit, files: dict[str, Path], **size: int) -> Watched:
+def opened(visit: Visit, files: dict[str, Path], **size: Any) -> Watched:
     """Open the form with the files, and start to select a region `near`."""
     watched = visit(**size)
     page = watched.page
@@ -295,11 +295,10 @@ def test_selected_region_stays_frozen(visit: Visit, service: Service, files: dic
     for _ in range(2):
         page.get_by_role("button", name="Redo").click()
     assert selected(watched, f"{count} of") == count
-    page.get_by_role("button", name="Use selection").click()
     region = page.get_by_role("group", name="Region 1")
     region.get_by_label("Freeze").check()
     set_options(watched, **STEPS, name="by hand")
-    page.get_by_role("button", name="Start").click()
+    page.get_by_role("button", name="Start").click()  # uses the open selection
     page.locator(".badge", has_text="Done").wait_for()
     job_id = page.url.rsplit("/", 1)[1]
     job = httpx2.get(f"{service.url}/v1/jobs/{job_id}").json()
@@ -322,8 +321,13 @@ def test_selected_region_stays_frozen(visit: Visit, service: Service, files: dic
 def test_panel_works_by_keyboard_on_small_screens(visit: Visit, files: dict[str, Path]) -> None:
     from axe_playwright_python.sync_playwright import Axe
 
-    watched = opened(visit, files, width=360, height=760)
+    watched = opened(visit, files, width=360, height=760, is_mobile=True, has_touch=True)
     page = watched.page
+    view = page.locator("canvas.view").bounding_box()
+    assert 0 <= view["y"] <= 760 - view["height"], "what is selected is in sight"
+    help_text = page.locator(".selecting .help").first.inner_text()
+    assert "Subtract" in help_text
+    assert "Alt" not in help_text
     for tool in ("Brush", "Lasso", "Similar", "Box", "Sphere"):
         page.get_by_label(tool, exact=True).check()
         assert page.evaluate("() => document.documentElement.scrollWidth") <= 360, tool
@@ -348,6 +352,10 @@ def test_panel_works_by_keyboard_on_small_screens(visit: Visit, files: dict[str,
     page.get_by_role("button", name="Clear").press("Enter")
     page.get_by_role("button", name="Pick at the middle").press("Enter")
     some_selected(watched)
-    page.get_by_role("button", name="Cancel").press("Enter")
+    page.keyboard.press("Escape")
+    page.locator(".selecting").first.wait_for(state="hidden")
     assert "selected by hand" not in page.get_by_role("group", name="Region 1").inner_text()
+    page.get_by_role("button", name="Add a region").focus()
+    focused, bar = page.locator(":focus").bounding_box(), page.locator(".actions").bounding_box()
+    assert focused["y"] + focused["height"] <= bar["y"] + 14, "the bar covers the focus"
     watched.check()

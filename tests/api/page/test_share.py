@@ -56,6 +56,8 @@ def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: S
     other = visit(link.removeprefix(service.url), width=900, height=700)
     other.page.get_by_role("heading", name="my wall").wait_for()
     other.settled()
+    slider = other.page.get_by_label("Wipe", exact=True).bounding_box()
+    assert slider["y"] + slider["height"] <= 700, "the wipe is in sight"
     other.wipe("Home")
     assert other.page.locator(".side.right").inner_text() == "Stylized"
     options = other.page.get_by_label("Camera", exact=True).locator("option")

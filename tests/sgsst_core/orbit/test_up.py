@@ -174,7 +174,7 @@ def test_stick_stands_along_its_axis_in_the_conventional_sense(along: int, name:
 
 
 def test_up_snaps_to_a_close_world_axis_only() -> None:
-    assert up_of(moved(figure(), Rotation.from_euler("x", 6, degrees=True))).name == "-y"
+    assert up_of(moved(figure(), Rotation.from_euler("x", 13, degrees=True))).name == "-y"
     slanted = up_of(moved(figure(), Rotation.from_euler("x", 30, degrees=True)))
     assert slanted.name.startswith("(")
     assert float(slanted.direction.norm()) == pytest.approx(1)
