@@ -121,8 +121,8 @@ def default_cameras(scene: Path, options: ViewOptions) -> tuple[Path | None, str
     """
     if options.orbit is not None or options.elevation is not None or options.radius is not None:
         return None, ""
-    if (found := cameras_beside(scene)) is not None:
-        return found, f"The cameras are those of {found}; --cameras and --orbit choose others."
+    if (cameras := cameras_beside(scene)) is not None:
+        return cameras, f"The cameras are those of {cameras}; --cameras and --orbit choose others."
     return None, f"There are no cameras beside {scene}, so its views are on an orbit (--orbit auto)."
 
 

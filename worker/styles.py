@@ -28,6 +28,11 @@ class StyleFile:
         return str(self.path) if self.weight == 1 else f"{self.path}:{self.weight!r}"
 
 
+def path_or_url(value: str | Path) -> Path | str:
+    """Return the path of a local file, or an http or https URL unchanged."""
+    return value if isinstance(value, str) and value.lower().startswith(("http://", "https://")) else Path(value)
+
+
 def split_weight(text: str, exists: Callable[[Path], bool] = Path.exists) -> tuple[str, float]:
     """Return the file and weight of FILE or FILE:WEIGHT; see `parse_style`. The weight is 1 if there is none."""
     match = _WEIGHTED.fullmatch(text)

@@ -6,11 +6,14 @@ import atexit
 import gc
 import sys
 
-from api.cli import ABORTED, INTERRUPTED
+from api.cli import ABORTED, INTERRUPTED, print_version
 
 
 def run() -> int:
     """Run the command line, and return its exit code. Ctrl-C ends it in one line, also while its imports run."""
+    if sys.argv[1:] == ["--version"]:
+        print_version()
+        return 0
     atexit.register(gc.freeze)  # or the end searches all that was imported for garbage, for half a second
     try:
         from api.cli.main import main

@@ -26,7 +26,7 @@ from api.cli.console import (
     transfer_bar,
 )
 from api.cli.options import with_arguments, with_options
-from api.client.inputs import different_names, path_or_url
+from api.client.inputs import different_names
 from service.parameters import JobParameters
 from service.states import ACTIONS, STEPPING, Transition, WebhookEvent
 from sgsst_core.errors import OutputError, SettingsError
@@ -47,7 +47,7 @@ from sgsst_core.stylizing.progress_bar import live_bar, set_total
 from worker.options import ESSENTIALS
 from worker.outputs import check_file, check_folder, check_is_not_input
 from worker.region_requests import RegionOptions, region_requests
-from worker.styles import parse_styles, split_weight
+from worker.styles import parse_styles, path_or_url, split_weight
 
 if TYPE_CHECKING:
     from stamina.instrumentation import RetryDetails
@@ -349,17 +349,8 @@ def mcp(
     serve(root, url, key)
 
 
-COMMANDS: tuple[Callable[..., None], ...] = (
-    submit,
-    status,
-    watch,
-    download,
-    *map(_command_of, ACTIONS),
-    share,
-    delete,
-    jobs,
-    mcp,
-)
+#: Commands that request an action on a job, by name.
+ACTION_COMMANDS = {action.value: _command_of(action) for action in ACTIONS}
 
 # --- shared --------------------------------------------------------------------------------------------------------
 

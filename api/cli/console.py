@@ -9,11 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 
 from sgsst_core.loss.convergence import ratio
-from sgsst_core.stylizing.progress_bar import live_bar
 
 #: Exit codes: an unusable input or option, and any other failure.
 BAD_INPUT, FAILURE = 2, 1
@@ -99,6 +97,10 @@ def spinner(text: str) -> Iterator[None]:
 @contextmanager
 def transfer_bar(console: Console, description: str) -> Iterator[Callable[[int, int], None]]:
     """Show the progress of a transfer; yield a function that receives the transferred and the total bytes."""
+    from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn
+
+    from sgsst_core.stylizing.progress_bar import live_bar
+
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with live_bar(console, *columns) as bar:
         task = bar.add_task(description, total=None)

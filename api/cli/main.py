@@ -8,15 +8,14 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, requires
 from typing import Annotated, Any
 
 import typer
 
-from api.cli import ABORTED, INTERRUPTED, client_commands, operator_commands
-from api.cli.batch_commands import batch
-from api.cli.bench_commands import bench_app
+from api.cli import ABORTED, INTERRUPTED, print_version
 from api.cli.console import (
     BAD_INPUT,
     CONFLICT,
@@ -24,26 +23,93 @@ from api.cli.console import (
     NOT_FOUND,
     Invocation,
     error_console,
-    out_console,
 )
-from api.cli.machine_commands import doctor, weights_app
-from api.cli.scene_commands import blend, check, convert, plan, render, view
-from api.cli.study_commands import study_app
-from api.cli.stylize_commands import demo, stylize
+from service.states import ACTIONS
 from sgsst_core.errors import InvalidInputError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import DISK_FULL
 from sgsst_core.files.camera_folder import CameraWarning
-from worker.options import EXPERT, GROUPS
 from worker.processes import process_start
 
 _DISTRIBUTION = "sgsst-service"
+#: Summaries of commands and groups of commands, by their modules, which are imported when one is called.
+_SUMMARIES: dict[str, dict[str, str]] = {
+    "stylize_commands": {
+        "stylize": "Stylize a scene with one or several style images.",
+        "demo": "Stylize a built-in scene, lifted from a stereo photograph, in a few minutes.",
+    },
+    "batch_commands": {
+        "batch": "Stylize several scenes in each of several styles; what is done already is not repeated.",
+    },
+    "scene_commands": {
+        "plan": "Show what a stylization would skip and why, and what a step would cost.",
+        "check": "Report extreme values in a scene, its views and its style, and their consequences.",
+        "render": "Render all views of a scene as images, or a video along a camera path.",
+        "convert": "Convert a scene to another format, which the name of OUT determines.",
+        "blend": "Blend scenes that differ only in color: a scene and its results, or several results.",
+        "view": "Write a scene as one HTML file, which shows it in 3D in a browser, without a server.",
+    },
+    "machine_commands": {
+        "doctor": "Examine this machine: GPU, driver, precision, memory, weights, caches, and correct results.",
+        "weights": "Weights of the feature network.",
+    },
+    "client_commands": {
+        "submit": "Submit a job to a service, with the options of stylize.",
+        "status": "Show the status of a job.",
+        "watch": "Show the progress of a job until it ends; exit with 5 if it does not succeed.",
+        "download": "Download a job's result or other files; an interrupted download resumes.",
+        **{action.value: ACTIONS[action].help for action in ACTIONS},
+        "share": "Create a read-only link to a result, for people without a key.",
+        "delete": "Delete a finished job and its results.",
+        "jobs": "List jobs, newest first.",
+        "mcp": "Serve the tools of a language model on standard input and output, by the Model Context Protocol.",
+    },
+    "operator_commands": {
+        "serve": "Run the service on this machine: HTTP API and dispatcher.",
+        "fsck": "Check all files of the service against its database; the service may be running.",
+        "keys": "API keys of the service on this machine.",
+    },
+    "bench_commands": {"bench": "Benchmarks for your own scene and machine."},
+    "study_commands": {"study": "Blind comparisons of results by eye."},
+}
+#: Module of each command.
+_MODULES = {name: module for module, names in _SUMMARIES.items() for name in names}
 #: Base of errors in the arguments, which typer does not export.
 _UsageError: Any = typer.BadParameter.__base__
 _formatted = warnings.formatwarning
 
 
+class _Commands(Mapping[str, Any]):
+    """All commands by name. Each is made when it is needed, since NumPy and pydantic take most of a short call."""
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULES)
+
+    def __len__(self) -> int:
+        return len(_MODULES)
+
+    def __getitem__(self, name: str) -> Any:
+        members = vars(import_module(f"api.cli.{_MODULES[name]}"))
+        made = typer.Typer(rich_markup_mode=None)
+        if group := members.get(f"{name}_app"):
+            made.add_typer(group, name=name)
+        else:
+            made.command(cls=_Command)(members[name] if name in members else members["ACTION_COMMANDS"][name])
+        made.callback()(lambda: None)
+        commands: Any = typer.main.get_command(made)
+        return commands.commands[name]
+
+
 class _Program(typer.core.TyperGroup):
     """The command `sgsst`. Ctrl-C aborts every command that does not handle it itself."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = _Commands()  # type: ignore[assignment]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 (of typer)
+        """Write the summaries of all commands."""
+        with formatter.section("Commands"):
+            formatter.write_dl([item for names in _SUMMARIES.values() for item in names.items()])
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; KeyboardInterrupt becomes Abort, because typer would turn it into a silent exit."""
@@ -58,6 +124,8 @@ class _Command(typer.core.TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, then the options of each group; options without a group come before the experts'."""
+        from worker.options import EXPERT, GROUPS
+
         titles = ("Arguments", *(title for title in GROUPS if title != EXPERT), "Options", EXPERT)
         sections: dict[str, list[tuple[str, str]]] = {title: [] for title in titles}
         for parameter in self.get_params(ctx):
@@ -79,35 +147,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-_COMMANDS: tuple[Callable[..., Any], ...] = (
-    stylize,
-    batch,
-    plan,
-    check,
-    render,
-    convert,
-    blend,
-    view,
-    demo,
-    doctor,
-    *client_commands.COMMANDS,
-    *operator_commands.COMMANDS,
-)
-for command in _COMMANDS:
-    app.command(cls=_Command)(command)
-app.add_typer(weights_app, name="weights")
-app.add_typer(bench_app, name="bench")
-app.add_typer(study_app, name="study")
-app.add_typer(operator_commands.keys_app, name="keys")
 
 
 @app.callback(invoke_without_command=True)
 def program(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     """Style transfer for 3D Gaussian Splatting scenes (SGSST)."""
     if version:
-        from sgsst_core.stylizing.checkpoint import versions
-
-        out_console.print(f"sgsst {versions()['program']}")
+        print_version()
         raise typer.Exit()
 
 

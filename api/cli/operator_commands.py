@@ -149,9 +149,6 @@ def revoke_key(
     error_console.print(f"Revoked key {row.id} of {row.name!r}.")
 
 
-COMMANDS = (serve, fsck)
-
-
 def _service_settings(data: Path | None) -> ServiceSettings:
     """Return the settings from the environment, to which a data folder is added for other processes."""
     from sgsst_core.errors import SettingsError

@@ -13,13 +13,14 @@ import httpx2
 
 from api.client import uploads
 from api.client.answers import Event, Job, RequestError, checked
-from api.client.inputs import JobFiles, path_or_url
+from api.client.inputs import JobFiles
 from api.client.transport import TRIES, Download, Progress, Transport, in_thread
 from service.states import Transition
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.formats import download_of_name
 from sgsst_core.files.formats.ply import PLY
+from worker.styles import path_or_url
 
 #: Jobs per page of a list.
 _PAGE = 200

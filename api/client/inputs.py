@@ -40,11 +40,6 @@ class JobFiles:
     masks: Mapping[str, Path] = field(default_factory=dict)
 
 
-def path_or_url(value: str | Path) -> Path | str:
-    """Return the path of a local file, or an http or https URL unchanged."""
-    return value if isinstance(value, str) and value.lower().startswith(("http://", "https://")) else Path(value)
-
-
 def input_files(job: JobFiles) -> list[InputFile]:
     """Return all files that a job needs.
 

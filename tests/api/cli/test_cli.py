@@ -906,10 +906,30 @@ def test_weights_list_and_fetch(
     assert "missing.pth" in capsys.readouterr().err
 
 
-def test_help_and_version_import_no_pytorch() -> None:
-    check = "import sys, api.cli.main; sys.exit(any(name in sys.modules for name in ('torch', 'numba', 'matplotlib')))"
+@pytest.mark.parametrize(
+    ("arguments", "unneeded"),
+    [
+        (["--version"], "torch numpy scipy ray numba matplotlib pydantic typer"),
+        (["--help"], "torch numpy scipy ray numba matplotlib pydantic"),
+        (["stylize", "--help"], "torch scipy ray numba matplotlib httpx2"),
+    ],
+)
+def test_short_calls_import_little(arguments: list[str], unneeded: str) -> None:
+    check = (
+        "import sys; from api.cli.__main__ import run; code = run(); "
+        f"sys.exit(code or ' '.join(set({unneeded.split()}) & sys.modules.keys()) or 0)"
+    )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    assert subprocess.run([sys.executable, "-c", check], env=environment).returncode == 0
+    ended = subprocess.run([sys.executable, "-c", check, *arguments], env=environment, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_summaries_of_commands_are_theirs(capsys: pytest.CaptureFixture[str]) -> None:
+    group: Any = typer.main.get_command(app)
+    assert main(["--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for name, command in group.commands.items():
+        assert f" {name} {command.help.split('.')[0]}" in shown
 
 
 @pytest.mark.parametrize(
