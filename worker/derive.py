@@ -17,14 +17,16 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.blending import blend_scenes, encode_blend
 from sgsst_core.files.formats import format_of_name, read_scene_header, scene_path
 from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.sog import META_NAME
 from sgsst_core.files.formats.streamed_sog import INDEX_NAME, STREAMED_SOG
 from sgsst_core.files.library import load_scene
-from sgsst_core.files.scene_file import encode_scene, read_scene, write_levels, write_sog_folder
+from sgsst_core.files.scene_file import encode_scene, losses, read_scene, write_levels, write_sog_folder
 from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
 from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
 from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.settings import Settings
 from worker.capture import about_notes, about_rendering, choose_axes, read_capture
@@ -120,21 +122,27 @@ def convert(
         write_usd(out, scene)
     else:
         with _written(out, in_place=in_place) as stream:
-            encode_scene(stream, scene, result_format(out), out, pad_sh=pad_sh)
+            encode_scene(stream, scene, result_format(out), out, pad_sh=pad_sh, axes=file.axes)
     stated = CLASSIC if is_usd else read_scene_header(out).tag.rendering
     if stated != scene.rendering:
         reason = f"its format cannot state {scene.rendering.text}"
         decisions += [Decision("rendering", f"warning: {out.name} will be drawn {stated.text}", reason)]
+    decisions += [] if is_usd or compare else about_losses(scene, read_scene_header(out).format, out)
     loss = None
     if compare:
         background = settings.background if settings else (0.0, 0.0, 0.0)
-        loss = measure_compression(out, scene, cameras, background=background, near=source.near)
+        loss = measure_compression(out, scene, cameras, background=background, near=source.near, axes=file.axes)
         loss = replace(loss, size=size or loss.size)
     return Converted(describe_scene(file), tuple(decisions), loss)
 
 
-def blend(parts: Sequence[tuple[SceneRequest, float]], out: Path, *, in_place: bool = False) -> None:
-    """Write the weighted mean of scenes that differ only in color.
+def about_losses(scene: Scene, format: SceneFormat, out: Path) -> list[Decision]:
+    """Return warnings about what a format cannot hold of a scene."""
+    return [Decision("scene", f"warning: {out.name} loses detail", note) for note in losses(scene, format)]
+
+
+def blend(parts: Sequence[tuple[SceneRequest, float]], out: Path, *, in_place: bool = False) -> list[Decision]:
+    """Write the weighted mean of scenes that differ only in color, and return warnings about what is lost.
 
     Args:
         parts: Scenes with their weights, which are divided by their sum. Cameras are not used.
@@ -154,6 +162,7 @@ def blend(parts: Sequence[tuple[SceneRequest, float]], out: Path, *, in_place: b
     out.parent.mkdir(parents=True, exist_ok=True)
     with _written(out, in_place=in_place) as stream:
         encode_blend(stream, blended, format, out)
+    return about_losses(blended.scene, format, out)
 
 
 @contextmanager

@@ -226,10 +226,10 @@ def _write_compressed(job: Job) -> CompressionLoss | None:
     if format is STREAMED_SOG:
         write_levels(path, scene, job.scene_file.path)
     else:
-        write_scene(path, scene, format)
-    settings = stylizer.job.settings
+        write_scene(path, scene, format, job.scene_file.axes)
+    settings, cameras = stylizer.job.settings, stylizer.job.views.cameras
     return measure_compression(
-        path, scene, stylizer.job.views.cameras, background=settings.background, near=settings.near
+        path, scene, cameras, background=settings.background, near=settings.near, axes=job.scene_file.axes
     )
 
 

@@ -66,7 +66,7 @@ class ViewOptions(BaseModel):
     spz_axes: SpzAxes = Field(
         "auto",
         description="Axes of an SPZ scene: rub (y up, z backward) or rdf (y down, z forward, as in a PLY); auto: as "
-        "the file states, else decided by cameras or the up direction, else rdf.",
+        "the file states, else decided by cameras or the up direction, else rub.",
     )
     render_mode: RenderMode = Field(
         "auto",

@@ -471,6 +471,8 @@ def _print_compression_loss(client: Client, job_id: str, format: DownloadName | 
         loss = json.loads(client.download(job_id, Path(folder, "loss.json"), name).read_text())
     psnr = "renders identical to" if loss["psnr_db"] is None else f"{loss['psnr_db']:.1f} dB PSNR against"
     error_console.print(f"{format}, {loss['bytes'] / 1e6:.1f} MB, {psnr} the PLY")
+    for warning in loss.get("warnings", []):
+        error_console.print(f"warning: {warning}")
 
 
 def _print_job(job: Job, as_json: bool) -> None:

@@ -292,7 +292,9 @@ def blend(
     """Blend scenes that differ only in color: a scene and its results, or several results."""
     from api.cli.scene_tools import blend_files
 
-    blended = blend_files(scenes, out, options)
+    blended, warnings = blend_files(scenes, out, options)
+    for line in warnings:
+        print_field(line.item, f"{line.decision}: {line.reason}")
     for path, weight in blended:
         print_field("weight", f"{weight:.4g} of {path}")
     print_field("scene", out)

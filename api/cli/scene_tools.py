@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from api.cli.arguments import local_path
-from sgsst_core.decision import warnings_of
+from sgsst_core.decision import Decision, warnings_of
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.atomic import ensure_writable_folder, write_json
 from sgsst_core.files.blending import normalized
@@ -158,8 +158,13 @@ def view_file_names(cameras: Sequence[Camera]) -> list[str]:
 # --- blend ---------------------------------------------------------------------------------------------------------
 
 
-def blend_files(texts: Sequence[str], out: Path, options: ViewOptions) -> list[tuple[Path, float]]:
-    """Write the weighted mean of scenes that differ only in color, and return each scene with its normalized weight.
+def blend_files(
+    texts: Sequence[str], out: Path, options: ViewOptions
+) -> tuple[list[tuple[Path, float]], list[Decision]]:
+    """Write the weighted mean of scenes that differ only in color.
+
+    Returns:
+        Each scene with its normalized weight, and warnings about what the format cannot hold.
 
     Args:
         texts: FILE or FILE:WEIGHT of each scene.
@@ -172,5 +177,6 @@ def blend_files(texts: Sequence[str], out: Path, options: ViewOptions) -> list[t
     if len(paths) < 2:
         raise SettingsError("There is one scene to blend. Give at least two, such as scene.ply:0.3 stylized.ply:0.7.")
     fractions = normalized(weights)
-    blend([(SceneRequest.of(path, None, options), weight) for path, weight in zip(paths, weights, strict=True)], out)
-    return list(zip(paths, fractions, strict=True))
+    parts = [(SceneRequest.of(path, None, options), weight) for path, weight in zip(paths, weights, strict=True)]
+    warnings = blend(parts, out)
+    return list(zip(paths, fractions, strict=True)), warnings

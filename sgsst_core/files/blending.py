@@ -68,7 +68,7 @@ def encode_blend(output: BinaryIO, blend: SceneFile, format: SceneFormat, target
     if format is PLY:
         encode_stylized(output, blend, blend.scene.sh_dc, target)
     else:
-        encode_scene(output, blend.scene, format, target)
+        encode_scene(output, blend.scene, format, target, axes=blend.axes)
 
 
 def normalized(weights: Sequence[float]) -> list[float]:

@@ -123,11 +123,12 @@ def png_profile(chunks: Mapping[bytes, bytes]) -> bytes:
         return _matrix_profile(_PRIMARIES[primaries], _CURVES[transfer])
     if b"sRGB" in chunks or not chunks:
         return b""
-    points, curve = _REC_709, _SRGB_CURVE
+    points: Sequence[tuple[float, float]] = _REC_709
+    curve: Sequence[float] = _SRGB_CURVE
     try:
         if b"cHRM" in chunks:
             values = [value / 1e5 for value in struct.unpack(">8I", chunks[b"cHRM"])]
-            points = tuple(zip(values[::2], values[1::2], strict=True))
+            points = list(zip(values[::2], values[1::2], strict=True))
         if b"gAMA" in chunks:
             gamma = 1e5 / struct.unpack(">I", chunks[b"gAMA"])[0]
             is_srgb = abs(gamma - _SRGB_GAMMA) < _GAMMA_ROUNDING and np.allclose(points, _REC_709, 0, _PRIMARY_ROUNDING)
@@ -155,7 +156,7 @@ def _matrix_profile(points: Sequence[tuple[float, float]], curve: Sequence[float
         raise ArithmeticError
 
     def numbers(values: Sequence[float] | NDArray[np.float64]) -> bytes:
-        return np.rint(65536 * np.asarray(values)).astype(">i4").tobytes()
+        return bytes(np.rint(65536 * np.asarray(values)).astype(">i4").data)
 
     tags = {"wtpt": b"XYZ " + bytes(4) + numbers(_D50)}
     for name, column in zip("rgb", adapted.T, strict=True):

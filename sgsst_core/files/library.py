@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -13,7 +14,7 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, format_of_name
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.spz import SpzAxes
-from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
+from sgsst_core.files.scene_file import SceneFile, losses, read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.files.trainer_checkpoints import (
     CHECKPOINT_SUFFIXES,
@@ -107,7 +108,9 @@ def save(path: str | Path, scene: AnyScene) -> None:
     elif format is PLY and isinstance(scene, SceneFile) and scene.header is not None:
         write_stylized(scene, path, scene.scene.sh_dc, sh_attenuation=scene.sh_attenuation)
     else:
-        write_scene(path, as_scene(scene), format)
+        write_scene(path, as_scene(scene), format, scene.axes if isinstance(scene, SceneFile) else "rub")
+    for note in losses(as_scene(scene), format) if format else ():
+        warnings.warn(f"{path.name}: {note}", stacklevel=2)
 
 
 def as_scene(scene: AnyScene) -> Scene:

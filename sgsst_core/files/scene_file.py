@@ -53,6 +53,10 @@ HELD_BYTES = 1 << 28
 
 #: Standard 3DGS properties by their names in PLY files: field of `Scene`, and column of its tensor.
 _STANDARD = {name: (field, column) for field, names in PROPERTIES.items() for column, name in enumerate(names)}
+#: Distance between positions, relative to a Gaussian's standard deviation, above which rounding moves it visibly.
+_COARSE = 4.0
+#: Names of arrays in notes.
+_TITLES = {"scales": "log scales", "sh_dc": "colors (f_dc)", "sh_rest": "spherical harmonics"}
 #: Properties that differ between the pieces of a split Gaussian.
 _SHAPE = (*PROPERTIES["means"], "opacity", *PROPERTIES["scales"], FILTER_3D)
 
@@ -71,6 +75,7 @@ class SceneFile:
         tag: Render mode that the file states. `scene.rendering` is another one if it was requested.
         copies: Number of pieces that each original Gaussian was split into, [N] int64; None if no Gaussian was split.
         sh_attenuation: SH attenuation that the scene has, but not the file.
+        axes: Axes that the scene has in an SPZ: those of the file, else RUB.
     """
 
     path: Path
@@ -84,6 +89,7 @@ class SceneFile:
     tag: RenderTag = UNTAGGED
     copies: NDArray[np.int64] | None = None
     sh_attenuation: float = 0.0
+    axes: str = "rub"
 
     def refined(self, refinement: Refinement | None) -> SceneFile:
         """Return the file with its scene refined; the file itself if no Gaussian was split.
@@ -138,7 +144,7 @@ def read_scene(
             Properties that 3DGS does not use are not checked.
         held_bytes: Maximum bytes of SH coefficients above degree 0 in memory. If they take more, they stay in the file
             (`StoredHarmonics`), provided that its layout allows this; see `stays_in_file`. None for `HELD_BYTES`.
-        spz_axes: Axes of an SPZ file, "rub" or "rdf"; "auto" for those that the file states, else "rdf".
+        spz_axes: Axes of an SPZ file, "rub" or "rdf"; "auto" for those that the file states, else "rub".
 
     Raises:
         SceneError: If the file cannot be read, is truncated, is not a 3DGS scene, has a wrong header, no Gaussians or
@@ -147,7 +153,7 @@ def read_scene(
     path = scene_path(path)
     header = read_scene_header(path)
     if isinstance(header, SpzHeader):
-        header = replace(header, axes=spz_axes)
+        header = replace(header, requested=spz_axes)
     ply = header.ply if isinstance(header, PlySceneHeader) else None
     offset = element_offsets(path, ply).get("vertex", 0) if ply else 0
     file = RowFile(path)
@@ -157,10 +163,10 @@ def read_scene(
         row = header.ply.vertex.dtype
         column = row.fields["f_rest_0"][1] if row.fields else 0
         stored = RowLayout(path, stamp, offset, header.count, row.itemsize, column, header.stored_coefficients)
-    columns, notes = SceneColumns(header, stored), header.notes
+    columns = SceneColumns(header, stored)
     about_rest = surplus(path, ply) if ply else ()
     if header.format.read is not None:
-        notes += header.format.read(file, header, columns.arrays) or ()
+        header = header.format.read(file, header, columns.arrays) or header
         for block in blocks(header.count):
             columns.check(block.start, block.stop - block.start)
     elif ply is not None and ply.text:
@@ -171,7 +177,7 @@ def read_scene(
         _read_binary(file, ply, offset, columns)
     file.check_unchanged(stamp)
     retained = columns.valid_rows(path, drop_invalid, about_rest)
-    notes += about_rest
+    notes = (*header.notes, *about_rest)
     notes += check_units(path, columns.arrays, FLAT, logits_stored=header.format is PLY)
     if ply is not None and ply.has_double_positions:
         notes += about_rounded_positions(columns.arrays["means"], columns.arrays["scales"])
@@ -184,7 +190,9 @@ def read_scene(
     if isinstance(header, PlySceneHeader) and header.sources:
         ply = None
     clamped = sum(columns.clamped)
-    return SceneFile(path, scene, ply, retained, stamp, header.format.name, clamped, notes, header.tag)
+    return SceneFile(
+        path, scene, ply, retained, stamp, header.format.name, clamped, notes, header.tag, axes=header.axes
+    )
 
 
 def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
@@ -209,14 +217,32 @@ def stays_in_file(declared: SceneHeader, held_bytes: int | None = None) -> bool:
     return plain and dtype.itemsize % 4 == 0 and offset % 4 == 0 and 4 * count * header.vertex.count > limit
 
 
-def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY) -> None:
+def write_scene(path: Path, scene: Scene, format: SceneFormat = PLY, axes: str = "rub") -> None:
     """Write a scene to a file, atomically; see `encode_scene`.
 
     Raises:
         OutputError: If the file cannot be written, or the format cannot represent the scene.
     """
     with atomic_path(path) as temporary, temporary.open("wb") as output:
-        encode_scene(output, scene, format, path)
+        encode_scene(output, scene, format, path, axes=axes)
+
+
+def losses(scene: Scene, format: SceneFormat) -> tuple[str, ...]:
+    """Return notes that count the Gaussians that a format cannot hold: values that it clips, or rounds too much."""
+    arrays, notes = arrays_of(scene), []
+    scales = arrays["scales"].max(axis=1)  # a Gaussian that is thin in one axis looks the same
+    for name, (low, high) in format.limits.ranges.items():
+        values = (scales if name == "scales" else arrays[name]).reshape(len(scene), -1)
+        clipped = int(((values < low) | (values > high)).any(axis=1).sum())
+        if clipped:
+            title = f"{_TITLES[name]} outside {low:.3g} to {high:.3g}, which {format.title} clips"
+            notes.append(f"{clipped:,} of {len(scene):,} Gaussians have {title}")
+    if format.limits.step is not None:
+        coarse = int((format.limits.step(arrays["means"]) > _COARSE * np.exp(scales.astype(np.float64))).sum())
+        if coarse:
+            moved = f"{format.title} moves {coarse:,} of {len(scene):,} Gaussians"
+            notes.append(f"{moved} by up to more than their size, because others are far away")
+    return tuple(notes)
 
 
 def write_levels(target: Path, scene: Scene, original: Path) -> int:
@@ -274,7 +300,9 @@ def write_sog_folder(folder: Path, scene: Scene) -> int:
         return sum(entry.file_size for entry in archive.infolist())
 
 
-def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Path, *, pad_sh: bool = False) -> None:
+def encode_scene(
+    output: BinaryIO, scene: Scene, format: SceneFormat, target: Path, *, pad_sh: bool = False, axes: str = "rub"
+) -> None:
     """Write a scene to a stream.
 
     Formats other than PLY omit SH bands that are 0 in all Gaussians, and may change the order of the Gaussians.
@@ -282,6 +310,7 @@ def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Pa
     Args:
         format: One of `RESULT_FORMATS`.
         pad_sh: Whether a PLY has the coefficients of degree 3, with zeros for missing ones; ignored for other formats.
+        axes: Axes of an SPZ; ignored for other formats.
 
     Raises:
         OutputError: If the format cannot represent the scene.
@@ -293,7 +322,7 @@ def encode_scene(output: BinaryIO, scene: Scene, format: SceneFormat, target: Pa
         if format is PLY:
             write_ply(output, arrays_of(scene), scene.rendering, COEFFICIENTS[3] if pad_sh else 0)
         else:
-            format.write(output, arrays_of(scene), scene.rendering)
+            format.write(output, arrays_of(scene), scene.rendering, *([axes] if format.has_axes else []))
     except OutputError as error:
         raise OutputError(f"{target}: {error}") from error
 

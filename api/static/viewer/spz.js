@@ -39,7 +39,7 @@ export async function spz(reader) {
     /** @type {Uint8Array<ArrayBuffer>[]} */
     const sections = [];
     for (const size of sizes) sections.push(await reader.take(size));
-    return { sections, rotated: Boolean(head.getUint8(14) & 2) && statesRub(await reader.peek(MAX_EXTENSIONS)) };
+    return { sections, rotated: !(head.getUint8(14) & 2) || statesRub(await reader.peek(MAX_EXTENSIONS)) };
   }, SPZ_4 - 1);
 }
 
@@ -98,7 +98,7 @@ function spzScene(head, load, newest) {
 }
 
 /**
- * Return whether extension records state that the axes are RUB. A record has a type, a length in bytes, and content.
+ * Return whether extension records state that the axes are RUB, or none. A record has a type, a length in bytes, and content.
  *
  * @param {Uint8Array} records
  */
@@ -107,7 +107,7 @@ function statesRub(records) {
   for (let o = 0; o + 12 <= records.length; o += 8 + view.getUint32(o + 4, true)) {
     if (view.getUint32(o, true) === AXES_EXTENSION) return [0, 4].includes(view.getUint32(o + 8, true));
   }
-  return false;
+  return true;
 }
 
 /**

@@ -9,7 +9,7 @@ layout is that of `splat-transform` (https://github.com/playcanvas/splat-transfo
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -39,6 +39,7 @@ from sgsst_core.files.formats.quantized import (
 from sgsst_core.files.formats.scene_format import (
     Arrays,
     FileStart,
+    Limits,
     OpenScene,
     SceneFormat,
     SceneHeader,
@@ -119,8 +120,8 @@ def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, .
         )
 
 
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
-    """Fill the arrays of a scene, and return the note on bytes after the last element."""
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
+    """Fill the arrays of a scene, and return the header with the note on bytes after the last element."""
     assert isinstance(header, CompressedPlyHeader)
     notes = surplus(file.path, header.ply)
     starts = element_offsets(file.path, header.ply)
@@ -138,7 +139,7 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
             for i in range(3 * header.coefficients):
                 channel, index = divmod(i, header.coefficients)
                 into["sh_rest"][block, index, channel] = _HARMONICS[harmonics[f"f_rest_{i}"]]
-    return notes
+    return replace(header, notes=(*header.notes, *notes))
 
 
 def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
@@ -245,4 +246,17 @@ def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[Any]:
     return packed
 
 
-COMPRESSED_PLY = SceneFormat("compressed.ply", "compressed PLY", 61, _matches, _read_header, _read, _write)
+def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the largest distance between positions that can be stored in the chunk of each Gaussian, [n]."""
+    order = along_curve(means)
+    starts = np.arange(0, len(means), CHUNK_ROWS)
+    ends = (side.reduceat(means[order].astype(np.float64), starts) for side in (np.maximum, np.minimum))
+    steps = np.empty(len(means))
+    steps[order] = (np.subtract(*ends) / (2047, 1023, 2047)).max(axis=1)[np.arange(len(means)) // CHUNK_ROWS]
+    return steps
+
+
+COMPRESSED_PLY = SceneFormat(
+    *("compressed.ply", "compressed PLY", 61, _matches, _read_header, _read, _write),
+    limits=Limits({"scales": (-_LARGEST_SCALE, _LARGEST_SCALE), "sh_rest": (-4.0, 4.0)}, _step),
+)

@@ -60,7 +60,7 @@ class Frame:
 
         x, y, z, w = Rotation.from_matrix(self.rotation).as_quat()
         turn = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])  # left multiplication, wxyz
-        harmonics = self._harmonics(arrays["sh_rest"].shape[1])
+        harmonics = harmonics_matrix(self.rotation, arrays["sh_rest"].shape[1])
         for part in blocks(len(arrays["means"])):
             block = {name: array[part] for name, array in arrays.items()}
             means = block["means"].astype(np.float64)
@@ -71,14 +71,15 @@ class Frame:
             rest = block["sh_rest"].astype(np.float64)
             block["sh_rest"][:] = np.einsum("ij,njc->nic", harmonics, rest)
 
-    def _harmonics(self, coefficients: int) -> NDArray[np.float64]:
-        """Return the matrix of SH coefficients above degree 0, [coefficients, coefficients].
 
-        A rotated function has the value at d that the original has at the inversely rotated d, for all directions d.
-        """
-        directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        values = (spherical_harmonics(*each.T)[:coefficients] for each in (directions, directions @ self.rotation))
-        new, old = (np.reshape(each, (coefficients, _DIRECTIONS)).T for each in values)
-        matrix: NDArray[np.float64] = np.round(np.linalg.lstsq(new, old, rcond=None)[0], _DECIMALS)
-        return matrix
+def harmonics_matrix(rotation: NDArray[np.float64], coefficients: int) -> NDArray[np.float64]:
+    """Return the matrix of SH coefficients above degree 0, [coefficients, coefficients], of a rotation or reflection.
+
+    A rotated function has the value at d that the original has at the inversely rotated d, for all directions d.
+    """
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    values = (spherical_harmonics(*each.T)[:coefficients] for each in (directions, directions @ rotation))
+    new, old = (np.reshape(each, (coefficients, _DIRECTIONS)).T for each in values)
+    matrix: NDArray[np.float64] = np.round(np.linalg.lstsq(new, old, rcond=None)[0], _DECIMALS)
+    return matrix

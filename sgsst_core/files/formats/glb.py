@@ -34,6 +34,7 @@ from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
     Arrays,
     FileStart,
+    Limits,
     OpenScene,
     RenderTag,
     SceneFormat,
@@ -441,4 +442,8 @@ def _matches(start: FileStart) -> bool:
     return start.head.startswith(_MAGIC)
 
 
-GLB = SceneFormat("glb", "GLB", 240, _matches, _read_header, _read, _write, media_type="model/gltf-binary")
+GLB = SceneFormat(
+    *("glb", "GLB", 240, _matches, _read_header, _read, _write),
+    media_type="model/gltf-binary",
+    limits=Limits({"scales": _LOG_SCALES}),
+)

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import codecs
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,13 +85,32 @@ class SceneHeader:
     Attributes:
         coefficients: SH coefficients per color channel above degree 0.
         notes: Notes on contents that are not read, or not read as stored.
+        axes: Axes that the scene has in an SPZ, see `spz`.
     """
 
     format: SceneFormat
     count: int
     coefficients: int
     notes: tuple[str, ...] = field(default=(), kw_only=True)
+    axes: str = field(default="rub", kw_only=True)
     tag: RenderTag = field(default=UNTAGGED, kw_only=True)
+
+
+class Limits(NamedTuple):
+    """What a format can store.
+
+    Attributes:
+        ranges: Lowest and highest value by the name of the array. That of "scales" holds for the largest of each
+            Gaussian.
+        step: Distance between positions that can be stored, for positions [n, 3]: [n], or the same for all. None if
+            positions are floats.
+    """
+
+    ranges: Mapping[str, tuple[float, float]] = {}
+    step: Callable[[NDArray[np.float32]], NDArray[np.float64]] | None = None
+
+
+_UNLIMITED = Limits()
 
 
 @dataclass(frozen=True)
@@ -109,10 +128,13 @@ class SceneFormat:
         read_header: Header check: reads the header without allocating memory for the data, and compares it with the
             size of the file. Raises a SceneError if the header is wrong or the file is truncated. It runs in the API
             process.
-        read: Reader. It fills arrays that were allocated by the header, and may return further notes. It need not check
-            for non-finite values. None for PLY, which `scene_file` reads, because its other data is written back.
+        read: Reader. It fills arrays that were allocated by the header, and may return a header with more notes. It
+            need not check for non-finite values. None for PLY, which `scene_file` reads, because its other data is
+            written back.
         write: Writer of a scene's arrays and its render mode, if the format can state one. It raises an OutputError
             without path if it cannot represent the arrays. None if the format is only read.
+        limits: What is lost beyond.
+        has_axes: Whether the writer takes axes as a fourth argument.
     """
 
     name: str
@@ -120,9 +142,11 @@ class SceneFormat:
     bytes_per_gaussian: int
     matches: Callable[[FileStart], bool]
     read_header: Callable[[FileStart], SceneHeader]
-    read: Callable[[OpenScene, SceneHeader, Arrays], tuple[str, ...] | None] | None = None
-    write: Callable[[BinaryIO, Arrays, Rendering], None] | None = None
+    read: Callable[[OpenScene, SceneHeader, Arrays], SceneHeader | None] | None = None
+    write: Callable[..., None] | None = None
     media_type: str = "application/octet-stream"
+    limits: Limits = _UNLIMITED
+    has_axes: bool = False
 
     @property
     def suffix(self) -> str:

@@ -40,6 +40,7 @@ from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
     Arrays,
     FileStart,
+    Limits,
     OpenScene,
     SceneFormat,
     SceneHeader,
@@ -414,4 +415,10 @@ def _webp(pixels: NDArray[np.uint8], width: int) -> bytes:
     return file.getvalue()
 
 
-SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write)
+def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the distance between positions that can be stored at each Gaussian, [n]."""
+    low, high = _encoded_positions(means)[1]
+    return np.max((high - low) / 65535 * (1 + np.abs(means)), axis=1)  # type: ignore[no-any-return]
+
+
+SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write, limits=Limits(step=_step))

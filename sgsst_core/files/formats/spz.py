@@ -7,12 +7,13 @@ decompression, so the decompressed data is never in memory as a whole. The layou
 https://github.com/nianticlabs/spz. Versions 1 to 3 are one gzip stream, which a few programs leave out. Version 4 has
 an uncompressed header and one zstd stream per attribute. SH coefficients of degree 4 are skipped.
 
-Axes are a matter of convention. Most programs store those of the PLY (RDF: x right, y down, z forward) unchanged; the
-format's library stores RUB (x right, y up, z backward) by default. An extension of the format states them. Written
-files have the axes of the PLY, and say so. Files that state nothing are read as RDF unless RUB is requested.
+Axes are a matter of convention: 16 of them have numbers, by the directions of x, y and z. The format's library stores
+RUB (x right, y up, z backward) unless an extension record states others, which many readers ignore. Some programs store
+those of the PLY (RDF: x right, y down, z forward) without saying so. Scenes keep the axes of the SPZ that they come
+from; others get RUB. Files of version 3 have no record, because readers refuse what follows the Gaussians.
 
 A flag states that a scene was trained antialiased. Spark sets it for all scenes. It writes versions up to 3 without
-extension records, so the flag counts only in other files.
+extension records and with the fractional bits of the format's library, so the flag counts in other files only.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from numpy.typing import NDArray
 
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.advice import converted
+from sgsst_core.files.formats.frame import harmonics_matrix
 from sgsst_core.files.formats.quantized import OPACITY_LOGITS, opacity_bytes, with_largest, without_largest
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
@@ -40,6 +41,7 @@ from sgsst_core.files.formats.scene_format import (
     UNTAGGED,
     Arrays,
     FileStart,
+    Limits,
     OpenScene,
     RenderTag,
     SceneFormat,
@@ -56,8 +58,7 @@ from sgsst_core.files.formats.scene_format import (
 )
 from sgsst_core.scene.rendering import Rendering
 
-Axes = Literal["rub", "rdf"]
-#: Requested axes; "auto" for those that the file states, else RDF.
+#: Requested axes; "auto" for those that the file states, else RUB.
 SpzAxes = Literal["auto", "rub", "rdf"]
 
 _MAGIC = b"NGSP"
@@ -68,6 +69,8 @@ _OLD_VERSIONS = tuple(struct.pack("<I", version) for version in (1, 2, 3))
 _DEFLATE_RATIO = 1032
 
 _READ_BYTES = 1 << 18
+#: Maximum bytes of a file's name, which gzip stores before the data.
+_NAME_BYTES = 1 << 20
 #: Maximum bytes of extensions.
 _EXTENSION_BYTES = 1 << 20
 #: Maximum window of zstd, the default limit of its command-line program: 2^27 bytes.
@@ -77,21 +80,17 @@ _ZSTD_RATIO = (1 << 17) // 4
 
 #: Type of the extension record that states the axes, and its numbers for them; 0 stands for the library's default.
 _AXES_EXTENSION = 0xADBE0003
-_AXES_NUMBERS: dict[int, Axes] = {0: "rub", 4: "rub", 6: "rdf"}
-#: Extension record of written files, which states the axes of a PLY.
-_AXES_RECORD = struct.pack("<III", _AXES_EXTENSION, 4, 6)
-_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
+_AXES = ["rub", "ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"]
+_AXES += ["lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu"]
+#: Directions of axes in those of a PLY, by the letters of names.
+_DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "d": (0, 1, 0), "u": (0, -1, 0), "f": (0, 0, 1), "b": (0, 0, -1)}
+_ANTIALIASED, _HAS_EXTENSIONS, _LEVELS = 1, 2, 0x80
+#: Fractional bits that the format's library and Spark write.
+_USUAL_BITS = 12
 _ENDS_EARLY = "the data ends before all Gaussians that the header declares"
-_ASSUMED_AXES = "axes: read as rdf; the file states none. If the scene is upside down, pass --spz-axes rub"
+_ASSUMED_AXES = "axes: read as rub; the file states none. If the scene is upside down, pass --spz-axes rdf"
 #: Maximum number of unknown extensions that a note names.
 _NOTED_EXTENSIONS = 8
-
-#: Sign changes of a rotation by 180 degrees about x, which converts between RDF and RUB: for positions, rotations
-#: (wxyz), and real spherical harmonics of degree 1 to 3. An SH function changes its sign if its polynomial has an odd
-#: total power of y and z.
-_FLIP = np.array([1, -1, -1], np.float32)
-_FLIP_QUATS = np.array([1, 1, -1, -1], np.float32)
-_FLIP_HARMONICS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 _SCALES = (np.arange(256) / 16 - 10).astype(np.float32)
 #: SH coefficient of degree 0 for each byte. Their range exceeds that of colors in 0..1.
@@ -126,6 +125,7 @@ class SpzHeader(SceneHeader):
         zipped: Whether the stream of version 1 to 3 is compressed by gzip.
         extended: Whether there are extension records; they follow the Gaussians of version 1 to 3.
         stated_axes: Axes that a file of version 4 states; None if it does not, and for other versions.
+        requested: Requested axes.
     """
 
     size: int
@@ -136,8 +136,8 @@ class SpzHeader(SceneHeader):
     streams: tuple[tuple[int, int], ...] = ()
     zipped: bool = True
     extended: bool = False
-    stated_axes: Axes | None = None
-    axes: SpzAxes = "auto"
+    stated_axes: str | None = None
+    requested: SpzAxes = "auto"
 
     @property
     def may_state_axes(self) -> bool:
@@ -161,16 +161,18 @@ def _old_header(file_start: FileStart) -> SpzHeader:
     zipped = head.startswith(_GZIP_MAGIC)
     try:
         start = zlib.decompressobj(31).decompress(head, 16) if zipped else head[:16]
+        if len(start) < 16 and zipped:  # after a long file name
+            start = zlib.decompressobj(31).decompress(read_bytes(path, 0, _NAME_BYTES), 16)
     except zlib.error as error:
         raise SceneError(f"{path}: is a damaged gzip file: {error}. Copy or export it again.") from error
-    if not start.startswith(_MAGIC):
+    if not start.startswith(_MAGIC) and not _MAGIC.startswith(start):
         raise SceneError(f"{path}: is a gzip file, but no SPZ scene. Unpack it first (gunzip), and give what is in it.")
     header = _shared_fields(file_start, start, (1, 2, 3))
     needed = 16 + sum(header.sections)
     if needed > (_DEFLATE_RATIO if zipped else 1) * header.size:
         declared = f"the header declares {header.count} Gaussians, which take {needed} bytes"
         raise truncated(path, f"{declared}, more than the file's {header.size} bytes can hold")
-    return replace(header, format=SPZ_3, zipped=zipped, tag=_tag(start[14], believed=header.extended))
+    return replace(header, format=SPZ_3, zipped=zipped, tag=_tag(start[14], header))
 
 
 def _zstd_header(file_start: FileStart) -> SpzHeader:
@@ -196,15 +198,16 @@ def _zstd_header(file_start: FileStart) -> SpzHeader:
         streams.append((position, compressed))
         position += compressed
     notes = (*extensions.notes(header.degree), *about_part(path, position, size))
-    tag = _tag(head[14], believed=True)
-    return replace(header, streams=tuple(streams), stated_axes=axes, notes=notes, tag=tag)
+    return replace(
+        header, streams=tuple(streams), stated_axes=axes, notes=(*header.notes, *notes), tag=_tag(head[14], header)
+    )
 
 
-def _tag(flags: int, *, believed: bool) -> RenderTag:
+def _tag(flags: int, header: SpzHeader) -> RenderTag:
     """Return the render mode that the flags state; if the flag is ignored, return the default mode with a warning."""
     if not flags & _ANTIALIASED:
         return UNTAGGED
-    if believed:
+    if header.version > 3 or header.extended or header.fractional_bits != _USUAL_BITS:
         return stated("antialiased", "the file's flag")
     reason = (
         "the file's flag says antialiased, but Spark sets it for all scenes; if the scene was trained so, add "
@@ -237,17 +240,17 @@ class _Extensions:
             records.append((kind, data[position - length : position]))
         return _Extensions(records, without_padding(data[position:]))
 
-    def axes(self, path: Path) -> Axes | None:
+    def axes(self, path: Path) -> str | None:
         """Return the stated axes; None if there are none."""
         for kind, content in self.records:
             if kind == _AXES_EXTENSION and len(content) >= 4:
                 number = int.from_bytes(content[:4], "little")
-                if number not in _AXES_NUMBERS:
+                if number >= len(_AXES):
                     raise SceneError(
-                        f"{path}: has the axes of SPZ's coordinate system {number}; RUB (4) and RDF (6) can be read. "
+                        f"{path}: has the axes of SPZ's coordinate system {number}; 0 to {len(_AXES) - 1} can be read. "
                         "Export it with one of these."
                     )
-                return _AXES_NUMBERS[number]
+                return _AXES[number]
         return None
 
     def notes(self, degree: int) -> tuple[str, ...]:
@@ -266,9 +269,17 @@ def _shared_fields(start: FileStart, head: bytes, versions: tuple[int, ...]) -> 
         raise SceneError(f"{path}: ends within its SPZ header: the file is truncated. Copy or export it again.")
     version, count, degree, fractional_bits = struct.unpack_from("<IIBB", head, 4)
     if version not in versions:
-        raise SceneError(f"{path}: is SPZ of version {version}, which cannot be read. {converted('scene.spz')}")
+        raise SceneError(
+            f"{path}: is SPZ of version {version}{' in a gzip stream' * (version == 4)}, which cannot be read. Export "
+            "it as SPZ 4 or 3, or as PLY."
+        )
     if degree not in STORED_COEFFICIENTS:
-        raise SceneError(f"{path}: has SH degree {degree}; 0 to 4 can be read. {converted('scene.spz')}")
+        raise SceneError(f"{path}: has SH degree {degree}; 0 to 4 can be read. Export it as PLY.")
+    if head[14] & _LEVELS:
+        raise SceneError(
+            f"{path}: holds the levels of detail of Spark, whose Gaussians stand for each other. Give the scene that "
+            "it was made of."
+        )
     if not count:
         raise SceneError(f"{path}: holds no Gaussians. Export the scene again.")
     if version > 1 and not fractional_bits <= 24:
@@ -284,11 +295,14 @@ def _shared_fields(start: FileStart, head: bytes, versions: tuple[int, ...]) -> 
         3 * STORED_COEFFICIENTS[degree] * count,
     )
     drawn, extended = COEFFICIENTS[min(degree, 3)], bool(head[14] & _HAS_EXTENSIONS)
-    return SpzHeader(SPZ, count, drawn, start.size, version, degree, fractional_bits, sections, extended=extended)
+    unknown = head[14] & ~(_ANTIALIASED | _HAS_EXTENSIONS)
+    notes = (f"the flags {unknown:#x} of the SPZ header are unknown and ignored",) if unknown else ()
+    fields = (count, drawn, start.size, version, degree, fractional_bits, sections)
+    return SpzHeader(SPZ, *fields, extended=extended, notes=notes)
 
 
-def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
-    """Fill the arrays of a scene, and return notes on version 1 to 3, and on axes that the file does not state."""
+def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> SpzHeader:
+    """Fill the arrays of a scene, and return the header with its axes, and further notes."""
     assert isinstance(spz, SpzHeader)
     path = file.path
     decoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.uint8]], NDArray[Any]]]] = [
@@ -315,16 +329,47 @@ def _read(file: OpenScene, spz: SceneHeader, into: Arrays) -> tuple[str, ...]:
         for block in blocks(spz.count):
             array[block] = decode(np.frombuffer(take((block.stop - block.start) * row_bytes), np.uint8))
     next(takes, None)  # reach the end of the last stream, where its checksum is verified
-    axes, notes = spz.stated_axes if spz.axes == "auto" else spz.axes, list[str]()
+    axes, notes = spz.stated_axes, list[str]()
     if not spz.streams:
         extensions, end = _extensions(path, stream, spz)
-        axes = extensions.axes(path) if spz.axes == "auto" else axes
+        axes = extensions.axes(path) if spz.requested == "auto" else None
         notes += [*extensions.notes(spz.degree), *about_part(path, end, spz.size)]
-    if axes == "rub":
-        into["means"] *= _FLIP
-        into["quats"] *= _FLIP_QUATS
-        into["sh_rest"] *= _FLIP_HARMONICS[: spz.coefficients, None]
-    return (*notes, *(() if axes else (_ASSUMED_AXES,)))
+    if spz.requested != "auto":
+        axes = spz.requested
+    elif axes is None:
+        notes.append(_ASSUMED_AXES)
+    axes = axes or _AXES[0]
+    if axes != "rdf":
+        for name, array in into.items():
+            for block in blocks(len(array)):
+                array[block] = _with_axes(name, array[block], _matrix(axes))
+    return replace(spz, axes=axes, notes=(*spz.notes, *notes))
+
+
+def _matrix(axes: str) -> NDArray[np.float64]:
+    """Return the matrix [3, 3] that converts vectors of other axes to those of a PLY: a permutation with signs."""
+    return np.array([_DIRECTIONS[letter] for letter in axes], np.float64).T
+
+
+def _with_axes(name: str, values: NDArray[Any], matrix: NDArray[np.float64]) -> NDArray[Any]:
+    """Return the values of an array of a scene in other axes.
+
+    Args:
+        matrix: Permutation with signs, [3, 3]; it may mirror.
+    """
+    order, signs = np.abs(matrix).argmax(axis=1), matrix.sum(axis=1).astype(values.dtype)
+    match name:
+        case "means":
+            values = values[:, order] * signs
+        case "scales":
+            values = values[:, order]
+        case "quats":  # the axis of a rotation is mirrored the other way
+            values = np.hstack([values[:, :1], values[:, 1:][:, order] * signs * round(np.linalg.det(matrix))])
+        case "sh_rest":
+            harmonics = harmonics_matrix(matrix, values.shape[1]).astype(values.dtype)
+            flips = np.array_equal(np.abs(harmonics), np.eye(len(harmonics)))
+            values = values * harmonics.diagonal()[:, None] if flips else harmonics @ values
+    return values
 
 
 class _Part:
@@ -434,11 +479,11 @@ def _smallest_three(data: NDArray[np.uint8]) -> NDArray[Any]:
     return np.roll(with_largest(packed >> 30, values), 1, axis=1)
 
 
-def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write SPZ version 4, the newest, with all 8 bits of SH coefficients."""
+def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering, axes: str = _AXES[0]) -> None:
+    """Write SPZ version 4, the newest, with all 8 bits of SH coefficients, and a record of its axes."""
     bits = _fractional_bits(arrays["means"])
     streams = []
-    for section in _encoded_sections(arrays, bits):
+    for section in _encoded_sections(arrays, bits, axes):
         compressor, size = zstd.ZstdCompressor(level=_ZSTD_LEVEL), 0
         compressed = bytearray()
         for block in section:
@@ -447,45 +492,54 @@ def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
         compressed += compressor.flush()
         if size:
             streams.append((size, compressed))
-    table = 32 + len(_AXES_RECORD)
-    output.write(_first_fields(4, arrays, bits, rendering) + struct.pack("<BI12x", len(streams), table) + _AXES_RECORD)
+    record = struct.pack("<III", _AXES_EXTENSION, 4, _AXES.index(axes, 1))
+    head = _first_fields(4, arrays, bits, rendering, _HAS_EXTENSIONS)
+    output.write(head + struct.pack("<BI12x", len(streams), 32 + len(record)) + record)
     for size, compressed in streams:
         output.write(struct.pack("<QQ", len(compressed), size))
     for _, compressed in streams:
         output.write(compressed)
 
 
-def _write_version_3(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
-    """Write SPZ version 3, for programs that cannot read version 4, with all 8 bits of SH coefficients."""
+def _write_version_3(output: BinaryIO, arrays: Arrays, rendering: Rendering, axes: str = _AXES[0]) -> None:
+    """Write SPZ version 3, for programs that cannot read version 4, with all 8 bits of SH coefficients.
+
+    Axes other than RDF become RUB, because the file does not state them.
+    """
     deflate = zlib.compressobj(_DEFLATE_LEVEL, wbits=31)
     bits = _fractional_bits(arrays["means"])
     output.write(deflate.compress(_first_fields(3, arrays, bits, rendering) + bytes(1)))
-    for section in _encoded_sections(arrays, bits):
+    for section in _encoded_sections(arrays, bits, axes if axes == "rdf" else _AXES[0]):
         for block in section:
             output.write(deflate.compress(block))
-    output.write(deflate.compress(_AXES_RECORD))
     output.write(deflate.flush())
 
 
-def _first_fields(version: int, arrays: Arrays, bits: int, rendering: Rendering) -> bytes:
+def _first_fields(version: int, arrays: Arrays, bits: int, rendering: Rendering, flags: int = 0) -> bytes:
     """Return the first 15 bytes of a header, which versions 2 to 4 share."""
     count, coefficients = arrays["sh_rest"].shape[:2]
-    flags = _HAS_EXTENSIONS | (_ANTIALIASED if rendering.antialiased else 0)
+    flags |= _ANTIALIASED if rendering.antialiased else 0
     return struct.pack("<4sIIBBB", _MAGIC, version, count, SH_DEGREES[coefficients], bits, flags)
 
 
-def _encoded_sections(arrays: Arrays, bits: int) -> Iterator[Iterator[bytes]]:
+def _encoded_sections(arrays: Arrays, bits: int, axes: str) -> Iterator[Iterator[bytes]]:
     """Yield the blocks of each section of version 3 and 4."""
-    encoders: list[tuple[NDArray[np.float32], Callable[[NDArray[np.float64]], NDArray[Any]]]] = [
-        (arrays["means"], lambda values: _encode_positions(values, bits)),
-        (arrays["opacities"], opacity_bytes),
-        (arrays["sh_dc"], lambda values: _to_byte(values * (0.15 * 255) + 127.5)),
-        (arrays["scales"], lambda values: _to_byte((values + 10) * 16)),
-        (arrays["quats"], _encode_rotations),
-        (arrays["sh_rest"], lambda values: _to_byte(values * 128 + 128)),
-    ]
-    for array, encode in encoders:
-        yield (np.ascontiguousarray(encode(array[block].astype(np.float64))).tobytes() for block in blocks(len(array)))
+    encoders: dict[str, Callable[[NDArray[np.float64]], NDArray[Any]]] = {
+        "means": lambda values: _encode_positions(values, bits),
+        "opacities": opacity_bytes,
+        "sh_dc": lambda values: _to_byte(values * (0.15 * 255) + 127.5),
+        "scales": lambda values: _to_byte((values + 10) * 16),
+        "quats": _encode_rotations,
+        "sh_rest": lambda values: _to_byte(values * 128 + 128),
+    }
+    matrix = _matrix(axes).T
+
+    def encoded(name: str) -> Iterator[bytes]:
+        for block in blocks(len(arrays[name])):
+            values = _with_axes(name, arrays[name][block].astype(np.float64), matrix)
+            yield np.ascontiguousarray(encoders[name](values)).tobytes()
+
+    return map(encoded, encoders)
 
 
 def _fractional_bits(means: NDArray[np.float32]) -> int:
@@ -517,5 +571,11 @@ def _to_byte(values: NDArray[np.float64]) -> NDArray[Any]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-SPZ = SceneFormat("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write)
-SPZ_3 = SceneFormat("v3.spz", "SPZ 3", 25, _is_old_version, _old_header, _read, _write_version_3)
+_LIMITS = Limits(
+    {"scales": (_SCALES[0], _SCALES[-1]), "sh_dc": (_COLORS[0], _COLORS[-1]), "sh_rest": (-1.0, 1.0)},
+    lambda means: np.ldexp(1.0, -_fractional_bits(means)),
+)
+SPZ = SceneFormat("spz", "SPZ", 25, _is_version_4, _zstd_header, _read, _write, limits=_LIMITS, has_axes=True)
+SPZ_3 = SceneFormat(
+    *("v3.spz", "SPZ 3", 25, _is_old_version, _old_header, _read, _write_version_3), limits=_LIMITS, has_axes=True
+)

@@ -15,7 +15,7 @@ import zipfile
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -216,7 +216,7 @@ def _part(path: Path, opened: _Opened, folder: str, level: int | None, ranges: l
     return _Part(folder, level, header)
 
 
-def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]:
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
     assert isinstance(header, StreamedHeader)
     with _opened(file.path) as opened:
         for part, rows in header.rows:
@@ -225,7 +225,8 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> tuple[str, ...]
                 arrays["sh_rest"][:, part.header.coefficients :] = 0
                 arrays["sh_rest"] = arrays["sh_rest"][:, : part.header.coefficients]
             read_sog(opened.part(part.folder), part.header, arrays)
-    return tuple(dict.fromkeys(note for part, _ in header.rows for note in part.header.notes))
+    notes = (note for part, _ in header.rows for note in part.header.notes)
+    return replace(header, notes=tuple(dict.fromkeys((*header.notes, *notes))))
 
 
 def pack(index: Path, target: Path) -> None:

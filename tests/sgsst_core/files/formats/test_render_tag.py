@@ -103,7 +103,7 @@ def test_classic_scenes_state_no_render_mode(tmp_path: Path, format: SceneFormat
         with zipfile.ZipFile(path) as archive:
             assert not {"model", "extras"} & json.loads(archive.read("meta.json")).keys()
     elif format.name == "v3.spz":
-        assert gzip.decompress(data)[14] == 2
+        assert gzip.decompress(data)[14] == 0
     elif format.name == "spz":
         assert data[14] == 2
     else:
@@ -115,9 +115,9 @@ def test_flag_of_old_spz_files_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "scene.spz"
     write_scene(path, replace(wall(), rendering=AA), by_name("v3.spz"))
     data = bytearray(gzip.decompress(path.read_bytes()))
-    assert data[14] == 3
-    data[14] = 1  # as by Spark: no extension records
-    path.write_bytes(gzip.compress(bytes(data[:-12])))
+    assert data[14] == 1
+    data[13] = 12  # as by Spark
+    path.write_bytes(gzip.compress(bytes(data)))
     file = read_scene(path)
     assert file.scene.rendering == CLASSIC
     ((drawn, reason),) = file.tag.warnings

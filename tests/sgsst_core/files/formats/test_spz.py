@@ -13,11 +13,13 @@ import pytest
 import torch
 from backports import zstd
 from gsply.spz import read_spz, write_spz
+from scipy.spatial.transform import Rotation
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.spz import SPZ, SPZ_3
+from sgsst_core.files.library import load_scene, save
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import basis
@@ -32,6 +34,8 @@ from tests.sgsst_core.files.formats.samples import (
 )
 from tests.sgsst_core.splat_scenes import cloud
 from tests.small_scenes import wall
+from worker.derive import convert
+from worker.job import SceneRequest
 
 #: Half a turn about x, from the axes of a PLY (RDF) to RUB.
 TURN = torch.tensor([1.0, -1.0, -1.0])
@@ -60,20 +64,21 @@ def test_gsply_files_are_read_as_by_gsply(tmp_path: Path, degree: int, version: 
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=degree)), version=version)
     assert read_scene_header(path).format is (SPZ_3 if version == 3 else SPZ)
-    loaded = read_scene(path)
+    loaded = read_scene(path, spz_axes="rdf")
     assert loaded.scene.sh_degree == degree
     assert_close(loaded.scene, scene_of(read_spz(path)))
-    assert_close(rotated(read_scene(path, spz_axes="rub").scene), scene_of(read_spz(path)))
+    assert_close(rotated(read_scene(path).scene), scene_of(read_spz(path)))
 
 
 @pytest.mark.parametrize("format", [SPZ, SPZ_3], ids=lambda format: format.name)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gsply_reads_written_files(tmp_path: Path, degree: int, format: SceneFormat) -> None:
     path = tmp_path / "scene"
-    write_scene(path, cloud(700, degree=degree), format)
-    loaded = read_scene(path).scene
-    assert loaded.sh_degree == degree
-    assert_close(loaded, scene_of(read_spz(path)))
+    for axes in ("rub", "rdf"):
+        write_scene(path, cloud(700, degree=degree), format, axes)
+        loaded = read_scene(path, spz_axes=axes).scene
+        assert loaded.sh_degree == degree
+        assert_close(rotated(loaded) if axes == "rub" else loaded, scene_of(read_spz(path)))
 
 
 def axes_record(number: int) -> bytes:
@@ -96,7 +101,7 @@ def with_records(data: bytes, records: bytes) -> bytes:
 def test_stated_axes_are_followed_unless_others_are_requested(tmp_path: Path, version: int) -> None:
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=2)), version=version)
-    plain, data = read_scene(path).scene, path.read_bytes()
+    plain, data = read_scene(path, spz_axes="rdf").scene, path.read_bytes()
     other = struct.pack("<II", 0x12340001, 5) + bytes(5)
     for number, rub in ((6, False), (4, True), (0, True)):
         path.write_bytes(with_records(data, other + axes_record(number)))
@@ -112,7 +117,7 @@ def test_unknown_extensions_are_noted(tmp_path: Path, version: int) -> None:
     write_spz(path, gsply_of(cloud(700)), version=version)
     data = path.read_bytes()
     assert read_scene(path).notes == (
-        "axes: read as rdf; the file states none. If the scene is upside down, pass --spz-axes rub",
+        "axes: read as rub; the file states none. If the scene is upside down, pass --spz-axes rdf",
     )
     assert not read_scene(path, spz_axes="rdf").notes
     records = axes_record(6) + struct.pack("<II", 0xADBE0002, 3) + b"abc" + struct.pack("<II", 7, 0)
@@ -128,20 +133,104 @@ def test_unknown_axes_are_refused_and_broken_records_ignored(tmp_path: Path, ver
     path = tmp_path / "scene"
     write_spz(path, gsply_of(cloud(700, degree=1)), version=version)
     data = path.read_bytes()
-    refused(tmp_path, with_records(data, axes_record(12)), "coordinate system 12; RUB .4. and RDF .6. can be read")
+    refused(tmp_path, with_records(data, axes_record(17)), "coordinate system 17; 0 to 16 can be read")
     plain = read_scene(path).scene
     for records in (axes_record(4)[:-1], struct.pack("<II", 7, 2**32 - 1) + axes_record(4), b"\0" * 7):
         path.write_bytes(with_records(data, records))
         assert_close(read_scene(path).scene, plain)
 
 
-def test_written_file_states_the_axes_of_a_ply(tmp_path: Path) -> None:
+#: Names of the format's coordinate systems (`CoordinateSystem` in splat-types.h): directions of x, y and z.
+SYSTEMS = ["LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"]
+SYSTEMS += ["LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]
+
+
+@pytest.mark.parametrize("number", range(1, 17))
+def test_all_axes_are_read_and_written_back(tmp_path: Path, number: int) -> None:
+    """A function of the direction d is the same in other axes, whose matrix may mirror."""
+    first, again = tmp_path / "first", tmp_path / "again"
+    name, scene = SYSTEMS[number - 1].lower(), cloud(700, degree=3)
+    scene = replace(scene, sh_dc=scene.sh_dc.clamp(-3, 3), sh_rest=held(scene.sh_rest).clamp(-0.5, 0.5))
+    write_scene(first, scene, SPZ, name)
+    assert first.read_bytes()[32:44] == axes_record(number)
+    loaded = read_scene(first)
+    assert loaded.axes == name
+    assert_close(loaded.scene, scene, opacities=0.01, others=0.1)
+    write_scene(again, loaded.scene, SPZ, loaded.axes)
+    assert_close(read_scene(again).scene, loaded.scene, opacities=0, others=0.02)
+    columns = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B": (2, -1)}
+    matrix = torch.zeros(3, 3)
+    for axis, (row, sign) in enumerate(columns[letter] for letter in SYSTEMS[number - 1]):
+        matrix[row, axis] = sign
+    as_stored = read_with_axes(first, 6)
+    assert torch.equal(as_stored.means @ matrix.T, loaded.scene.means)
+    covariances = [covariance(each) for each in (as_stored, loaded.scene)]
+    torch.testing.assert_close(matrix @ covariances[0] @ matrix.T, covariances[1], rtol=1e-3, atol=1e-6)
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1)
+    seen, there = (basis(each, 3) for each in (directions, directions @ matrix.double()))
+    stored, read = (held(each.sh_rest).double() for each in (as_stored, loaded.scene))
+    torch.testing.assert_close(
+        torch.einsum("dk,nkc->ndc", there, stored), torch.einsum("dk,nkc->ndc", seen, read), rtol=1e-4, atol=1e-4
+    )
+
+
+def read_with_axes(path: Path, number: int) -> Scene:
+    """Return the scene of a file of version 4 under other axes."""
+    data = path.read_bytes()
+    other = path.with_name("other")
+    other.write_bytes(data[:40] + struct.pack("<I", number) + data[44:])
+    return read_scene(other).scene
+
+
+def covariance(scene: Scene) -> torch.Tensor:
+    rotations = torch.from_numpy(Rotation.from_quat(scene.quats.numpy(), scalar_first=True).as_matrix()).float()
+    axes = rotations * scene.scales.exp()[:, None]
+    return axes @ axes.mT
+
+
+def test_version_3_has_no_record_and_the_axes_of_the_library(tmp_path: Path) -> None:
     raw = gzip.decompress(encoded(tmp_path, SPZ_3))
-    assert raw[14] == 2
-    assert raw.endswith(axes_record(6))
-    raw = encoded(tmp_path, SPZ)
-    assert raw[14] == 2
-    assert raw[32:44] == axes_record(6)
+    assert (raw[14], len(raw)) == (0, 16 + 616 * ROW)
+    assert_close(read_scene(tmp_path / "good").scene, read_scene_of(tmp_path, SPZ), opacities=0, others=0)
+    write_scene(tmp_path / "rdf", wall(sh_degree=1), SPZ_3, "rdf")
+    write_scene(tmp_path / "mirrored", wall(sh_degree=1), SPZ_3, "luf")
+    assert gzip.decompress((tmp_path / "rdf").read_bytes()) != raw
+    assert gzip.decompress((tmp_path / "mirrored").read_bytes()) == raw
+
+
+def read_scene_of(tmp_path: Path, format: SceneFormat) -> Scene:
+    (tmp_path / "scene").write_bytes(encoded(tmp_path, format))
+    return read_scene(tmp_path / "scene").scene
+
+
+def test_converted_scenes_keep_their_axes(tmp_path: Path) -> None:
+    for name, number in (("luf", 7), ("rub", 4), ("rdf", 6)):
+        source, out = tmp_path / "source.spz", tmp_path / "out.spz"
+        write_scene(source, cloud(700), SPZ, name)
+        convert(SceneRequest(scene=source), out, compare=False)
+        assert out.read_bytes()[32:44] == axes_record(number)
+        save(out, load_scene(source))
+        assert out.read_bytes()[32:44] == axes_record(number)
+
+
+def test_long_file_names_in_the_gzip_header_are_skipped(tmp_path: Path) -> None:
+    data = encoded(tmp_path, SPZ_3)
+    named = data[:3] + b"\x08" + data[4:10] + b"n" * 70_000 + b"\0" + data[10:]
+    (tmp_path / "scene").write_bytes(named)
+    assert_close(read_scene(tmp_path / "scene").scene, read_scene(tmp_path / "good").scene, opacities=0, others=0)
+
+
+@pytest.mark.parametrize("format", [SPZ, SPZ_3], ids=lambda format: format.name)
+def test_unknown_flags_are_noted_and_levels_of_detail_refused(tmp_path: Path, format: SceneFormat) -> None:
+    data = encoded(tmp_path, format)
+    for flag in (0x40, 0x80):
+        raw = bytearray(gzip.decompress(data) if format is SPZ_3 else data)
+        raw[14] |= flag
+        if flag == 0x80:
+            refused(tmp_path, bytes(raw), "levels of detail of Spark")
+        else:
+            (tmp_path / "scene").write_bytes(bytes(raw))
+            assert "the flags 0x40 of the SPZ header are unknown and ignored" in read_scene(tmp_path / "scene").notes
 
 
 def test_both_versions_store_the_same_values(tmp_path: Path) -> None:
@@ -171,7 +260,7 @@ def test_files_without_their_gzip_layer_are_read(tmp_path: Path, version: int) -
 def test_degree_4_is_read_as_degree_3(tmp_path: Path) -> None:
     """Each Gaussian has 15 coefficients per channel of degree 1 to 3, and then 9 of degree 4."""
     write_scene(tmp_path / "three", cloud(700, degree=3), SPZ_3)
-    raw = gzip.decompress((tmp_path / "three").read_bytes())[:-12]
+    raw = gzip.decompress((tmp_path / "three").read_bytes())
     body, harmonics = raw[: 16 + 700 * 20], np.frombuffer(raw[16 + 700 * 20 :], np.uint8).reshape(700, 45)
     more = np.concatenate([harmonics, np.full((700, 27), 200, np.uint8)], axis=1)
     (tmp_path / "four").write_bytes(
@@ -226,10 +315,12 @@ ROW = 20 + 9
         (spz_bytes(3, 616, 1, bytes(616 * ROW))[:-9], "ends before all Gaussians"),
         (spz_bytes(3, 4_000_000_000, 3, bytes(1000)), "declares 4000000000 Gaussians, which take 260000000016 bytes"),
         (spz_bytes(3, 616, 1, bytes(616 * ROW + (64 << 20))), "continues after all Gaussians"),
-        (spz_bytes(5, 616, 1, bytes(616 * ROW)), "version 5, which cannot be read.*splat-transform"),
-        (spz_bytes(3, 616, 5, bytes(100)), "SH degree 5; 0 to 4 can be read.*splat-transform"),
+        (spz_bytes(5, 616, 1, bytes(616 * ROW)), "version 5, which cannot be read. Export it as SPZ 4 or 3"),
+        (spz_bytes(3, 616, 5, bytes(100)), "SH degree 5; 0 to 4 can be read. Export it as PLY"),
         (spz_bytes(3, 0, 0), "holds no Gaussians"),
         (gzip.compress(b"NGSP" + bytes(3)), "ends within its SPZ header"),
+        (spz_bytes(4, 616, 1, bytes(616 * ROW)), "version 4 in a gzip stream, which cannot be read"),
+        *((spz_bytes(3, 616, 1, bytes(616 * ROW))[:end], "ends within its SPZ header") for end in (2, 10, 12)),
         (gzip.compress(b"something else that was packed"), "a gzip file, but no SPZ"),
         (b"\x1f\x8b" + bytes(100), "damaged gzip file"),
         (b"NGSP" + bytes(5), "ends within its SPZ header"),
