@@ -1,6 +1,6 @@
 """Tests that the private names of dependencies that the project uses still exist.
 
-The upper bounds of Ray, PyTorch and uvicorn in pyproject.toml exclude a new version until these tests pass with it.
+The upper bounds of Ray and uvicorn in pyproject.toml exclude a new version until these tests pass with it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PRIVATE = re.compile(
 def test_only_listed_modules_use_private_names() -> None:
     files = [path for package in ("sgsst_core", "worker", "service", "api") for path in (ROOT / package).rglob("*.py")]
     users = {path.relative_to(ROOT).as_posix() for path in files if PRIVATE.search(path.read_text())}
-    assert users == {"worker/ranks/cluster.py", "worker/ranks/process_group.py"}, (
+    assert users == {"worker/ranks/cluster.py"}, (
         "Another module uses a private name of a package. Do without it, or add a test of the name here that says what "
         "to do when it is gone, and bound the package in pyproject.toml."
     )
@@ -98,17 +98,6 @@ def test_process_group_device_can_be_reset() -> None:
     assert isinstance(getattr(dist.ProcessGroup, "bound_device_id", None), property), (
         "A process group no longer has bound_device_id. Find how groups of some ranks are made without the others, and "
         "change `process_group` in worker/ranks/process_group.py; else GPU ranks hang once the plan has left some out."
-    )
-
-
-def test_process_group_timeout_can_be_set() -> None:
-    from torch.distributed import distributed_c10d
-
-    set_timeout = getattr(distributed_c10d, "_set_pg_timeout", None)
-    parameters = list(inspect.signature(set_timeout).parameters) if set_timeout is not None else []
-    assert parameters == ["timeout", "group"], (
-        "PyTorch sets the time-out of a process group in another way now: change "
-        "worker/ranks/process_group.py. Without it, ranks of a slow machine are taken for lost."
     )
 
 

@@ -32,7 +32,7 @@ class Listener:
         stop: Called after each step, or a few times per second; returns True to interrupt the job.
         finish: Called like `stop`; returns True to end the job after a step, with its present colors as the result.
         saved: Called with the step of each checkpoint; not used for ranks.
-        happened: Called with a sentence about each lost or resumed attempt on ranks.
+        happened: Called with a sentence about each lost or resumed attempt on ranks, and about a long wait for a rank.
         left_out: Called with the GPUs that the job released because the plan does not use them, by their names in
             CUDA_VISIBLE_DEVICES on their machine.
         stored: Called with the workplace's description of each stored file, in order.

@@ -103,13 +103,15 @@ class Collectives:
         iteration counts as failed. Before this call, the timeout is long enough for the preparation of a job.
         """
 
-    def leading_group(self, count: int) -> Collectives | None:
-        """Return the group of the first `count` ranks; return None on ranks outside the group."""
-        return self
+    def form_groups(self, count: int, groups: int) -> tuple[Collectives, Collectives] | None:
+        """Form a group of the first `count` ranks, and `groups` equal groups of consecutive ones of them.
 
-    def split_group(self, groups: int) -> Collectives:
-        """Split the ranks into `groups` equal groups of consecutive ranks, and return this rank's group."""
-        return self
+        Every rank calls this, also those that are in none of the groups.
+
+        Returns:
+            The group of the first ranks, and the one of the smaller groups that this rank is in; None on other ranks.
+        """
+        return self, self
 
 
 ALONE = Collectives()

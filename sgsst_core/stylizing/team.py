@@ -36,12 +36,12 @@ class Team:
     """
 
     def __init__(self, plan: Plan, settings: Settings, collectives: Collectives) -> None:
-        taking_part = collectives.leading_group(min(plan.ranks, collectives.size))
-        if taking_part is None:
+        count = min(plan.ranks, collectives.size)
+        self.groups = math.gcd(settings.views_per_step, count)
+        formed = collectives.form_groups(count, self.groups)
+        if formed is None:
             raise RankLeftOut
-        self.everybody = taking_part
-        self.groups = math.gcd(settings.views_per_step, taking_part.size)
-        self.group = taking_part.split_group(self.groups)
+        self.everybody, self.group = formed
         #: Pixels and seconds of this rank's network passes in each step, until speeds have been compared.
         self._pace: list[tuple[int, float]] | None = [] if settings.rebalance and self.group.size > 1 else None
 

@@ -24,6 +24,7 @@ from worker.ranks.rank_group import (
     RankHandle,
     end_rank,
     end_ranks,
+    long_wait,
     look_for_losses,
     poll_ranks,
     start_ranks,
@@ -140,6 +141,7 @@ class _Attempts:
         deadline: float | None = None
         done_at: float | None = None
         finishing = False
+        said: str | None = None
         while True:
             if deadline is None and self._listener.stop():
                 deadline = time.monotonic() + STOP_SECONDS
@@ -151,6 +153,8 @@ class _Attempts:
                 return None
             poll_ranks(self._group)
             self._relay.pass_on(first.status)
+            if self._relay.before_steps and (line := long_wait(self._group)) and line != said:
+                self._listener.happened(said := line)
             if first.outcome is not None and first.outcome.kind == "done":
                 done_at = done_at or time.monotonic()
                 if all(rank.outcome for rank in self._group.handles) or time.monotonic() - done_at > _LAST_WORDS:
@@ -249,6 +253,11 @@ class Relay:
     def farthest(self) -> tuple[int, int | None]:
         """Return the highest step and the step of the last checkpoint. One of them changes with any progress."""
         return self.step, self.saved
+
+    @property
+    def before_steps(self) -> bool:
+        """Return whether the current attempt has not made a step."""
+        return self._progress is None or not self._progress.is_step
 
     def begin_attempt(self) -> None:
         """Reset the state of the current attempt for a new set of ranks."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +23,6 @@ from typing import Any, TypeVar
 import torch
 import torch.distributed as dist
 from torch import Tensor
-from torch.distributed.distributed_c10d import _set_pg_timeout
 
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.statistics import LayerStatistics
@@ -39,6 +39,32 @@ DEFAULT_TIMEOUT = timedelta(seconds=120)
 PREPARING = timedelta(minutes=30)
 #: Timeout as a number of iterations, used if it is longer than the minimum. Ranks are never that far apart.
 ITERATIONS = 5
+
+
+class Waiting:
+    """Record of whether this process waits for other ranks.
+
+    Attributes:
+        since: Start of the present exchange in monotonic seconds; None while there is none.
+    """
+
+    since: float | None = None
+
+    def __enter__(self) -> None:
+        self.since = time.monotonic()
+
+    def __exit__(self, *error: object) -> None:
+        self.since = None
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the start of the present exchange; 0 while there is none."""
+        since = self.since
+        return 0.0 if since is None else time.monotonic() - since
+
+
+#: Record of this process, which is one rank of one job.
+WAITING = Waiting()
 
 
 @contextmanager
@@ -66,15 +92,16 @@ def process_group(
         return
     patience = max(timeout, PREPARING)
     _stay_on_interface(address)
-    device, sharing, store = _meet(rank, size, address, with_index(device), patience, listener)
-    if device.type == "cuda":
-        torch.cuda.set_device(device)
-    backend = _backend(device, sharing)
-    dist.init_process_group(
-        backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device, backend)
-    )
-    # With a bound device, subgroups would be split off this group's connections. That needs all ranks, including those
-    # that the job has left out by then.
+    with WAITING:
+        device, sharing, store = _meet(rank, size, address, with_index(device), patience, listener)
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        backend = _backend(device, sharing)
+        dist.init_process_group(
+            backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device, backend)
+        )
+    # Subgroups get connections of their own, which ranks that are left out do not close. With a bound device, they
+    # would be split off from those of this group.
     world: Any = dist.group.WORLD
     world.bound_device_id = None
     try:
@@ -241,7 +268,8 @@ class ProcessGroupCollectives(Collectives):
         )
         into = flat.new_empty(sum(expected))
         self.sent["image"] += flat.nbytes
-        dist.all_to_all_single(into, flat, expected, counts, group=self._group)
+        with WAITING:
+            dist.all_to_all_single(into, flat, expected, counts, group=self._group)
         values = iter(into.split([image[rank].numel() for rank in others for image in received]))
         for rank in range(self.size):
             for source, target in zip(sent, received, strict=True):
@@ -258,7 +286,8 @@ class ProcessGroupCollectives(Collectives):
     def _reduce(self, tensor: Tensor, traffic: Traffic, operation: Any = dist.ReduceOp.SUM) -> Tensor:
         tensor = tensor.contiguous()
         self.sent[traffic] += 2 * (self.size - 1) * tensor.nbytes // self.size
-        dist.all_reduce(tensor, operation, group=self._group)
+        with WAITING:
+            dist.all_reduce(tensor, operation, group=self._group)
         return tensor
 
     def all_reduce_statistics(
@@ -320,11 +349,13 @@ class ProcessGroupCollectives(Collectives):
         """See `Collectives`."""
         message = encode(value)
         sizes = [torch.empty(1, dtype=torch.int64) for _ in range(self.size)]
-        dist.all_gather(sizes, torch.tensor([len(message)]), group=self._group)
+        with WAITING:
+            dist.all_gather(sizes, torch.tensor([len(message)]), group=self._group)
         padded = message.new_zeros(int(max(sizes)))
         padded[: len(message)] = message
         messages = [torch.empty_like(padded) for _ in range(self.size)]
-        dist.all_gather(messages, padded, group=self._group)
+        with WAITING:
+            dist.all_gather(messages, padded, group=self._group)
         return [decode(each[: int(size)]) for each, size in zip(messages, sizes, strict=True)]
 
     def broadcast(self, make: Callable[[], T]) -> T:
@@ -336,10 +367,11 @@ class ProcessGroupCollectives(Collectives):
             except SgsstError as error:
                 message = encode((None, error))
         size = torch.tensor([len(message)])
-        dist.broadcast(size, group=self._group, group_src=0)
-        if self.rank != 0:
-            message = message.new_empty(int(size))
-        dist.broadcast(message, group=self._group, group_src=0)
+        with WAITING:
+            dist.broadcast(size, group=self._group, group_src=0)
+            if self.rank != 0:
+                message = message.new_empty(int(size))
+            dist.broadcast(message, group=self._group, group_src=0)
         value: T
         value, problem = decode(message)
         if problem is not None:
@@ -348,35 +380,28 @@ class ProcessGroupCollectives(Collectives):
 
     def set_timeout_for(self, iteration_seconds: float) -> None:
         """See `Collectives`."""
-        _set_pg_timeout(max(self._timeout, timedelta(seconds=ITERATIONS * iteration_seconds)), self._group)
+        self._group.set_timeout(max(self._timeout, timedelta(seconds=ITERATIONS * iteration_seconds)))
 
-    def leading_group(self, count: int) -> Collectives | None:
+    def form_groups(self, count: int, groups: int) -> tuple[Collectives, Collectives] | None:
         """See `Collectives`."""
-        return self if count == self.size else self._own_group([list(range(count))])
+        each = count // groups
+        first = self._subgroup(range(count))
+        parts = (
+            [self._subgroup(range(start, start + each)) for start in range(0, count, each)] if groups > 1 else [first]
+        )
+        own = next((part for part in parts if part is not None), None)
+        return None if first is None or own is None else (first, own)
 
-    def split_group(self, groups: int) -> Collectives:
-        """See `Collectives`."""
-        if groups == 1:
+    def _subgroup(self, ranks: range) -> Collectives | None:
+        """Return a group of ranks; None on other ranks. Every rank of the job must call this, as of `new_group`."""
+        if len(ranks) == self.size:
             return self
-        each = self.size // groups
-        own = self._own_group([list(range(start, start + each)) for start in range(0, self.size, each)])
-        assert own is not None
-        return own
-
-    def _own_group(self, all_ranks: list[list[int]]) -> Collectives | None:
-        """Create groups, and return the one that this rank is in; None if it is in none.
-
-        Every rank must create all groups, because torch.distributed requires it.
-        """
-        own: Collectives | None = None
-        for ranks in all_ranks:
-            members = [dist.get_global_rank(self._group, rank) for rank in ranks]
-            group = dist.new_group(members, timeout=max(self._timeout, PREPARING), device_id=self._named)
-            if self.rank in ranks:
-                own = ALONE if len(ranks) == 1 else self._of_group(group)
-        return own
-
-    def _of_group(self, group: Any) -> ProcessGroupCollectives:
+        if len(ranks) == 1:
+            return ALONE if self.rank in ranks else None
+        with WAITING:
+            group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING), device_id=self._named)
+        if self.rank not in ranks:
+            return None
         return ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing, self.sent)
 
 

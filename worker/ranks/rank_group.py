@@ -223,6 +223,28 @@ def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> 
         _wait_for_the_reason(group, cluster, failed[0])
 
 
+#: Seconds of waiting for others before the first step that are reported.
+LONG_WAIT = 60.0
+
+
+def long_wait(group: RankGroup) -> str | None:
+    """Return a sentence about the ranks that wait long for others, and what these do; None if no rank waits long."""
+    waiting = [rank for rank in group.handles if rank.status.waiting > LONG_WAIT]
+    if not waiting:
+        return None
+    others = [rank for rank in group.handles if rank not in waiting and rank.outcome is None]
+    doing = [
+        f"{group.name_of(rank)} ({rank.status.progress.stage if rank.status.progress else 'reading'})"
+        for rank in others
+    ]
+    names = ", ".join(map(group.name_of, waiting))
+    return f"Waiting for more than {LONG_WAIT:.0f} s: {names}. " + (
+        f"Still at work: {', '.join(doing)}."
+        if others
+        else "All wait for each other's messages: check the network between their machines."
+    )
+
+
 def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle) -> None:
     """Wait for the cause of a rank's broken connection and raise it.
 

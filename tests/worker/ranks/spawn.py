@@ -17,7 +17,7 @@ from tests.ports import free_port
 from tests.pretend_cuda.runtime import pretend_cuda
 from worker.ranks.process_group import process_group
 
-MOST_RANKS = 4
+MOST_RANKS = 8
 
 
 def on_ranks(

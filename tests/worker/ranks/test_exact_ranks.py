@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -243,18 +244,58 @@ def test_refinement_matches_one_rank() -> None:
         assert refinement.psnr == pytest.approx(alone.psnr, abs=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("ranks", "views_per_step"), [(1, 2), (2, 2), (4, 2), (3, 2), (2, 4)])
-def test_several_views_per_step_do_not_depend_on_rank_count(ranks: int, views_per_step: int) -> None:
-    scene = wall()
-    values = {"steps_coarse": 2, "steps_sos": 4, "views_per_step": views_per_step, "learning_rate": 0.01}
-    expected = stylize(ALONE, scene, 5, values)
-    actual = on_ranks(ranks, stylize, scene, 5, values) if ranks > 1 else [expected]
-    for result in actual:
-        assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
-        assert result["views"] == expected["views"]
-        assert torch.equal(result["colors"], actual[0]["colors"])
-    assert expected["losses"] != stylize(ALONE, scene, 5, {**values, "views_per_step": 1})["losses"]
+VIEWS_PER_STEP = (1, 2, 3, 4, 8)
+
+
+def stylize_each(collectives: Collectives) -> list[dict[str, Any]]:
+    """Run a whole job for each number of views per step, and compute its gradient in its end in float64."""
+    results = []
+    for count in VIEWS_PER_STEP:
+        own: dict[str, Any] = {"steps_coarse": 1, "steps_sos": 1, "learning_rate": 0.01, "views_per_step": count}
+        settings = make_settings("standard", coarsest_side=40, rebalance=False, early_stop=False, **own)
+        inputs, weights = (wall(), cameras(8), Style.of(style().double()), settings), tiny_weights()
+        job = plan_job(*inputs, weights=weights, collectives=collectives)
+        stylizer = Stylizer(job)
+        run(stylizer)
+        exact = prepare_job(
+            replace(job.plan, uncached="reference", cached_weights="none"),
+            *inputs,
+            weights=weights,
+            collectives=collectives,
+        )
+        exact.loss.use(FeatureNetwork(weights, job.network.layers, torch.float64))
+        other = Stylizer(replace(exact, network=exact.loss.network))
+        other.sh_dc = torch.nn.Parameter(torch.roll(other.sh_dc.detach(), 1, dims=0).double())
+        other.latest = views = list(range(count))
+        results.append(
+            {
+                "losses": [record.loss for record in stylizer.history],
+                "views": [record.view for record in stylizer.history],
+                "colors": stylizer.stylized(),
+                "exact": other._mean_gradient(views, job.schedule[-1])[0],
+            }
+        )
+    return results
+
+
+@functools.cache
+def alone() -> list[dict[str, Any]]:
+    results = stylize_each(ALONE)
+    assert len({tuple(result["losses"]) for result in results}) == len(results)
+    return results
+
+
+@pytest.mark.parametrize("ranks", [2, 3, 4, 6, 8])
+def test_jobs_of_any_shape_match_one_rank(ranks: int) -> None:
+    by_rank = on_ranks(ranks, stylize_each)
+    for results in by_rank:
+        for actual, first, expected in zip(results, by_rank[0], alone(), strict=True):
+            assert actual["losses"] == pytest.approx(expected["losses"], rel=BOUNDS[torch.float32])
+            assert actual["views"] == expected["views"]
+            assert relative_error(actual["colors"], expected["colors"]) < BOUNDS[torch.float32]
+            assert torch.equal(actual["colors"], first["colors"])
+            assert actual["exact"].dtype == torch.float64
+            assert relative_error(actual["exact"], expected["exact"]) < BOUNDS[torch.float64]
 
 
 def test_ranks_use_the_same_background_colors() -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -18,14 +20,18 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut, same_on_all
 from sgsst_core.parallel.division import ImageExchange
+from sgsst_core.progress import Progress
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
+from tests.api.service import wait_for
 from tests.networks import tiny_weights
 from tests.ports import free_port
 from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
-from worker.ranks.process_group import _backend, _meet
+from worker.ranks.process_group import WAITING, _backend, _meet
+from worker.ranks.rank import Outcome, RankStatus
+from worker.ranks.rank_group import LONG_WAIT, RankGroup, RankHandle, long_wait
 
 HEIGHT = 70
 
@@ -162,32 +168,77 @@ def merge_empty(collectives: Collectives) -> LayerStatistics:
     return collectives.all_reduce_statistics([LayerStatistics.zero(4)], numbers(0.0))[0][0]
 
 
-def values(collectives: Collectives) -> dict[str, Any]:
-    own = collectives.split_group(2)
-    part = collectives.leading_group(2)
+def values(collectives: Collectives, count: int, groups: int) -> dict[str, Any]:
+    formed = collectives.form_groups(count, groups)
     return {
         "all_gather": collectives.all_gather(collectives.rank),
         "broadcast": collectives.broadcast(lambda: f"made by {collectives.rank}"),
         "same": same_on_all(collectives, 5),
         "different": same_on_all(collectives, collectives.rank),
-        "split": (own.rank, own.size, own.all_gather(collectives.rank)),
-        "first": None if part is None else (part.rank, part.size, part.all_gather(collectives.rank)),
+        "formed": formed and [(each.rank, each.size, each.all_gather(collectives.rank)) for each in formed],
         "all_reduce": float(collectives.all_reduce(torch.tensor([float(collectives.rank)]))),
         "local": collectives.local_size,
     }
 
 
-def test_collectives_and_groups_follow_their_definitions() -> None:
-    results = on_ranks(4, values)
-    for rank, result in enumerate(results):
+@pytest.mark.parametrize(("count", "groups"), [(4, 1), (4, 2), (4, 4), (3, 3), (2, 1), (2, 2), (1, 1)])
+def test_collectives_and_groups_follow_their_definitions(count: int, groups: int) -> None:
+    each = count // groups
+    for rank, result in enumerate(on_ranks(4, values, count, groups)):
         assert result["all_gather"] == [0, 1, 2, 3]
         assert result["broadcast"] == "made by 0"
         assert result["same"]
         assert not result["different"]
-        assert result["split"] == (rank % 2, 2, [0, 1] if rank < 2 else [2, 3])
-        assert result["first"] == ((rank, 2, [0, 1]) if rank < 2 else None)
         assert result["all_reduce"] == 6.0
         assert result["local"] == 4
+        first = rank - rank % each
+        own = (rank % each, each, list(range(first, first + each)))
+        assert result["formed"] == ([(rank, count, list(range(count))), own] if rank < count else None)
+
+
+def wait_for_first(collectives: Collectives, seen: Path) -> bool:
+    """Exchange a value once a thread of rank 1 has seen that it waits for rank 0; return whether it still does."""
+
+    def watch() -> None:
+        wait_for(lambda: WAITING.seconds > 0, "rank 1 to wait")
+        seen.touch()
+
+    if collectives.rank == 1:
+        threading.Thread(target=watch, daemon=True).start()
+    else:
+        wait_for(seen.exists, "rank 1 to wait")
+    collectives.all_gather(None)
+    return WAITING.seconds > 0
+
+
+def test_wait_for_another_rank_is_visible(tmp_path: Path) -> None:
+    assert on_ranks(2, wait_for_first, tmp_path / "seen") == [False, False]
+
+
+def rank_handle(waiting: float, stage: str | None = None, kind: Literal["left-out"] | None = None) -> RankHandle:
+    status = RankStatus(
+        waiting=waiting, progress=Progress(stage=stage) if stage else None, outcome=kind and Outcome(kind)
+    )
+    return RankHandle(None, None, status=status)
+
+
+@pytest.mark.parametrize(
+    ("handles", "said"),
+    [
+        ([rank_handle(0.0), rank_handle(LONG_WAIT - 1)], None),
+        (
+            [rank_handle(LONG_WAIT + 1, "planning"), rank_handle(0.0), rank_handle(2.0, "planning")],
+            "Worker 0. Still at work: Worker 1 (reading), Worker 2 (planning).",
+        ),
+        (
+            [rank_handle(LONG_WAIT + 1), rank_handle(0.0, kind="left-out"), rank_handle(LONG_WAIT + 9)],
+            "Worker 0, Worker 2. All wait for each other's messages: check the network between their machines.",
+        ),
+    ],
+)
+def test_long_wait_names_the_late_ranks(handles: list[RankHandle], said: str | None) -> None:
+    line = long_wait(RankGroup(lambda rank: None, handles))
+    assert line == (said and f"Waiting for more than 60 s: {said}")
 
 
 def fail_on_first(collectives: Collectives) -> str:

@@ -146,7 +146,7 @@ def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
     collectives.reduce_parts([exchange], [torch.zeros(*own.shape, 3)])
     collectives.all_reduce(torch.zeros(1000, 3))
     collectives.union(torch.zeros(300, dtype=torch.bool))
-    pair = collectives.split_group(collectives.size // 2)
+    _, pair = collectives.form_groups(collectives.size, collectives.size // 2) or (None, ALONE)
     pair.all_reduce(torch.zeros(500), "statistics")
     return dict(collectives.sent)
 
