@@ -14,6 +14,8 @@ import psutil
 import torch
 from torch import Tensor
 
+from sgsst_core import container
+
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
@@ -71,13 +73,13 @@ def measuring_memory(memory: int) -> int:
 def default_memory_limit(device: torch.device | None = None) -> int:
     """Return the default memory budget of a job in bytes, given the memory that is free now.
 
-    For a GPU, it is GPU memory; for a CPU or None, it is memory of the machine.
+    For a GPU, it is GPU memory; for a CPU or None, it is memory of the machine or of this process's container.
     """
     if device is not None and device.type == "cuda":
         free, total = torch.cuda.mem_get_info(device)
         return int(min(total * GPU_SHARE, free * FREE_SHARE))
-    memory = psutil.virtual_memory()
-    return int(min(memory.total * TOTAL_SHARE, memory.available * FREE_SHARE))
+    total, available = container.memory()
+    return int(min(total * TOTAL_SHARE, available * FREE_SHARE))
 
 
 def peak_memory() -> int:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
 import time
 from collections.abc import Callable
@@ -16,9 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import psutil
 import torch
 
+from sgsst_core import container
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
@@ -223,7 +222,7 @@ def _handed_over(file: Path, fingerprint: str, inputs: Inputs, settings: Setting
 def _conditions(settings: Settings) -> str:
     """Return a text about everything besides the inputs that determines what a plan has measured."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    machine = (socket.gethostname(), os.cpu_count(), psutil.virtual_memory().total, torch.get_num_threads(), device)
+    machine = (socket.gethostname(), *container.memory()[:1], container.cores(), torch.get_num_threads(), device)
     return json.dumps([settings.model_dump(mode="json"), versions(), machine])
 
 

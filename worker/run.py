@@ -132,6 +132,9 @@ def run_rank(
         SgsstError: If the job fails.
         RankLeftOut: If the plan does not use this rank.
     """
+    import torch
+
+    from sgsst_core import container
     from sgsst_core.parallel.collectives import ALONE
     from sgsst_core.planning.time_budget import seconds_left
     from worker.execute import execute
@@ -140,6 +143,8 @@ def run_rank(
 
     # what preceded a job of several ranks belongs to its command, on another clock perhaps
     start = max(time.time() - options.started, 0.0) if collectives is None else 0.0
+    if collectives is None:  # PyTorch knows the cores of the machine only
+        torch.set_num_threads(min(torch.get_num_threads(), container.cores()))
     preview, collectives = None, collectives or ALONE
     left = seconds_left(request.settings.within, options.started)
     if options.preview_folder:

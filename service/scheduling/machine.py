@@ -11,9 +11,8 @@ import socket
 import subprocess
 from dataclasses import dataclass
 
-import psutil
-
 from service.settings import ServiceSettings
+from sgsst_core import container
 from worker.processes import ProcessId, home
 
 
@@ -37,7 +36,7 @@ class Machine:
         """Return this machine, or the portion of the cluster at RAY_ADDRESS that the settings name."""
         cluster = bool(os.environ.get("RAY_ADDRESS"))
         gpus = tuple(str(number) for number in range(settings.cluster_gpus)) if cluster else _own_gpus()
-        return Machine(gpus, os.cpu_count() or 1, psutil.virtual_memory().total, cluster)
+        return Machine(gpus, container.cores(), container.memory().total, cluster)
 
 
 def _own_gpus() -> tuple[str, ...]:

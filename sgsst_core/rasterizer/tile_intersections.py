@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 
+from sgsst_core import container
 from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import LOG2_ALPHA_MIN, NEAR, RASTER_TILE
 from sgsst_core.errors import TooManyIntersectionsError
@@ -90,7 +90,7 @@ def build_tile_intersections(
         _count_tiles(values, *size, chunks, threads, counts, positions)
     first_slots = run_starts(counts)
     total = int(first_slots[-1])
-    check_intersections(total, len(counts), camera, free=psutil.virtual_memory().available)
+    check_intersections(total, len(counts), camera, free=container.memory().available)
     starts = run_starts(positions.sum(axis=0))
     # First position that each chunk writes to in each tile: after the entries of all preceding chunks.
     positions = starts[:-1] + np.cumsum(positions, axis=0) - positions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -11,9 +10,9 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-import psutil
 import torch
 
+from sgsst_core import container
 from sgsst_core.budget import device_peak, peak_memory
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import ratio, smoothed
@@ -361,9 +360,9 @@ def machine(device: torch.device) -> dict[str, Any]:
     return {
         "system": platform.platform(),
         "processor": _processor(),
-        "cores": os.cpu_count(),
+        "cores": container.cores(),
         "threads": torch.get_num_threads(),
-        "memory_bytes": psutil.virtual_memory().total,
+        "memory_bytes": container.memory().total,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "python": platform.python_version(),
         "torch": torch.__version__,

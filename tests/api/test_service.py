@@ -19,12 +19,12 @@ from typing import Any
 
 import httpx2
 import numpy as np
-import psutil
 import pytest
 import torch
 from plyfile import PlyData
 
 from api.client import AsyncClient, Client, Job
+from sgsst_core import container
 from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import EXTRA_FORMATS, by_name
 from sgsst_core.files.formats.spz import SPZ
@@ -399,11 +399,11 @@ def test_concurrent_jobs_share_cores_and_memory(files: dict[str, Path], tmp_path
         tasks = [json.loads(path.read_text()) for path in service.data.glob("work/*/*/task.json")]
         limits = [task["spec"]["settings"]["memory_limit"] for task in tasks]
         assert len(limits) == 2
-        assert 0 < sum(limits) <= 0.8 * psutil.virtual_memory().total
+        assert 0 < sum(limits) <= 0.8 * container.memory().total
         threads = [
             process.environ()["MKL_NUM_THREADS"] for process in service.processes("service.scheduling.attempt_process")
         ]
-        assert set(threads) == {str(max(1, (os.cpu_count() or 1) // 2))}
+        assert set(threads) == {str(max(1, container.cores() // 2))}
         wait_for(lambda: "sgsst_slots_free 0.0" in client.get("/metrics").text, "no place to be free", service.said)
         ready = client.get("/readyz").json()
         assert (ready["status"], ready["checks"]["dispatchers"]) == ("ok", "1")

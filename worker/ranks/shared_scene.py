@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import torch
 from numpy.typing import NDArray
 
+from sgsst_core import container
 from sgsst_core.errors import SceneTooLargeError, SgsstError
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes
@@ -179,7 +179,7 @@ def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: i
     each = scene_bytes + own  # every rank has its own copy of the Gaussians that its views show
     where = f"Rank {rank} on {socket.gethostname()}: the scene's {count:,} Gaussians need"
     advice = "Give a machine with more memory, fewer --workers on each, or a smaller scene."
-    needed, free = scene_bytes + sharing * each, available_memory()
+    needed, free = scene_bytes + sharing * each, container.memory().available
     if needed > free:
         ranks = f"{sharing} ranks share it" if sharing > 1 else "there is one rank"
         return SceneTooLargeError(
@@ -194,18 +194,3 @@ def _lack(rank: int, sharing: int, count: int, scene_bytes: int, device_bytes: i
                 f"{free / 1e9:.2f} GB are free. {advice}"
             )
     return None
-
-
-def available_memory() -> int:
-    """Return the bytes of memory still available to this process: those of the machine or, if less, of its cgroup."""
-    free = psutil.virtual_memory().available
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit = (group / "memory.max").read_text().strip()
-        if limit != "max":
-            used = int((group / "memory.current").read_text())
-            cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-            free = min(free, int(limit) - used + int(cached.get("inactive_file", 0)))
-    except OSError:  # no cgroup v2, or none for this process
-        pass
-    return int(free)

@@ -15,6 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from sgsst_core import container
 from sgsst_core.errors import SceneError, SceneTooLargeError
 from sgsst_core.files import scene_file
 from sgsst_core.files.formats import EXTRA_FORMATS
@@ -28,7 +29,6 @@ from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
 from tests.worker.ranks.spawn import on_ranks
 from worker.processes import home
-from worker.ranks import shared_scene
 from worker.ranks.shared_scene import read_shared_scene
 
 linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory files are looked for in Linux's /proc")
@@ -114,7 +114,7 @@ def test_compressed_scene_needs_memory_of_its_floats(tmp_path: Path) -> None:
     path = tmp_path / "scene"
     for format in EXTRA_FORMATS:
         write_scene(path, wall(sh_degree=3), format)
-        little = patch.object(shared_scene, "available_memory", return_value=616 * 4 * 59)
+        little = patch.object(container, "memory", return_value=container.Memory(1 << 40, 616 * 4 * 59))
         with little, pytest.raises(SceneTooLargeError, match="616 Gaussians need"):
             read_shared_scene(path, ALONE)
 
