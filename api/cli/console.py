@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -105,3 +107,13 @@ def transfer_bar(console: Console, description: str) -> Iterator[Callable[[int, 
     with live_bar(console, *columns) as bar:
         task = bar.add_task(description, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total or None)
+
+
+def leave_terminal(number: int) -> None:
+    """Discard what is written to a terminal from now on if a signal says that it is closed: writing would fail."""
+    if number != getattr(signal, "SIGHUP", None):
+        return
+    with Path(os.devnull).open("wb") as nowhere:
+        for descriptor in (1, 2):
+            if stat.S_ISCHR(os.fstat(descriptor).st_mode):
+                os.dup2(nowhere.fileno(), descriptor)

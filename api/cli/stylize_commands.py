@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from api.cli.arguments import JobInputs, file_to_write, folder_to_write
-from api.cli.console import EARLY_ENDS, FAILURE, Invocation, error_console, loss_text, out_console, print_field, spinner
+from api.cli.console import (
+    EARLY_ENDS,
+    FAILURE,
+    Invocation,
+    error_console,
+    leave_terminal,
+    loss_text,
+    out_console,
+    print_field,
+    spinner,
+)
 from api.cli.machine_commands import fetch
 from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import WeightsError
@@ -23,6 +33,7 @@ from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.number_format import clock
 from sgsst_core.stylizing.progress_bar import job_bar
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
+from worker.processes import STOP_SIGNALS
 
 if TYPE_CHECKING:  # PyTorch and Numba take seconds to import, so each command imports what it needs
     from worker.job import JobSpec, Result
@@ -212,19 +223,22 @@ class StopFlag:
 
     @contextmanager
     def on_signal(self, announce: Callable[[], None]) -> Iterator[None]:
-        """Set this flag at the first SIGINT or SIGTERM, and call `announce`. The second has its usual effect.
+        """Set this flag at the first Ctrl-C, SIGTERM or SIGHUP, and call `announce`. The second has its usual effect.
 
-        Outside the main thread, Python allows no signal handlers, so the flag stays unset.
+        SIGHUP arrives when the terminal is closed; like others, it stays ignored if it is, as by `nohup`. Outside the
+        main thread, Python allows no signal handlers, so the flag stays unset.
         """
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+        before = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
 
         def handle(number: int, _frame: FrameType | None) -> None:
             self._signal = number
             for other, handler in before.items():
                 signal.signal(other, handler)
+            leave_terminal(number)
             announce()
 
         try:

@@ -11,11 +11,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from api.cli.console import leave_terminal
 from service.optional import missing_extras
 from service.settings import ServiceSettings
 from service.startup import keep_private
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError
+from worker.processes import STOP_SIGNALS
 
 #: Seconds of life below which a dead process is restarted only after a wait, and maximum wait in seconds. The wait
 #: doubles each time.
@@ -69,7 +71,9 @@ class _Child:
 
 
 def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
-    """Run API and dispatcher until SIGTERM or Ctrl-C; running jobs then save their state. A second signal ends at once.
+    """Run API and dispatcher until SIGTERM, Ctrl-C or the end of the terminal; running jobs then save their state.
+
+    A second signal ends at once.
 
     This process owns the listening socket, so that connections wait during a restart of the API instead of being
     refused.
@@ -87,10 +91,10 @@ def serve(settings: ServiceSettings, announce: Callable[[str], None]) -> None:
     store.close()
     with _listen(settings) as listener:
         api = _Child(
-            "API", [sys.executable, "-m", "api.http.server", "--fd", str(listener.fileno())], (listener.fileno(),)
+            "API", [sys.executable, "-P", "-m", "api.http.server", "--fd", str(listener.fileno())], (listener.fileno(),)
         )
-        dispatcher = _Child("dispatcher", [sys.executable, "-m", "service.scheduling.dispatcher"])
-        if subprocess.run([sys.executable, "-m", "service.ensure_network_weights"], check=False).returncode:
+        dispatcher = _Child("dispatcher", [sys.executable, "-P", "-m", "service.scheduling.dispatcher"])
+        if subprocess.run([sys.executable, "-P", "-m", "service.ensure_network_weights"], check=False).returncode:
             raise ServeError(
                 "No feature network is installed, so no job can run. `sgsst weights list` shows where to get one."
             )
@@ -117,8 +121,9 @@ def _listen(settings: ServiceSettings) -> socket.socket:
 
 def _run(children: list[_Child], settings: ServiceSettings, announce: Callable[[str], None], address: str) -> None:
     signals: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: signals.append(number))
+    for number in STOP_SIGNALS:
+        if signal.getsignal(number) != signal.SIG_IGN:  # as by `nohup`
+            signal.signal(number, lambda number, _: signals.append(number))
     for child in children:
         child.start()
     announce(
@@ -128,6 +133,7 @@ def _run(children: list[_Child], settings: ServiceSettings, announce: Callable[[
         for child in children:
             child.restart_if_dead(announce)
         time.sleep(_LOOK_SECONDS)
+    leave_terminal(signals[0])
     announce("Stopping; running jobs save their state. Press Ctrl-C again to stop immediately.")
     processes = [child.process for child in children if child.process is not None]
     for process in processes:

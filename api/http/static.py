@@ -130,7 +130,7 @@ class ExampleScene:
 def _built_example() -> dict[str, StaticFile]:
     """Build the demo's scene in a child process, because the API process never imports PyTorch."""
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-m", "api.cli.demo_scene", folder], check=True)
+        subprocess.run([sys.executable, "-P", "-m", "api.cli.demo_scene", folder], check=True)
         return {path.name: _file(path.name, path.read_bytes()) for path in Path(folder).iterdir()}
 
 

@@ -15,8 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import psutil
-
 from service import problems
 from service.deadlines import suspended
 from service.files.blobs import Blobs
@@ -29,6 +27,7 @@ from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.tables import BlobRow
+from sgsst_core import container
 from sgsst_core.errors import WeightsError
 
 _log = logging.getLogger(__name__)
@@ -63,7 +62,7 @@ _ENVIRONMENT = (
     *("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"),
 )
 #: Command of the inspecting process, run without a shell; tests replace it by one with compromised readers.
-COMMAND: tuple[str, ...] = (sys.executable, "-m", "service.inspection.process")
+COMMAND: tuple[str, ...] = (sys.executable, "-P", "-m", "service.inspection.process")
 
 Show = Callable[[dict[str, Any]], None]
 
@@ -301,7 +300,7 @@ class Inspector:
         """Return the memory limit of reading in bytes; photos do not add to it, because they are read one at a time."""
         size: int = sum(entry["size"] for entry in inputs if entry["role"] != "photos")
         minimum = self._settings.inspection_bytes
-        maximum = max(minimum, int(_MEMORY_FRACTION * psutil.virtual_memory().total))
+        maximum = max(minimum, int(_MEMORY_FRACTION * container.memory().total))
         return min(minimum + MEMORY_PER_BYTE * size, maximum)
 
     async def close(self) -> None:
@@ -364,7 +363,7 @@ def threads_of_a_job(settings: ServiceSettings) -> int:
     return (
         int(threads)
         if threads.isdigit() and int(threads)
-        else max(1, (os.cpu_count() or 1) // (settings.parallel_jobs or 1))
+        else max(1, container.cores() // (settings.parallel_jobs or 1))
     )
 
 

@@ -34,7 +34,7 @@ class ChildProcess:
             environment = dict.fromkeys(_THREADS, str(grant.threads)) | environment
         with (folder / "log.txt").open("ab") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "service.scheduling.attempt_process", str(folder)],
+                [sys.executable, "-P", "-m", "service.scheduling.attempt_process", str(folder)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=log,

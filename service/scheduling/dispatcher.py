@@ -138,8 +138,8 @@ class Dispatcher:
 
 
 def main() -> None:
-    """Run a dispatcher with the environment's settings until SIGTERM or SIGINT."""
-    from worker.processes import die_with_parent
+    """Run a dispatcher with the environment's settings until SIGTERM, SIGINT or SIGHUP."""
+    from worker.processes import STOP_SIGNALS, die_with_parent
 
     if os.environ.get("SGSST_DIE_WITH_PARENT"):
         die_with_parent()
@@ -149,8 +149,8 @@ def main() -> None:
     def handle(_number: int, _frame: FrameType | None) -> None:
         dispatcher.stop()
 
-    signal.signal(signal.SIGTERM, handle)
-    signal.signal(signal.SIGINT, handle)
+    for number in STOP_SIGNALS:
+        signal.signal(number, handle)
     dispatcher.run()
     logging.shutdown()
     os._exit(0)  # threads that wait for a hanging file store would be waited for

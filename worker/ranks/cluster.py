@@ -6,6 +6,7 @@ it is closed, and also when the process that started it is killed.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import secrets
@@ -23,7 +24,9 @@ from typing import Any
 
 import psutil
 
+from sgsst_core import container
 from sgsst_core.errors import ClusterAwayError, RanksFailedError, SettingsError
+from worker.processes import STOP_SIGNALS
 from worker.ranks import sweeper
 from worker.ranks.failure_policy import first_line
 from worker.ranks.memory import memory_beside_gpus
@@ -84,12 +87,15 @@ class Cluster:
         """
         if threading.current_thread() is not threading.main_thread():
             raise RuntimeError("Ray must be started on the main thread: it ends with the thread that started it")
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
         try:
-            if self.local:
-                self._start()
-            else:
-                self._join()
+            if hasattr(signal, "SIGHUP"):  # Ray's processes inherit this: they must outlast a closed terminal
+                signal.signal(signal.SIGHUP, signal.SIG_IGN)
+            with contextlib.chdir("/"):  # Ray lets its processes import modules from the current folder
+                if self.local:
+                    self._start()
+                else:
+                    self._join()
         finally:
             for number, handler in before.items():  # restore the handlers that Ray has replaced
                 signal.signal(number, handler)
@@ -130,7 +136,7 @@ class Cluster:
         try:
             ray.init(
                 address="local",
-                num_cpus=max(self._workers, os.cpu_count() or 1),
+                num_cpus=max(self._workers, container.cores()),
                 object_store_memory=OBJECT_STORE_BYTES,
                 include_dashboard=False,
                 log_to_driver=False,
