@@ -254,7 +254,7 @@ def disposition(name: str, *, inline: bool) -> str:
     """
     last = re.sub(r"[\x00-\x1f\x7f-\x9f\"*:<>?|\u202a-\u202e\u2066-\u2069]+", "_", re.split(r"[/\\]", name)[-1])
     last = last[-_MAX_NAME:].strip(" .")
-    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", last).strip("._") or "file"
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", last).strip("._-") or "file"
     header = f'{"inline" if inline else "attachment"}; filename="{plain}"'
     if last.isascii() or not last:
         return header

@@ -289,9 +289,10 @@ class BlobFolder(Blobs):
             final.unlink()
             raise
         known = self._blobs / location
+        intact = self.objects.fault(f"{BLOBS}/{location}", sha256) is None  # read even if new: time would tell which
         if known == final:
             return sha256
-        if self.objects.fault(f"{BLOBS}/{location}", sha256) is None:
+        if intact:
             final.unlink()  # an intact file stays: a confined process may open only the file that it was given
         else:
             known.parent.mkdir(exist_ok=True)

@@ -242,20 +242,21 @@ class ObjectStore:
 
     def ping(self) -> None:
         """Raise OSError or StoreError if the store cannot be reached."""
-        # a prefix of a bucket does not exist before the first object in it
-        root = self.root if self.local else self.root.partition("/")[0]
-        with self._translated(root):
-            self._files.invalidate_cache()
-            if not self._files.exists(root):
-                raise FileNotFoundError(f"The file store {root!r} does not exist or cannot be reached.")
+        with self._translated(self.root):
+            if not self._exists():
+                raise FileNotFoundError(f"The file store {self.root!r} does not exist or cannot be reached.")
+
+    def _exists(self) -> bool:
+        """Return whether the folder or bucket exists; a prefix of a bucket does not before the first object in it."""
+        self._files.invalidate_cache()
+        return bool(self._files.exists(self.root if self.local else self.root.partition("/")[0]))
 
     def make_bucket(self) -> None:
         """Create the bucket of an S3 store if it does not exist."""
         if self._s3:
             bucket = self.root.partition("/")[0]
             with self._translated(bucket):
-                self._files.invalidate_cache()
-                if not self._files.exists(bucket):
+                if not self._exists():
                     self._files.mkdir(bucket)
 
     def _path(self, name: str) -> str:
@@ -263,13 +264,16 @@ class ObjectStore:
 
     @contextlib.contextmanager
     def _translated(self, name: str) -> Iterator[None]:
-        """Convert all errors of a remote store, whatever library raises them, to `StoreError`."""
+        """Convert all errors of a remote store, whatever library raises them, to `StoreError`.
+
+        A missing object of a missing bucket is no lost file: its store is away.
+        """
         try:
             yield
-        except (FileNotFoundError, TruncatedError, StoreError):
+        except (TruncatedError, StoreError):
             raise
         except Exception as error:
-            if self.local:
+            if self.local or (isinstance(error, FileNotFoundError) and (not self._s3 or self._exists())):
                 raise
             error.add_note(f"store of files: {name}")  # for the operator's log
             raise problems.STORE_UNAVAILABLE() from error

@@ -120,7 +120,7 @@ def check_roles(
     """Raise an error unless a job has exactly the files that it needs.
 
     Args:
-        orbit: Whether the cameras are on an orbit, which excludes camera files.
+        orbit: Whether the parameters ask for an orbit, which excludes camera files; without these, it is the default.
         weights: Weights of the style images that belong to no region; None for equal weights.
         regions: Regions of the job, whose styles and masks must be among the inputs.
 
@@ -142,14 +142,11 @@ def check_roles(
             input="style_weights",
         )
     unfit = partial(problems.INVALID_INPUT, code="invalid-cameras")
-    if not by_role["cameras"] and not orbit:
-        message = "There are no cameras. Send camera files as 'cameras', or the parameter 'orbit'."
-        raise unfit(message, input="cameras")
     if by_role["cameras"] and orbit:
         message = "Both 'cameras' and the parameter 'orbit' were sent. Send only one of them."
         raise unfit(message, input="cameras")
-    if by_role["photos"] and orbit:
-        message = "'photos' requires 'cameras', and cannot be combined with 'orbit'. Send 'cameras' instead."
+    if by_role["photos"] and not by_role["cameras"]:
+        message = "'photos' requires 'cameras', and cannot be combined with an orbit. Send the cameras of the photos."
         raise unfit(message, input="photos")
     _check_camera_files([entry["name"] for entry in by_role["cameras"]])
     (((role, name), count),) = Counter((entry["role"], entry["name"].lower()) for entry in inputs).most_common(1)

@@ -57,15 +57,14 @@ class StoredBlobs(Blobs):
             super().ensure_space(size)
 
     def add(self, path: Path, upload_id: str | None = None) -> str:
-        """Upload a received file unless its content is already stored, and move it into the cache."""
+        """Upload a received file, and move it into the cache.
+
+        The work is the same if its content is already stored: its duration would tell what others have.
+        """
         sha256, size = file_digest(path), path.stat().st_size
-        location = self._inputs.hold_known(sha256, size, upload_id)
-        if location is not None:
-            self._repair(location, sha256, path)
-        else:
-            location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
-            self.objects.put(path, f"{BLOBS}/{location}")
-            self._register(sha256, location, size, upload_id)
+        location = f"{sha256[:2]}/{sha256}-{secrets.token_hex(4)}"
+        self.objects.put(path, f"{BLOBS}/{location}")
+        self._repair(self._register(sha256, location, size, upload_id), sha256, path)
         self._cache.adopt(path, sha256)
         return sha256
 
@@ -105,7 +104,7 @@ class StoredBlobs(Blobs):
     def _repair(self, location: str, sha256: str, path: Path) -> None:
         """Replace a blob with this file if the blob is lost or damaged."""
         try:
-            self.objects.check_once(f"{BLOBS}/{location}", sha256)
+            self.objects.check(f"{BLOBS}/{location}", sha256)
         except (LostFileError, DamagedFileError):
             self.objects.put(path, f"{BLOBS}/{location}")
 
@@ -150,9 +149,7 @@ class StoredBlobs(Blobs):
         # hash the stored object itself, because it becomes the blob
         self.objects.get(f"{BLOBS}/{joined}", whole)
         sha256 = file_digest(whole)
-        location = self._register(sha256, joined, upload.length, upload.id)
-        if location != joined:
-            self._repair(location, sha256, whole)
+        self._repair(self._register(sha256, joined, upload.length, upload.id), sha256, whole)
         self._cache.adopt(whole, sha256)
         return sha256
 

@@ -145,12 +145,33 @@ class Capacity:
         return Grant(ranks, (), slots, threads, min(requested or limit, limit))
 
 
-def estimated_seconds(job: JobRow, gpus: int = 1) -> float:
-    """Estimate the duration of a job in seconds from its record, before its files are read.
+@dataclass(frozen=True)
+class Estimate:
+    """Duration of a job, estimated from its record, before its files are read.
 
     The constants are for H200 GPUs; `service.scheduling.selection` scales the estimate by the measured pace.
+
+    Attributes:
+        steps: Duration of all steps on one GPU in seconds.
+        within: Time budget of the job in seconds.
     """
-    return min(_START_SECONDS + _seconds_of_steps(job) / max(gpus, 1), _settings(job).within or math.inf)
+
+    steps: float = 0.0
+    within: float = math.inf
+
+    @staticmethod
+    def of(job: JobRow) -> Estimate:
+        """Return the estimate for a job."""
+        return Estimate(_seconds_of_steps(job), _settings(job).within or math.inf)
+
+    def seconds(self, gpus: int = 1) -> float:
+        """Return the seconds on some GPUs."""
+        return min(_START_SECONDS + self.steps / max(gpus, 1), self.within)
+
+
+def estimated_seconds(job: JobRow, gpus: int = 1) -> float:
+    """Estimate the duration of a job in seconds."""
+    return Estimate.of(job).seconds(gpus)
 
 
 def _seconds_of_steps(job: JobRow) -> float:

@@ -66,19 +66,6 @@ class InputRows:
                 _hold_for_upload(session, upload_id, sha256, size)
             return session.get_one(BlobRow, sha256, populate_existing=True).location
 
-    def hold_known(self, sha256: str, size: int, upload_id: str | None) -> str | None:
-        """Hold a known blob for an upload or receipt, and return its location; None if there is no such blob."""
-        with self.database.writing() as session:
-            if upload_id is not None:
-                _lock_upload(session, upload_id)
-            row = session.get(BlobRow, sha256, with_for_update=True)
-            if row is None:
-                return None
-            row.touched_at = self.database.clock()
-            if upload_id is not None:
-                _hold_for_upload(session, upload_id, sha256, size)
-            return row.location
-
     def hold(self, digests: Sequence[str]) -> dict[str, BlobRow]:
         """Return blobs by digest, and protect them from collection for a while.
 

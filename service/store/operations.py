@@ -14,7 +14,6 @@ from sqlalchemy import ColumnElement, SQLColumnExpression, and_, bindparam, case
 from service import problems
 from service.states import ACTIVE, JobStatus
 from service.store.database import Database, upsert
-from service.store.job_inputs import counts_and_named
 from service.store.tables import AttemptRow, Base, CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
 
 _JOBS = Base.metadata.tables[JobRow.__tablename__]
@@ -50,7 +49,7 @@ class Line:
 
     Attributes:
         running: Jobs that dispatchers hold, each with the start of its attempt and the number of its GPUs.
-        queued: First queued jobs by priority and age, with scene, styles and cameras as their inputs.
+        queued: First queued jobs by priority and age.
         capacity: GPUs, or slots for jobs, of all live dispatchers.
     """
 
@@ -136,8 +135,12 @@ class Operations:
         return [(progress["step"], progress["seconds"]) for progress in rows if progress and progress.get("seconds")]
 
     def line(self, most: int) -> Line:
-        """Return the running jobs and up to `most` queued ones, to forecast when those start."""
-        shown = [column for column in _JOBS.c if column.name != "inputs"]
+        """Return the running jobs and up to `most` queued ones, to forecast when those start.
+
+        Their rows have neither inputs nor parameters, which may be long.
+        """
+        names = ("id", "status", "queued_at", "not_before", "attempt", "progress")
+        shown = [_JOBS.c[name] for name in names]
         attempt = and_(AttemptRow.job_id == _JOBS.c.id, AttemptRow.number == _JOBS.c.attempt)
         active = (
             select(*shown, AttemptRow.started_at.label("since"), AttemptRow.gpus)
@@ -146,16 +149,13 @@ class Operations:
         )
         queued = select(*shown).where(_JOBS.c.status == JobStatus.QUEUED).limit(most)
         capacity = select(func.coalesce(func.sum(DispatcherRow.slots), 0)).where(_IS_ALIVE)
-        names = [column.name for column in shown]
         with self._database.reading_rows() as connection:
             active_rows = connection.execute(active.where(_JOBS.c.status.in_(ACTIVE))).all()
             waiting = connection.execute(queued.order_by(_JOBS.c.priority.desc(), _JOBS.c.queued_at, _JOBS.c.id)).all()
-            ids = [row.id for row in (*active_rows, *waiting)]
-            _, inputs = counts_and_named(connection, ids)
             total = connection.execute(capacity, self._span()).scalar_one()
 
         def job(row: Any) -> JobRow:
-            return JobRow(**{name: getattr(row, name) for name in names}, inputs=inputs[row.id])
+            return JobRow(**{name: getattr(row, name) for name in names})
 
         return Line([(job(row), row.since, row.gpus) for row in active_rows], [job(row) for row in waiting], total)
 

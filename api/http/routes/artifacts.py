@@ -33,6 +33,8 @@ router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
 
 #: Media types that a browser may show inline. The HTML report may run its own script, but is isolated from this site.
 _INLINE = ("image/", "video/", "text/html", "application/json", "text/plain")
+#: Spaces and punctuation, but for those that names of files have.
+_NO_WORD = re.compile(r"[\x00-,/:-@\[-^`{-\xbf\u2000-\u206f\s]+")
 _SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
@@ -113,7 +115,7 @@ async def get_artifact(
     job = await asyncio.to_thread(find, context, caller, job_id)
     row = await _find_artifact(context, caller, job, name, format_)
     # the suggested name includes the job's, so that results of jobs differ
-    plain, last = re.sub(r"[^A-Za-z0-9._-]+", "_", job.name).strip("._")[:60], PurePosixPath(row.name).name
+    plain, last = _NO_WORD.sub("_", job.name).strip("._")[:60], PurePosixPath(row.name).name
     file = artifact_file(context, job.owner, row, f"{plain}-{last}" if plain else last, media_type(row.name))
     return await send_file(request, context.threads, file, conditions)
 

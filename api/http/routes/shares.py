@@ -28,6 +28,7 @@ from service.files.artifacts import media_type
 from service.problems import SHARE_ID, SHARE_TOKEN
 from service.store.access import Shared
 from service.store.quotas import Quotas
+from service.store.tables import ArtifactRow
 
 router = APIRouter(tags=["shares"])
 
@@ -130,12 +131,14 @@ def revoke_share(
 )
 async def show_shared(shared: SharedDep, context: ContextDep) -> Response:
     """Get what the viewer of a shared result needs to know. The token of the link replaces a key."""
-    view = await asyncio.to_thread(_shared_view, context, shared)
+    view, plan = await asyncio.to_thread(_shared_view, context, shared)
+    if plan is not None:
+        view.parameters |= await context.threads.run(shared.job.owner, _up_direction, context, plan, size=plan.size)
     return Response(view.model_dump_json(), headers=_SECRET, media_type="application/json")
 
 
-def _shared_view(context: Context, shared: Shared) -> SharedView:
-    """Return the public view of a shared job: only what the page needs to show it.
+def _shared_view(context: Context, shared: Shared) -> tuple[SharedView, ArtifactRow | None]:
+    """Return the public view of a shared job, only what the page needs to show it, and the row of the job's plan.
 
     Raises:
         NoShareError: If the job was deleted meanwhile.
@@ -144,23 +147,21 @@ def _shared_view(context: Context, shared: Shared) -> SharedView:
     try:
         job, _ = jobs.detail(job_id, None)
         files = [name for name, artifact in _RESULTS.items() if jobs.artifact(job_id, artifact)]
+        plan = jobs.artifact(job_id, "plan.json")
     except NoJobError:
         raise problems.NO_SHARE() from None
-    return SharedView(
+    view = SharedView(
         name=job.row.name,
         expires_at=shared.share.expires_at,
-        parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters}
-        | _up_direction(context, job_id),
+        parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters},
         cameras=[entry["name"] for entry in job.inputs if entry["role"] == "cameras"],
         files=files,
     )
+    return view, plan
 
 
-def _up_direction(context: Context, job_id: str) -> dict[str, str]:
-    """Return the parameter `up` as the plan of an orbit has requested or found it; nothing without such a plan."""
-    row = context.store.jobs.artifact(job_id, "plan.json")
-    if row is None:
-        return {}
+def _up_direction(context: Context, row: ArtifactRow) -> dict[str, str]:
+    """Return the parameter `up` as the plan of an orbit has requested or found it; nothing without an orbit."""
     with contextlib.suppress(FileNotFoundError):
         plan = json.loads(b"".join(context.artifacts.objects.read(row.location, 0, row.size)))
         return next(({"up": each["decision"]} for each in plan["decisions"] if each["item"] == "up"), {})

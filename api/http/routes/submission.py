@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from functools import partial
 from typing import Annotated, Any
 
@@ -315,14 +315,14 @@ def _resolve_inputs(
     inputs = list(received.files)
     ids = [text for _, _, text in received.uploads if is_id(text)]
     uploads = context.store.inputs.uploads(ids, caller.owner) if ids else {}
-    jobs: dict[str, list[dict[str, Any]]] = {}
+    released: dict[str, bool] = {}
     resolved: list[tuple[str, str]] = []
     for _, role, text in received.uploads:
         if is_url(text):
             resolved.append((file_name(text), fetched.get(text, "")))
             continue
         if reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
-            entry = _referred_input(context, caller, reference[1], reference[2], role, jobs)
+            entry = _referred_input(context, caller, reference[1], reference[2], role, released)
             resolved.append((entry["name"], entry["sha256"]))
             continue
         upload = uploads.get(text)
@@ -340,27 +340,24 @@ def _resolve_inputs(
 
 
 def _referred_input(
-    context: Context, caller: Caller, job_id: str, name: str, role: str, jobs: dict[str, list[dict[str, Any]]]
+    context: Context, caller: Caller, job_id: str, name: str, role: str, released: dict[str, bool]
 ) -> dict[str, Any]:
-    """Return the entry of an input of one of the caller's jobs.
+    """Return the entry of an input of one of the caller's jobs. No other entry of the job is read.
 
     Args:
-        jobs: Inputs of jobs that were read for other references, to which this one's are added.
+        released: Whether jobs that other references name have released their inputs; this one's job is added.
 
     Raises:
         UNKNOWN_INPUT: If the input does not exist, or was released.
     """
-    try:
-        if job_id not in jobs:
-            released = find(context, caller, job_id).status == JobStatus.EXPIRED
-            jobs[job_id] = [] if released else context.store.jobs.inputs(job_id)
-    except NoJobError:
-        raise problems.UNKNOWN_INPUT(job_id=job_id, name=name, input=role) from None
-    place = parse_input(name)
-    entries = [entry for entry in jobs[job_id] if place and entry["role"] == place[0]]
-    if place is None or place[1] >= len(entries):
-        raise problems.UNKNOWN_INPUT(job_id=job_id, name=name, input=role)
-    return entries[place[1]]
+    with suppress(NoJobError):
+        if job_id not in released:
+            released[job_id] = find(context, caller, job_id).status == JobStatus.EXPIRED
+        place = parse_input(name)
+        entry = context.store.jobs.input(job_id, *place) if place and not released[job_id] else None
+        if entry is not None:
+            return entry
+    raise problems.UNKNOWN_INPUT(job_id=job_id, name=name, input=role)
 
 
 def _upload_digest(context: Context, upload: UploadRow, role: str) -> str:

@@ -163,9 +163,9 @@ async def create_upload(
     limit = context.settings.max_upload_bytes
     if length > limit:
         raise problems.TOO_LARGE(f"The file has {length:,} bytes. At most {limit:,} are allowed.", limit=limit)
-    if not length:
-        raise problems.MALFORMED_BODY("The file is empty. Give its size as Upload-Length.")
     name = staged_name("upload", uploaded_name(metadata))
+    if not length:
+        raise problems.MALFORMED_BODY(f"{name}: is empty (Upload-Length: 0). Choose a file with content.")
     seconds = context.settings.upload_hours * 3600
     await context.threads.run(caller.owner, context.blobs.ensure_space, length)
     row = await asyncio.to_thread(

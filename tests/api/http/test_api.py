@@ -120,7 +120,8 @@ def test_invalid_query_is_named_as_it_was_sent(client: httpx2.Client) -> None:
 
 def test_missing_and_surplus_files_are_rejected(client: httpx2.Client, files: dict[str, bytes]) -> None:
     assert refused(client.post("/v1/jobs", files=form(files, style=None)), 422, "invalid-request")["input"] == "style"
-    refused(client.post("/v1/jobs", files=form(files, cameras=None)), 422, "invalid-cameras")
+    photo = ("photos", ("a.png", files["style"]))
+    refused(client.post("/v1/jobs", files=[*form(files, cameras=None), photo]), 422, "invalid-cameras")
     refused(client.post("/v1/jobs", files=[*form(files), ("scene", ("b.ply", files["scene"]))]), 422, "invalid-request")
     refused(client.post("/v1/jobs", files=form(files, weights=b"x")), 422, "invalid-request")
     refused(client.post("/v1/jobs", files=form(files, cameras=("a.exe", b"x"))), 422, "invalid-cameras")

@@ -256,7 +256,7 @@ def test_plan_of_an_orbit_says_whether_up_is_sure(service: Service, files: dict[
         assert (asked["sure"], len(asked["candidates"])) == (False, 2)
         assert asked["candidates"][0] == "-y"
         assert "most captures" in asked["reason"]
-        refused = client.post("/v1/jobs", **request(without, orbit=2) | {"params": {"sure_up": True}})
+        refused = client.post("/v1/jobs", **request(without) | {"params": {"sure_up": True}})  # an orbit by default
         assert (refused.status_code, refused.json()["code"]) == (422, "unsure-up")
         assert refused.json()["candidates"] == asked["candidates"]
         assert jobs(client) == before

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,8 @@ from service.store import Store, open_store
 from service.store.access import MOST_SHARES
 from service.store.tables import CounterRow, ShareRow
 from tests.api.conftest import KEYED, Services
-from tests.api.service import Service, check_documented
+from tests.api.http.test_hanging import MANY
+from tests.api.service import Service, check_documented, wait_for
 from tests.small_scenes import wall, write_files
 
 PLY, COLORS, THUMBNAIL = b"ply\nstylized", b"\0\1" * 9, b"\xff\xd8\xff\xe0"
@@ -63,6 +66,7 @@ def finished(client: httpx2.Client, service: Service, store: Store, files: dict[
             "stylized.ply": PLY,
             "colors.f16": COLORS,
             "report.json": b"{}",
+            "plan.json": b'{"decisions": []}',
             "previews/thumbnail.jpg": THUMBNAIL,
         }
         for name, content in contents.items():
@@ -360,3 +364,27 @@ def test_client_shares_results(
         assert [each["id"] for each in client.shares(job_id)] == [created["id"]]
         client.revoke_share(job_id, created["id"])
         assert client.shares(job_id) == []
+
+
+def test_link_whose_files_hang_occupies_no_thread_of_others(
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+) -> None:
+    job_id = finished(me, service, store, files, tmp_path)
+    _, token = share(me, job_id)
+    row = store.jobs.artifact(job_id, "plan.json")
+    assert row is not None
+    path = service.data / "artifacts" / row.location
+    away, pipe = path.rename(path.with_suffix(".away")), path.with_suffix(".pipe")
+    os.mkfifo(path)  # opening it takes until somebody else writes to it
+    with ThreadPoolExecutor(MANY) as pool, service.client(store.keys.create("other")[1]) as other:
+        reads = [pool.submit(visitor.get, f"/v1/shared/{token}") for _ in range(MANY)]
+        try:
+            for _ in range(3):
+                assert other.get("/v1/jobs").json()["jobs"] == []
+            assert not any(read.done() for read in reads)
+        finally:
+            path.rename(pipe)
+            away.rename(path)
+            writer = os.open(pipe, os.O_RDWR)
+        wait_for(lambda: visitor.get(f"/v1/shared/{token}").status_code == 200, "the link", service.said)
+        os.close(writer)

@@ -567,7 +567,7 @@ def test_requests_are_checked_before_anything_is_fetched(
     service: Service, shared_files: FileServer, urls: dict[str, str]
 ) -> None:
     wrong: list[tuple[str, dict[str, Any]]] = [
-        ("invalid-cameras", {"scene": urls["scene"], "style": urls["style"]}),
+        ("invalid-cameras", {"scene": urls["scene"], "style": urls["style"], "photos": [urls["style"]]}),
         ("unknown-upload", {"scene": urls["scene"], "style": "x", "cameras": [urls["cameras"]]}),
         ("invalid-url", {"scene": urls["scene"], "style": "http://evil.test/", "cameras": [urls["cameras"]]}),
         ("webhooks-off", {**urls, "cameras": [urls["cameras"]], "webhook": "https://example.com/"}),

@@ -14,7 +14,9 @@ from pathlib import Path
 import httpx2
 import pytest
 
+from service.errors import StoreError
 from service.files.artifacts import Artifacts
+from service.files.objects import ObjectStore
 from tests.api.service import Service, undisturbed, wait_for
 from tests.service.files.s3 import environment_of, s3_server
 from tests.small_scenes import wall, write_files
@@ -108,10 +110,11 @@ def test_later_objects_are_visible_to_other_processes(
     assert httpx2.head(late).status_code == 404
 
 
-def test_missing_bucket_is_not_ready(artifacts: Artifacts) -> None:
-    artifacts.objects.ping()
-    with pytest.raises(OSError, match="nowhere"):
-        Artifacts("s3://nowhere/x").objects.ping()
+def test_missing_bucket_is_an_outage_and_no_lost_file(environment: dict[str, str]) -> None:
+    objects = ObjectStore("s3://nowhere/x")
+    for use in (objects.ping, lambda: objects.size("a")):
+        with pytest.raises(StoreError):
+            use()
 
 
 @contextmanager

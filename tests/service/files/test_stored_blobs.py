@@ -137,6 +137,27 @@ def test_uploading_again_repairs_a_damaged_blob(fleet: Fleet, lost: bool, size: 
     assert fleet.read(fleet.host("three"), sha256) == data
 
 
+@pytest.mark.parametrize("local", [True, False])
+def test_work_for_a_file_does_not_tell_whether_another_key_has_it(
+    fleet: Fleet, local: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host = BlobFolder(fleet.folder / "data", fleet.store.inputs, 0) if local else fleet.host("one")
+    read: list[str] = []
+    digest = ObjectStore.digest
+    monkeypatch.setattr(ObjectStore, "digest", lambda self, name: (read.append(name), digest(self, name))[1])
+    work = []
+    for name in ("first", "second"):
+        path = host.incoming / name
+        path.write_bytes(b"x" * MB)
+        before = len(fleet.s3.asked)
+        host.add(path)
+        sent = [method for method, _ in fleet.s3.asked[before:] if method not in ("DELETE", "HEAD")]
+        work.append((len(read), sent))
+        read.clear()
+    assert work[0] == work[1]
+    assert work[0][0] == 1
+
+
 @pytest.mark.slow
 def test_ranges_are_read_without_a_full_copy(fleet: Fleet) -> None:
     data = os.urandom(2 * MB + 7)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import event
 
 from service.scheduling.forecast import expected_starts
 from service.scheduling.packing import estimated_seconds
@@ -69,3 +70,17 @@ def test_free_capacity_and_priority_count(store: Store, clock: Clock) -> None:
     assert expected_starts(store, [low, high]) == pytest.approx({high: queued_at, low: reported_at + 90})
     clock.now += 1000
     assert expected_starts(store, [low]) == {}, "the dispatcher is dead"
+
+
+def test_parameters_of_jobs_ahead_are_read_once(store: Store, clock: Clock) -> None:
+    """They may take 64 kB each, and belong to other keys."""
+    store.operations.record_heartbeat("one", 2, 1)
+    waiting = [queue_later(store, clock) for _ in range(3)]
+    read: list[str] = []
+    event.listen(store.database.engine, "before_cursor_execute", lambda *each: read.append(each[2]))
+    first = expected_starts(store, waiting[-1:])
+    assert sum("parameters" in statement for statement in read) == 3
+    read.clear()
+    assert expected_starts(store, waiting[-1:]) == first
+    assert read
+    assert not any("parameters" in statement or "inputs" in statement for statement in read)

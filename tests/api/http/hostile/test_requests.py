@@ -281,7 +281,10 @@ def test_uploads_require_protocol_version(client: httpx2.Client) -> None:
 def test_malformed_upload_creation_is_rejected(client: httpx2.Client) -> None:
     for length in ("-1", "x", "1.5", "1e3", "0x10", "", str(2**60), "9" * 5000, "NaN", *NO_DIGITS):
         refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": length}), 422, "invalid-request")
-    refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": "0"}), 400, "malformed-body")
+    empty = {**TUS, "Upload-Length": "0", "Upload-Metadata": "filename c2NlbmUucGx5"}
+    assert refused(client.post("/v1/uploads", headers=empty), 400, "malformed-body")["detail"].startswith(
+        "scene.ply: is"
+    )
     refused(client.post("/v1/uploads", headers={**TUS, "Upload-Length": str(81 * MB)}), 413, "too-large")
     refused(
         client.post("/v1/uploads", headers={"Tus-Resumable": "9", "Upload-Length": "5"}), 412, "unsupported-tus-version"
