@@ -9,6 +9,9 @@ https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussi
 glTF has y up, z forward and x left. Scenes are rotated by 180 degrees about z from and to the axes of a PLY, after the
 transformation of the node that holds them.
 
+Gaussians may be a compressed SPZ in the data (KHR_gaussian_splatting_compression_spz_2), with the axes of its library.
+Linear colors are converted to sRGB for each Gaussian.
+
 The specification does not define antialiasing. Written files state the render mode in the `extras` of the primitive.
 """
 
@@ -21,7 +24,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,21 +51,26 @@ from sgsst_core.files.formats.scene_format import (
     read_rows,
     truncated,
 )
+from sgsst_core.files.formats.spz import SPZ_3
 from sgsst_core.files.formats.units import logarithms, logits
 from sgsst_core.scene.rendering import Rendering
 
 _MAGIC = b"glTF"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAX_JSON_BYTES = 1 << 20
+#: Bytes of an SPZ in which its header is read.
+_HEAD_BYTES = 8192
 #: Maximum number of nodes above the one of the Gaussians.
 _MAX_DEPTH = 64
 _MAX_BYTES = (1 << 32) - 1
 _EXTENSION = "KHR_gaussian_splatting"
 #: Extensions that change nothing in what is read. Files that require another one are refused.
 _HARMLESS = re.compile(
-    rf"{_EXTENSION}|KHR_mesh_quantization|EXT_(mesh_features|structural_metadata)"
+    rf"{_EXTENSION}(_compression_spz_2)?|KHR_mesh_quantization|EXT_(mesh_features|structural_metadata)"
     r"|[A-Z]+_(materials|texture|lights|xmp|audio|animation)(_\w+)?"
 )
+_SPZ = f"{_EXTENSION}_compression_spz_2"
+_LINEAR = "lin_rec709_display"
 _SUPPORTED = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
@@ -124,6 +132,8 @@ class GlbPart:
         harmonics: Accessors of the SH coefficients above degree 0.
         frame: Transformation to the axes of a PLY.
         tag: Render mode that the set states.
+        linear: Whether colors are linear.
+        spz: Byte offset and header of the SPZ that holds all attributes, in place of accessors; None if none does.
     """
 
     count: int
@@ -131,6 +141,13 @@ class GlbPart:
     harmonics: list[Accessor]
     frame: Frame
     tag: RenderTag
+    linear: bool
+    spz: tuple[int, SceneHeader] | None = None
+
+    @property
+    def coefficients(self) -> int:
+        """Return the number of SH coefficients per color channel above degree 0."""
+        return self.spz[1].coefficients if self.spz else len(self.harmonics)
 
 
 @dataclass(frozen=True)
@@ -148,7 +165,7 @@ def _read_header(start: FileStart) -> GlbHeader:
         shown, hidden = _shown_splats(path, document)
         required = {each for each in document.get("extensionsRequired", []) if not _HARMLESS.fullmatch(each)}
         for primitive, _ in shown:
-            required |= set(primitive["extensions"][_EXTENSION].get("extensions") or {})
+            required |= set(primitive["extensions"][_EXTENSION].get("extensions") or {}) - {_SPZ}
         if required:
             raise SceneError(
                 f"{path}: its Gaussians need the glTF extension {', '.join(sorted(required))[:80]}, which cannot be "
@@ -157,6 +174,12 @@ def _read_header(start: FileStart) -> GlbHeader:
         parts = [_part(path, document, *each, data) for each in shown]
         notes = [f"{hidden} sets of Gaussians that no node shows are left out"] if hidden else []
         notes += ["animations are left out"] if document.get("animations") else []
+        unknown = {name for each, _ in shown for name in each["extensions"][_EXTENSION]}
+        unknown -= {*_SUPPORTED, "extensions", "extras"}
+        notes += [f"{', '.join(sorted(unknown))[:80]} of {_EXTENSION} are unknown and ignored"] if unknown else []
+        linear = "colors are linear, and converted to sRGB for each Gaussian; where Gaussians overlap, renders differ"
+        notes += [linear] if any(part.linear for part in parts) else []
+        notes += [note for part in parts if part.spz for note in part.spz[1].notes]
         notes += _about_rest(path, document, parts, data)
     except _WRONG_JSON as error:
         raise SceneError(f"{path}: is not a valid GLB scene ({repr(error)[:200]}). Export it again.") from error
@@ -165,7 +188,7 @@ def _read_header(start: FileStart) -> GlbHeader:
         raise SceneError(f"{path}: its nodes show {count} Gaussians, more than its {len(data)} bytes can hold.")
     if len({part.tag.rendering for part in parts}) > 1:
         raise SceneError(f"{path}: its {len(parts)} sets of Gaussians have different render modes. Export them apart.")
-    coefficients = max(len(part.harmonics) for part in parts)
+    coefficients = max(part.coefficients for part in parts)
     return GlbHeader(GLB, count, coefficients, parts, notes=tuple(notes), tag=parts[0].tag)
 
 
@@ -227,8 +250,9 @@ def _part(
 ) -> GlbPart:
     """Parse a primitive of Gaussians. Errors of `_WRONG_JSON` mean that a value is missing or wrong."""
     declared = primitive["extensions"][_EXTENSION]
+    linear = declared.get("colorSpace") == _LINEAR
     for name, supported in _SUPPORTED.items():
-        if declared.get(name, supported) != supported:
+        if declared.get(name, supported) != supported and not (linear and name == "colorSpace"):
             raise SceneError(
                 f"{path}: its Gaussians have {name} {str(declared[name])[:40]!r}; only {supported!r} can be read. "
                 "Export it again."
@@ -239,6 +263,21 @@ def _part(
     if type(count) is not int or count < 1:
         raise ValueError(f"count: {count}")
 
+    compressed = (declared.get("extensions") or {}).get(_SPZ)
+    local = Y_UP if compressed else np.eye(4)  # an SPZ is read in the axes of a PLY
+    try:
+        frame = Frame.of(Y_UP @ matrix @ local)
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}, by the transformation of its node. Export it without that.") from error
+    tag = extras_tag(primitive.get("extras"), "the extras of the GLB")
+    if compressed:
+        start, size = _view(document, compressed["bufferView"], data)
+        spz = FileStart(path, read_bytes(path, start, start + min(size, _HEAD_BYTES)), size)
+        header = SPZ_3.read_header(spz)
+        if not SPZ_3.matches(spz) or header.count != count:
+            raise ValueError(f"SPZ of {header.count} Gaussians in place of {count}")
+        return GlbPart(count, {}, [], frame, tag if tag.reason else header.tag, linear, (start, header))
+
     def accessor(name: str, kind: str) -> Accessor:
         if name not in attributes:
             raise SceneError(f"{path}: its Gaussians have no attribute {name}. Export it again.")
@@ -246,16 +285,13 @@ def _part(
 
     present = sum(name in attributes for name in _HARMONICS)
     coefficients = min(number for number in COEFFICIENTS.values() if number >= present)
-    try:
-        frame = Frame.of(Y_UP @ matrix)
-    except ValueError as error:
-        raise SceneError(f"{path}: {error}, by the transformation of its node. Export it without that.") from error
     return GlbPart(
         count,
         {name: accessor(*attribute) for name, attribute in _ATTRIBUTES.items()},
         [accessor(name, "VEC3") for name in _HARMONICS[:coefficients]],
         frame,
-        extras_tag(primitive.get("extras"), "the extras of the GLB"),
+        tag,
+        linear,
     )
 
 
@@ -285,21 +321,40 @@ def _accessor(document: dict[str, Any], index: int, shape: str, count: int, data
     entry = document["accessors"][index]
     if entry["type"] != shape or entry["count"] != count or "sparse" in entry:
         raise ValueError(f"accessor {index}: {entry}")
-    view = document["bufferViews"][entry["bufferView"]]
-    if view.get("buffer") != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
-        raise ValueError(f"buffer view {entry['bufferView']} is not in the file, or compressed")
+    start, size = _view(document, entry["bufferView"], data)
     code = _TYPES[entry["componentType"]]
     kind = np.dtype((code, (_COMPONENTS[shape],)))
-    stride = view.get("byteStride", kind.itemsize)
-    first, start, size = entry.get("byteOffset", 0), view.get("byteOffset", 0), view["byteLength"]
-    if any(type(number) is not int or number < 0 for number in (stride, first, start, size)):
-        raise ValueError(f"accessor {index}: {entry}, {view}")
-    inside = start + size <= len(data) and first + (count - 1) * stride + kind.itemsize <= size
-    if not inside or not kind.itemsize <= stride <= _MAX_STRIDE:
+    stride = document["bufferViews"][entry["bufferView"]].get("byteStride", kind.itemsize)
+    first = entry.get("byteOffset", 0)
+    if any(type(number) is not int or number < 0 for number in (stride, first)):
+        raise ValueError(f"accessor {index}: {entry}, stride {stride}")
+    if first + (count - 1) * stride + kind.itemsize > size or not kind.itemsize <= stride <= _MAX_STRIDE:
         raise ValueError(f"accessor {index}: {count} values are more than its {size} bytes can hold")
     largest = _LARGEST.get(code) if entry.get("normalized", False) else None
-    offset, end = data.start + start + first, data.start + start + size
-    return Accessor(offset, stride, kind, largest, entry["bufferView"], end)
+    return Accessor(start + first, stride, kind, largest, entry["bufferView"], start + size)
+
+
+def _view(document: dict[str, Any], index: int, data: range) -> tuple[int, int]:
+    """Return the byte offset of a buffer view in the file, and its size, after checking that it lies in the data."""
+    view = document["bufferViews"][index]
+    if view.get("buffer") != 0 or "uri" in document["buffers"][0] or view.get("extensions"):
+        raise ValueError(f"buffer view {index} is not in the file, or compressed")
+    start, size = view.get("byteOffset", 0), view["byteLength"]
+    if any(type(number) is not int or number < 0 for number in (start, size)) or start + size > len(data):
+        raise ValueError(f"buffer view {index}: {view}, more than its {len(data)} bytes can hold")
+    return data.start + start, size
+
+
+class _Within(NamedTuple):
+    """Part of an open scene that is a file of its own."""
+
+    path: Path
+    file: OpenScene
+    start: int
+
+    def read(self, offset: int, buffer: NDArray[np.uint8]) -> None:
+        """Read bytes of the part, starting at `offset`, until a buffer is full."""
+        self.file.read(self.start + offset, buffer)
 
 
 def _node_matrix(nodes: list[dict[str, Any]], parents: dict[int, int], index: int) -> NDArray[np.float64]:
@@ -348,14 +403,32 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
         arrays = {name: array[first : first + part.count] for name, array in into.items()}
         first += part.count
         with np.errstate(over="ignore", invalid="ignore"):  # invalid values are reported later
-            for name, convert in converters.items():
+            for name, convert in converters.items() if not part.spz else ():
                 for block, values in _values(file, part.accessors[name], part.count):
                     arrays[name][block] = convert(values)
             for index, accessor in enumerate(part.harmonics):
                 for block, values in _values(file, accessor, part.count):
                     arrays["sh_rest"][block, index] = values
-            arrays["sh_rest"][:, len(part.harmonics) :] = 0
+            arrays["sh_rest"][:, part.coefficients :] = 0
+            if part.spz:
+                start, spz = part.spz
+                within = {**arrays, "sh_rest": arrays["sh_rest"][:, : part.coefficients]}
+                assert SPZ_3.read is not None
+                SPZ_3.read(_Within(file.path, file, start), spz, within)
             part.frame.apply(arrays)
+            if part.linear:
+                _convert_linear(arrays)
+
+
+def _convert_linear(arrays: Arrays) -> None:
+    """Convert linear colors to sRGB in place (IEC 61966-2-1); harmonics by the slope at the color of degree 0."""
+    with np.errstate(invalid="ignore"):
+        colors = np.maximum(COLOR_OFFSET + SH_C0 * arrays["sh_dc"].astype(np.float64), 0)
+        dark, power = colors <= 0.0031308, np.maximum(colors, 0.0031308) ** (1 / 2.4)
+        encoded = np.where(dark, 12.92 * colors, 1.055 * power - 0.055)
+        slopes = np.where(dark, 12.92, 1.055 / 2.4 * power / np.maximum(colors, 0.0031308))
+        arrays["sh_dc"][:] = (encoded - COLOR_OFFSET) / SH_C0
+        arrays["sh_rest"] *= slopes[:, None].astype(np.float32)
 
 
 def _values(file: OpenScene, accessor: Accessor, count: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:
@@ -391,7 +464,8 @@ def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
     with np.errstate(over="ignore"):
         opacities = np.clip(1 / (1 + np.exp(-arrays["opacities"].astype(np.float64))), 1e-37, _LARGEST_OPACITY)
     quats = np.roll(arrays["quats"].astype(np.float64), -1, axis=1)
-    colors = np.column_stack([np.clip(COLOR_OFFSET + SH_C0 * arrays["sh_dc"].astype(np.float64), 0, 1), opacities])
+    colors = np.clip(COLOR_OFFSET + SH_C0 * arrays["sh_dc"].astype(np.float64), 0, 1)
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # as glTF requires
     values = {
         "means": arrays["means"],
         "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
@@ -404,7 +478,7 @@ def _columns(arrays: Arrays) -> list[tuple[str, NDArray[Any]]]:
     ]
     harmonics = arrays["sh_rest"].shape[1]
     columns += [(_HARMONICS[index], arrays["sh_rest"][:, index].astype("<f4")) for index in range(harmonics)]
-    return [*columns, ("COLOR_0", np.rint(255 * colors).astype(np.uint8))]
+    return [*columns, ("COLOR_0", np.rint(255 * np.column_stack([linear, opacities])).astype(np.uint8))]
 
 
 def _document(columns: list[tuple[str, NDArray[Any]]], data_bytes: int, extras: dict[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ import torch
 
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.glb import GLB
+from sgsst_core.files.formats.spz import SPZ_3
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import assert_close, check_documents, encoded, refused
-from tests.sgsst_core.splat_scenes import cloud
+from tests.sgsst_core.splat_scenes import camera, cloud
 
 PREFIX = "KHR_gaussian_splatting:"
 
@@ -225,12 +228,81 @@ def test_infinite_opacities_are_clamped(tmp_path: Path) -> None:
     assert bool(torch.isfinite(file.scene.opacities).all())
 
 
+def test_colors_for_other_programs_are_linear(tmp_path: Path) -> None:
+    scene = cloud(500)
+    write_scene(tmp_path / "scene.glb", scene, GLB)
+    document, data = split((tmp_path / "scene.glb").read_bytes())
+    entry = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    view = document["bufferViews"][entry["bufferView"]]
+    stored = np.frombuffer(data, np.uint8, view["byteLength"], view["byteOffset"]).reshape(-1, 4) / 255
+    srgb = np.where(stored <= 0.0031308, 12.92 * stored, 1.055 * stored ** (1 / 2.4) - 0.055)[:, :3]
+    expected = np.clip(0.5 + 0.28209479 * scene.sh_dc.numpy(), 0, 1)
+    assert np.abs(srgb - expected).max() < 0.026  # half a step of 8 bits, in the dark
+    assert np.abs(srgb - expected)[expected > 0.5].max() < 0.003
+    np.testing.assert_allclose(stored[:, 3], scene.opacities.sigmoid().numpy(), atol=0.5 / 255 + 1e-6)
+
+
+def test_linear_colors_become_srgb(tmp_path: Path) -> None:
+    """Those of a Gaussian in any direction, as far as they are close to its color of degree 0."""
+    scene = cloud(500, degree=1)
+    scene = replace(scene, sh_dc=scene.sh_dc.clamp(-1.5, 3), sh_rest=scene.sh_rest * 1e-3)
+    write_scene(tmp_path / "linear.glb", scene, GLB)
+    document, data = split((tmp_path / "linear.glb").read_bytes())
+    document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"] |= {
+        "colorSpace": "lin_rec709_display",
+        "sharpness": 1,
+    }
+    (tmp_path / "linear.glb").write_bytes(joined(document, data))
+    file = read_scene(tmp_path / "linear.glb")
+    assert [note.partition(",")[0] for note in file.notes] == [
+        "sharpness of KHR_gaussian_splatting are unknown and ignored",
+        "colors are linear",
+    ]
+    view = camera()
+    linear, srgb = (
+        0.5 + 0.28209479 * each.sh_dc.double() + rest_colors(each.sh_rest, each.means, view)
+        for each in (scene, file.scene)
+    )
+    expected = torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(1e-9) ** (1 / 2.4) - 0.055)
+    torch.testing.assert_close(srgb, expected, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("node", [{}, {"translation": [1, 2, 3], "rotation": [0.6, 0, 0, 0.8], "scale": [2, 2, 2]}])
+def test_compressed_gaussians_are_read_as_others(tmp_path: Path, node: dict[str, Any]) -> None:
+    """The SPZ has the axes of its library, RUB; its Gaussians appear in those of glTF, LUF."""
+    plain, scene = tmp_path / "plain.glb", cloud(500, degree=2)
+    write_scene(tmp_path / "scene.spz", scene, SPZ_3)
+    write_scene(plain, read_scene(tmp_path / "scene.spz").scene, GLB)
+    document, data = split(plain.read_bytes())
+    document["nodes"][0] |= node
+    plain.write_bytes(joined(document, data))
+    blob = (tmp_path / "scene.spz").read_bytes()
+    blob = b"some" + blob + bytes(-len(blob) % 4)
+    primitive = document["meshes"][0]["primitives"][0]
+    primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] = {COMPRESSION: {"bufferView": 0}}
+    document |= {
+        "extensionsRequired": ["KHR_gaussian_splatting", COMPRESSION],
+        "accessors": [{key: each[key] for key in ("componentType", "count", "type")} for each in document["accessors"]],
+        "bufferViews": [{"buffer": 0, "byteOffset": 4, "byteLength": len(blob) - 4}],
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    (tmp_path / "small.glb").write_bytes(joined(document, blob))
+    file = read_scene(tmp_path / "small.glb")
+    assert_close(file.scene, read_scene(plain).scene, opacities=1e-6, others=2e-5)
+    assert file.notes == ()
+    document["accessors"][0]["count"] = 499
+    refused(tmp_path, joined(document, blob), "SPZ of 500 Gaussians in place of 499", "wrong.glb")
+    document["bufferViews"][0]["byteLength"] += 1
+    refused(tmp_path, joined(document, blob), "bytes can hold", "wrong.glb")
+
+
 def test_checks_read_only_the_header(tmp_path: Path) -> None:
     document, data = split(encoded(tmp_path, GLB))
     (tmp_path / "scene").write_bytes(joined(document, bytes(len(data))))
     assert read_scene_header(tmp_path / "scene").count == 616
 
 
+COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
 MESH = {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}
 FIRST = "meshes__0__primitives__0__"
 
@@ -246,16 +318,16 @@ FIRST = "meshes__0__primitives__0__"
             by_hand(
                 **{
                     FIRST + "extensions__KHR_gaussian_splatting__extensions": {
-                        "KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}
+                        "KHR_gaussian_splatting_lgsc": {"bufferView": 0}
                     }
                 }
             ),
-            "KHR_gaussian_splatting_compression_spz_2, which cannot be read",
+            "KHR_gaussian_splatting_lgsc, which cannot be read",
         ),
         (by_hand(**{FIRST + "extensions__KHR_gaussian_splatting__kernel": "box"}), "kernel 'box'"),
         (
-            by_hand(**{FIRST + "extensions__KHR_gaussian_splatting__colorSpace": "lin_rec709_display"}),
-            "colorSpace 'lin_rec709_display'",
+            by_hand(**{FIRST + "extensions__KHR_gaussian_splatting__colorSpace": "lin_rec2020_display"}),
+            "colorSpace 'lin_rec2020_display'",
         ),
         (by_hand(**{FIRST + "attributes": {"POSITION": 0}}), "no attribute KHR_gaussian_splatting:ROTATION"),
         (by_hand(**{FIRST + f"attributes__{PREFIX}SH_DEGREE_1_COEF_1": 0}), "no attribute .*SH_DEGREE_1_COEF_0"),
@@ -268,7 +340,7 @@ FIRST = "meshes__0__primitives__0__"
         (by_hand(accessors__0__type="MAT4"), "not a valid GLB scene"),
         (by_hand(accessors__0__sparse={}), "not a valid GLB scene"),
         (by_hand(accessors__0__bufferView=7), "not a valid GLB scene"),
-        (by_hand(bufferViews__0__byteLength=97), "more than its 97 bytes can hold"),
+        (by_hand(bufferViews__0__byteLength=97), "97, .*more than its 100 bytes can hold"),
         (by_hand(bufferViews__0__byteLength=95), "more than its 95 bytes can hold"),
         (by_hand(bufferViews__0__byteStride=0), "not a valid GLB scene"),
         (by_hand(bufferViews__0__byteOffset=2**70), "not a valid GLB scene"),
