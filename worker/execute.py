@@ -202,6 +202,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
         loss_after=mean_loss(after, weights),
         report_error=str(error) if error else None,
         compressed=compressed and compressed.text("the PLY"),
+        loss_views=len(stylizer.job.evaluation_views),
         loss_over_time=loss_over_time(stylizer, before),
     )
 

@@ -70,7 +70,7 @@ class JobSpec(BaseModel):
 
 
 class Result(BaseModel):
-    """Result of a job. Its record in the service leaves out the last two fields, which the report has in detail.
+    """Result of a job. Its record in the service leaves out the last three fields, which the report has in detail.
 
     Attributes:
         stopped: Reason why the job ended; see `stylizing.loop.run`. If it is "interrupted", only a checkpoint was
@@ -80,6 +80,7 @@ class Result(BaseModel):
         loss_after: Mean loss of the last round of views, over the same scales; None if the job was interrupted.
         report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
         compressed: Text about the quality of the compressed file; None if no compressed file was requested.
+        loss_views: Number of evaluation views, which are spread over all.
         loss_over_time: Summary for the report; None if no step was made on all scales.
     """
 
@@ -92,6 +93,7 @@ class Result(BaseModel):
     loss_after: float | None = None
     report_error: str | None = None
     compressed: str | None = Field(None, exclude=True)
+    loss_views: int = Field(0, exclude=True)
     loss_over_time: dict[str, Any] | None = Field(None, exclude=True)
 
 

@@ -165,6 +165,7 @@ def _print_result(outputs: Outputs, result: Result, command: str) -> None:
     assert result.loss_before is not None
     assert result.loss_after is not None
     print_field("loss", loss_text(result.loss_before, result.loss_after))
+    print_field("loss measured", f"before on {result.loss_views} views, after in the steps of the last round of views")
     for line in _loss_over_time(result):
         print_field("loss over time", line)
     paths = [("stylized scene", outputs.ply)]

@@ -31,7 +31,7 @@ def loss_table(report: dict[str, Any]) -> Table:
         after = loss["after"]["scales"].get(scale, {})
         rows.append([f"scale {scale}", before["total"], after.get("total"), loss["relative_by_scale"].get(scale)])
     return Table(
-        ["", "unstylized", "stylized", "relative"],
+        ["", f"unstylized, on {len(loss['views'])} views", "stylized, in the last round of views", "relative"],
         [[name, *(number(value) for value in values)] for name, *values in rows],
     )
 

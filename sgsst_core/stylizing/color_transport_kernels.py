@@ -1,4 +1,4 @@
-"""Numba kernel of `color_transport`: all rounds in one pass over the colors, on all CPU cores."""
+"""Numba kernel of the color transport of `warm_start`: all rounds in one pass over the colors, on all CPU cores."""
 
 # Arguments are untyped: Numba compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def"

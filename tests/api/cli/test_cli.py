@@ -116,7 +116,14 @@ def test_compressed_result_never_overwrites_scene(files: Files, capsys: pytest.C
 def test_stylize_changes_only_f_dc(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(files.stylize("--steps-sos", "3")) == 0
     shown = capsys.readouterr().out
-    for expected in ("616 Gaussians, SH degree 1", "3 of 64x48, 1 scale", "VGG16", "3 steps", "before", str(files.out)):
+    for expected in (
+        "616 Gaussians, SH degree 1",
+        "3 of 64x48, 1 scale",
+        "VGG16",
+        "3 steps",
+        "before on 3 views",
+        str(files.out),
+    ):
         assert expected in shown
     assert sorted(path.name for path in files.out.parent.iterdir()) == [
         "stylized.before_after.jpg",
