@@ -55,7 +55,7 @@ class Gate:
                 yield
         except DatabaseUnavailableError as error:
             if refusal is None:
-                _log.warning("database unavailable: %s", error.__cause__ or error)
+                _log.warning("database unavailable: %s", getattr(error.__cause__, "orig", error))  # without the SQL
             self._refusal = error
             raise
         except BaseException:
