@@ -170,7 +170,9 @@ class _CheckpointWriter:
 
 
 def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft | None) -> Result:
-    """Write the PLY, then all other outputs. Novel views are left out if a time budget has no time for them.
+    """Write the PLY, then all other outputs.
+
+    Novel views are left out if a time budget has no time for them, or the user has ended the run, and waits.
 
     Every rank must call this function.
     """
@@ -187,7 +189,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
     if first and stopped not in CONTINUABLE:
         outputs.checkpoints.remove()
     needed = measure.seconds_left(stylizer.step, ends=True)
-    if stylizer.job.collectives.broadcast(lambda: left is None or left() > needed):
+    if stylizer.job.collectives.broadcast(lambda: stopped != "on-request" and (left is None or left() > needed)):
         measure.at_the_end()
     # The initial loss is evaluated here, because evaluating it before the first step would delay the job.
     before = measure.evaluate(unstylized=True)

@@ -291,12 +291,13 @@ export class SelectPanel {
   key(event) {
     const { target } = event, text = target instanceof HTMLInputElement && !["radio", "checkbox", "range"].includes(target.type);
     const key = event.key.toLowerCase(), controlled = event.ctrlKey || event.metaKey;
+    if (this.selection && key === "escape" && (target === document.body || this.stage.element.contains(/** @type {Node} */ (target)))) return this.close(null);
     if (!this.selection || event.altKey || (text && !(controlled && this.element.contains(target)))) return;
     const { input } = this.parts.radius;
     /** @type {Record<string, () => void>} */
     const actions = controlled
       ? { y: () => this.ask("redo"), z: () => this.ask(event.shiftKey ? "redo" : "undo"), i: () => this.ask("invert") }
-      : { v: () => this.choose("move"), b: () => this.choose("brush"), l: () => this.choose("lasso"), r: () => this.choose("box"), escape: () => this.close(null), "[": () => (input.value -= 4), "]": () => (input.value = Number(input.value) + 4) };
+      : { v: () => this.choose("move"), b: () => this.choose("brush"), l: () => this.choose("lasso"), r: () => this.choose("box"), "[": () => (input.value -= 4), "]": () => (input.value = Number(input.value) + 4) };
     if (!actions[key]) return;
     event.preventDefault();
     actions[key]();

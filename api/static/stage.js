@@ -83,7 +83,7 @@ export class Stage {
     this.helpList = h("dl");
     const help = h("details.help", h("summary", { title: say.keys, "aria-label": say.keys }, icon("help")), this.helpList);
     this.setHelp();
-    help.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && (help.open = false));
+    help.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && help.open && (event.stopPropagation(), (help.open = false)));
     put(this.tools, this.wipe, this.cameraTools, h("fieldset.segments", h("legend.away", say.movement), mode(say.orbit, true), mode(say.fly, false)),
       h("div.buttons", this.framesButton, button("home", say.home, () => this.home()), button("picture", say.screenshot, () => this.save()), button("full", say.full, () => this.full()), help));
     this.offerHeadsets();

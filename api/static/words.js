@@ -204,7 +204,7 @@ export const words = {
     sheetOf: (/** @type {string} */ name) => `Views of ${name} before and after`, failed: "The job failed", anotherPainting: "Try another painting", changed: "Same with changes",
   },
   video: {
-    title: "Video", path: "Camera path", paths: /** @type {Record<string, string>} */ ({ orbit: "Once around", cameras: "Through the cameras" }), length: "Length", seconds: (/** @type {number} */ n) => `${n} seconds`, size: "Size", pixels: (/** @type {string | number} */ n) => (n ? `${n} pixels wide` : "Size of the views"),
+    title: "Video", path: "Camera path", paths: /** @type {Record<string, string>} */ ({ orbit: "Once around", cameras: "Through the cameras" }), length: "Length", seconds: (/** @type {number} */ n) => `${n} seconds`, size: "Size", pixels: (/** @type {string | number} */ n) => (n ? `${n} pixels` : "Own size"),
     compare: "Start with the original", make: "Make a video", again: "Make another video", starting: "Starting the video…", made: "The video is ready.", progress: "Video progress", player: "Video of the result", download: "Download video",
     rendering: (/** @type {number} */ n, /** @type {number} */ all, /** @type {number | null} */ left) => `Frame ${count(n)} of ${count(all)}${left ? `, about ${seconds(left)} left` : ""}. You can leave this page.`,
     unplayable: "This browser can't play H.264 video. Download it instead.",

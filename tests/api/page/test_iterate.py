@@ -14,6 +14,7 @@ from PIL import Image
 from sgsst_core.options import STRENGTHS
 from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, set_options, started, submit
 from tests.api.page.browser import Watched
+from tests.api.page.test_viewer import base_of
 from tests.api.service import Service
 
 pytestmark = pytest.mark.slow
@@ -96,6 +97,8 @@ def test_painting_of_a_region_is_not_one_of_the_job(
     assert before["name"] == "scene · style"
     watched = visit(f"/#/jobs/{before['id']}")
     page = watched.page
+    labels = "async ([base, job]) => (await import(`${base}/names.js`)).labels([job])"
+    assert page.evaluate(labels, [base_of(watched), before]) == ["style; the left: night"]
     page.get_by_role("button", name="Try another painting").click()
     page.get_by_role("img", name="night.png").wait_for()
     page.locator(".thumb", has_text="for the left").wait_for()
