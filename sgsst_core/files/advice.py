@@ -106,6 +106,16 @@ SCENES = (
         lambda head: head.startswith((b"PXR-USDC", b"#usda")) or is_usdz(head),
     ),
     Kind(
+        "an archive of NumPy arrays, such as those of gsplat, not a scene. Write a PLY of it with "
+        "`gsplat.export_splats`, or give the checkpoint of the run (ckpts/*.pt).",
+        lambda head: head.startswith(b"PK") and b".npy" in head[:200],
+        (".npz",),
+    ),
+    Kind(
+        "a dynamic scene, whose Gaussians move or exist at certain moments only. Export one moment as a static scene.",
+        suffixes=(".sog4d", ".sog4d.zip", ".splat4d"),
+    ),
+    Kind(
         "a table of splat-transform, which cannot be read. Write a PLY instead: `splat-transform SOURCE scene.ply`.",
         _begins(b"x,y,z,", holding=b"f_dc_0"),
     ),
@@ -212,7 +222,7 @@ CAMERAS = (
 _CHANGED_MEANING: tuple[tuple[re.Pattern[str], str], ...] = (
     (
         re.compile(
-            r"t|times?|(t|time)_(center|mean|scale|sigma|start|end)|(start|end)_time|trbf(_\w+)?|motion(_\w+)?|omega_\w+|sogst"
+            r"t|times?|(t|time)_(center|mean|scale|sigma|start|end)|(start|end)_time|trbf(_\w+)?|motion(_\w+)?|omega_\w+|sogst|sog4d"
             r"|f_t_\d+|(scale|scales|scaling|rot|rotation|opacity|xyz|mean|mu|center|sigma|cov)_t"
             r"|(rot|rotation)_r(_\w+)?|v[xyz]|vel(ocity|ocities)?(_\w+)?|durations?|life(span|time)"
         ),
@@ -229,6 +239,12 @@ _CHANGED_MEANING: tuple[tuple[re.Pattern[str], str], ...] = (
 )
 
 
+def known_kind(path: Path, head: bytes, kinds: Iterable[Kind]) -> Kind | None:
+    """Return the kind of a file by its first bytes or its name; None if it is of no known one."""
+    name = path.name.lower()
+    return next((kind for kind in kinds if kind.head(head) or name.endswith(kind.suffixes)), None)
+
+
 def refuse_known(path: Path, kinds: Iterable[Kind], error: type[InvalidInputError]) -> None:
     """Raise an error that says what to do if the start or the name of a file is that of a known kind.
 
@@ -238,9 +254,8 @@ def refuse_known(path: Path, kinds: Iterable[Kind], error: type[InvalidInputErro
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES).removeprefix(b"\xef\xbb\xbf").lstrip()
-    for kind in kinds:
-        if kind.head(head) or path.name.lower().endswith(kind.suffixes):
-            raise error(f"{path}: is {kind.text}")
+    if kind := known_kind(path, head, kinds):
+        raise error(f"{path}: is {kind.text}")
 
 
 def refuse_changed_meaning(path: Path, names: Iterable[str]) -> None:

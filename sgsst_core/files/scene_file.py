@@ -184,7 +184,7 @@ def read_scene(
     arrays: dict[str, Any] = {name: torch.from_numpy(array) for name, array in columns.arrays.items()}
     if stored:
         arrays["sh_rest"] = StoredHarmonics(stored, coefficients=header.coefficients, file=file)
-    scene = Scene(**arrays, rendering=header.tag.rendering)
+    scene = Scene(**arrays, rendering=header.tag.rendering, up=header.up)
     if retained is not None:
         scene = scene.subset(torch.from_numpy(retained))
     if isinstance(header, PlySceneHeader) and header.sources:

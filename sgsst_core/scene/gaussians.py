@@ -37,6 +37,7 @@ class Scene:
         sh_dc: [N, 3], degree-0 coefficients, which stylization optimizes.
         sh_rest: [N, K, 3] with K = 0, 3, 8 or 15 for SH degree 0 to 3.
         rendering: Render mode, which every rasterizer follows.
+        up: World direction of up that the file states; None if it does not.
 
     Example:
         >>> scene = load_scene("scene.ply").scene
@@ -51,6 +52,7 @@ class Scene:
     sh_dc: Tensor  # [N, 3]
     sh_rest: Tensor | StoredHarmonics  # [N, K, 3]
     rendering: Rendering = field(default=CLASSIC, kw_only=True)
+    up: tuple[float, float, float] | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return int(self.means.shape[0])

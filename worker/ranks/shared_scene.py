@@ -30,7 +30,7 @@ from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_scene, stays_in_file
 from sgsst_core.parallel.collectives import Collectives
 from sgsst_core.planning.choices import OPTIMIZER_BYTES
-from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.gaussians import TENSORS
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from worker.processes import home
 
@@ -132,7 +132,7 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
         for name, (offset, _, _) in layout.items():
             data = np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8)
             memory[offset : offset + data.nbytes] = data.data
-    empty = Scene(*(torch.empty(0) for _ in TENSORS), rendering=file.scene.rendering)
+    empty = replace(file.scene, **{name: torch.empty(0) for name in TENSORS})
     in_file = None if stored is None else stored.arguments
     shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, retained=None), in_file)
     return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared

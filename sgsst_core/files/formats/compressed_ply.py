@@ -26,6 +26,7 @@ from sgsst_core.files.formats.ply_header import (
     element_offsets,
     ply_tag,
     read_header,
+    stated_up,
     surplus,
 )
 from sgsst_core.files.formats.quantized import (
@@ -108,7 +109,8 @@ def _read_header(start: FileStart) -> CompressedPlyHeader:
             )
         _check_kinds(path, harmonics, "u1", tuple(f"f_rest_{i}" for i in range(number)))
     element_offsets(path, header)
-    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, number // 3, header, tag=ply_tag(header))
+    tag, up = ply_tag(header), stated_up(header)
+    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, number // 3, header, tag=tag, up=up)
 
 
 def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:

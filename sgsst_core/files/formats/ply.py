@@ -18,7 +18,15 @@ import numpy as np
 from sgsst_core.errors import SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
 from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
-from sgsst_core.files.formats.ply_header import PlyHeader, check_length, comment_lines, is_flat, ply_tag, read_header
+from sgsst_core.files.formats.ply_header import (
+    PlyHeader,
+    check_length,
+    comment_lines,
+    is_flat,
+    ply_tag,
+    read_header,
+    stated_up,
+)
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
     STORED_COEFFICIENTS,
@@ -63,9 +71,8 @@ def _read_header(start: FileStart) -> PlySceneHeader:
     notes = ["SH bands above degree 3 are not drawn; only a stylized PLY keeps them"] if coefficients < stored else []
     if sources:
         notes.append(f"{', '.join(dict.fromkeys(sources.values()))} become the usual properties of a stylized PLY")
-    return PlySceneHeader(
-        PLY, header.vertex.count, coefficients, header, stored, sources, notes=tuple(notes), tag=ply_tag(header)
-    )
+    fields = (header.vertex.count, coefficients, header, stored, sources)
+    return PlySceneHeader(PLY, *fields, notes=tuple(notes), tag=ply_tag(header), up=stated_up(header))
 
 
 def _sources(kinds: dict[str, str]) -> dict[str, str]:

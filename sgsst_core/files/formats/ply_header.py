@@ -10,6 +10,7 @@ and our own `eps2d 0.1`. Other comments that seem to state one give a warning.
 
 from __future__ import annotations
 
+import math
 import mmap
 import re
 import struct
@@ -69,6 +70,9 @@ _MODE = re.compile(
     re.IGNORECASE,
 )
 _EPS2D = re.compile(r"[\w.|]*?(?:eps_?2d|kernel_?size)" + _IS, re.IGNORECASE)
+_UP = re.compile(r"vertical axis:(.{1,100})", re.IGNORECASE)
+#: Directions of up by the names of axes; in Brush, up is -y unless the data set states another.
+_NAMED_UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 #: Comments that seem to state a render mode.
 _ABOUT_MODE = re.compile(
     r"anti[-_ ]?alias|(?<![a-z])mip(?:map|[-_ ]?splat|(?![a-z]))|filter[-_ ]?3d|low[-_ ]?pass|eps_?2d|kernel"
@@ -324,6 +328,18 @@ def ply_tag(header: PlyHeader) -> RenderTag:
     if eps2d is None:
         eps2d = usual if mode == "antialiased" else EPS2D
     return stated(mode or "classic", ", ".join(reasons), eps2d, tuple(warnings))
+
+
+def stated_up(header: PlyHeader) -> tuple[float, float, float] | None:
+    """Return the direction of up that Brush's comment states; None for its default, which means nothing."""
+    up = None
+    for match in filter(None, map(_UP.fullmatch, header.comments)):
+        try:
+            x, y, z = map(float, _NAMED_UP.get(match[1].strip().lower()) or re.split(r"[\s,]+", match[1].strip(" []")))
+        except ValueError:
+            continue
+        up = (x, y, z) if 0 < math.hypot(x, y, z) < math.inf and (x, y, z) != _NAMED_UP["y"] else None
+    return up
 
 
 def is_flat(names: Collection[str]) -> bool:

@@ -86,6 +86,7 @@ class SceneHeader:
         coefficients: SH coefficients per color channel above degree 0.
         notes: Notes on contents that are not read, or not read as stored.
         axes: Axes that the scene has in an SPZ, see `spz`.
+        up: Direction of up; None if the file does not state it.
     """
 
     format: SceneFormat
@@ -93,6 +94,7 @@ class SceneHeader:
     coefficients: int
     notes: tuple[str, ...] = field(default=(), kw_only=True)
     axes: str = field(default="rub", kw_only=True)
+    up: tuple[float, float, float] | None = field(default=None, kw_only=True)
     tag: RenderTag = field(default=UNTAGGED, kw_only=True)
 
 

@@ -25,7 +25,7 @@ from PIL import Image
 
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.advice import converted, is_checkpoint, is_usdz, refuse_changed_meaning
+from sgsst_core.files.advice import SCENES, converted, known_kind, refuse_changed_meaning
 from sgsst_core.files.formats.archive import ZIP_MAGIC, FilesOfScene
 from sgsst_core.files.formats.codebooks import VALUES, nearest_entries, palette, value_codebook
 from sgsst_core.files.formats.quantized import (
@@ -166,7 +166,7 @@ class SogFiles(FilesOfScene):
 
 def _matches(start: FileStart) -> bool:
     head = start.head
-    archive = head.startswith(ZIP_MAGIC) and not is_checkpoint(head) and not is_usdz(head)
+    archive = head.startswith(ZIP_MAGIC) and known_kind(start.path, head, SCENES) is None
     return archive or (head.lstrip().startswith(b"{") and b'"means"' in head)
 
 
@@ -200,6 +200,11 @@ def _parsed(files: SogFiles, meta: dict[str, Any]) -> SogHeader:
     if version not in (1, 2):
         raise SceneError(
             f"{files.path}: is SOG of version {str(version)[:20]}, which cannot be read. {converted('scene.sog')}"
+        )
+    if "files" not in meta["means"] and "shape" in meta["means"]:
+        raise SceneError(
+            f"{files.path}: describes a scene that gsplat compressed (PngCompression), which has another layout. "
+            "Decompress it with gsplat, and write a PLY with `gsplat.export_splats`."
         )
     names = {name: meta[name]["files"] for name in _IMAGES if name in meta or name != "shN"}
     for name, own in names.items():

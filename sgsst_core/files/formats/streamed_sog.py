@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.advice import is_checkpoint, is_usdz
+from sgsst_core.files.advice import SCENES, known_kind
 from sgsst_core.files.formats.archive import ZIP_MAGIC, FilesOfScene, archive_end
 from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader, read_bytes
 from sgsst_core.files.formats.sog import (
@@ -114,7 +114,7 @@ def _opened(path: Path) -> Iterator[_Opened]:
 def _matches(start: FileStart) -> bool:
     if not start.head.startswith(ZIP_MAGIC):
         return start.head.lstrip().startswith(b"{") and b'"lodLevels"' in start.head
-    if is_checkpoint(start.head) or is_usdz(start.head):
+    if known_kind(start.path, start.head, SCENES):
         return False
     try:
         end = archive_end(start.path)
