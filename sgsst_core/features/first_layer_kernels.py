@@ -77,9 +77,10 @@ def pixel_gradients(
     channel, entry = tl.arange(0, BLOCK), tl.arange(0, 16)  # nine entries: three rows of three colors
     is_weight = (channel < CHANNELS)[:, None] & (entry < 9)[None, :]
     sums = tl.zeros([P, 16], tl.float32)
+    from_row = row + tl.zeros_like(column)  # Triton 3.9's interpreter accepts no mask made from a scalar
     for tap in tl.range(3, num_stages=1):
         from_column = column + tap - 1
-        there = (row >= 0) & (row < height) & (from_column >= 0) & (from_column < width)
+        there = (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width)
         source = gradient + ((row * width + from_column) * CHANNELS)[:, None] + channel[None, :]
         values = tl.load(source, mask=there[:, None] & (channel < CHANNELS)[None, :], other=0.0)
         of_tap = weight + ((entry % 3 * 9 + entry // 3 * 3 + tap) * CHANNELS)[None, :] + channel[:, None]
