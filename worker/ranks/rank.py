@@ -136,7 +136,7 @@ class RankTask:
         folder: Base folder of relative paths on every machine; unused with a workplace.
         workers: Requested ranks and lost attempts, for the report.
         seconds_lost, seconds_since_loss: Costs of the last lost attempt until this task was created; see
-            `attempts.LostAttempt`.
+            `run.LostAttempt`.
     """
 
     request: JobSpec

@@ -316,6 +316,36 @@ def test_resume_after_ctrl_c_is_bit_identical(files: Files, capfd: pytest.Captur
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("workers", [(), ("--workers", "2")])
+def test_closed_terminal_saves(files: Files, workers: tuple[str, ...]) -> None:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "120"}
+    environment.pop("RAY_ADDRESS", None)
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "api.cli", *files.stylize("--steps-sos", "400", "--no-early-stop", *workers)]
+    with subprocess.Popen(
+        ["setsid", "--ctty", *command], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
+    ) as process:
+        os.close(theirs)
+        _shown_until(ours, "schedule")
+        os.close(ours)
+        assert process.wait(timeout=120) == 128 + signal.SIGHUP
+    assert files.out.with_name("stylized.checkpoint.safetensors").exists()
+
+
+@pytest.mark.slow
+def test_nohup_continues_at_a_closed_terminal(files: Files) -> None:
+    command = [sys.executable, "-m", "api.cli", *files.stylize("--steps-sos", "150", "--no-early-stop")]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(["nohup", *command], stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("schedule"):
+                process.send_signal(signal.SIGHUP)
+        assert process.wait(timeout=120) == 0
+    assert files.out.exists()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["plan", "stylize"])
 def test_ctrl_c_during_survey_leaves_no_files(files: Files, command: str) -> None:
     """The progress bar shows when the survey runs; there are enough views for the signal to arrive meanwhile."""

@@ -32,6 +32,8 @@ Place = Literal[
     "all_reduce_statistics",
     "all_gather",
     "checkpoint",
+    "form_groups",
+    "finish",
 ]
 
 
@@ -59,9 +61,12 @@ class Fault:
         _file(request).write_text(json.dumps(asdict(self)))
 
     def arm(self, request: JobSpec) -> None:
-        """Install the fault in this process once the job is planned: planning makes steps as well."""
+        """Install the fault in this process once the job is planned, unless it belongs to planning."""
         from sgsst_core.stylizing.stylizer import Stylizer
 
+        if self.place == "form_groups":
+            self._install(request)
+            return
         create: Callable[..., None] = Stylizer.__init__
 
         def create_and_install(stylizer: Stylizer, *arguments: Any, **options: Any) -> None:
@@ -169,14 +174,16 @@ def _places() -> dict[str, tuple[Any, str]]:
     from sgsst_core.stylizing import checkpoint
     from sgsst_core.stylizing.optimizer import ColorOptimizer
     from sgsst_core.stylizing.views import Views
+    from worker import execute
     from worker.ranks.process_group import ProcessGroupCollectives
 
-    exchanges = ("gather_parts", "reduce_parts", "all_reduce", "all_reduce_statistics", "all_gather")
+    exchanges = ("form_groups", "gather_parts", "reduce_parts", "all_reduce", "all_reduce_statistics", "all_gather")
     return {
         "render": (Views, "render"),
         "loss": (SosLoss, "evaluate"),
         "optimizer": (ColorOptimizer, "update"),
         "checkpoint": (checkpoint, "_write"),
+        "finish": (execute, "_finish"),
         **{name: (ProcessGroupCollectives, name) for name in exchanges},
     }
 
