@@ -234,8 +234,8 @@ export class SubmitView {
    * @param {boolean} [sure] whether doubtful cameras are refused
    */
   async act(dry, sure = true) {
-    if (this.busy === "starting" || (dry && this.busy)) return;
     await this.selecting.settle();
+    if (this.busy === "starting" || (dry && this.busy)) return;
     this.submission.sure = sure;
     this.clearWrong();
     this.markWrong();
