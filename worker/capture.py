@@ -19,7 +19,7 @@ from sgsst_core.files.photos import MAX_MISSING, Photo, PhotoFolder, check_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
 from sgsst_core.orbit.subject import find_subject, find_up
-from sgsst_core.planning.capture_checks import compare_photos, frame_warnings
+from sgsst_core.planning.capture_checks import compare_photos, frame_warnings, implausible
 from sgsst_core.planning.shown import shown_by
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread, undistorted
 from sgsst_core.scene.gaussians import Scene
@@ -97,7 +97,7 @@ class Capture:
         """
         if self.orbit is not None:
             return self
-        decisions = frame_warnings(scene, self.cameras, near)
+        decisions = [*implausible(scene.means, self.cameras), *frame_warnings(scene, self.cameras, near)]
         photos = self.photos
         if photos is not None:
             photos, about = compare_photos(scene, self.cameras, photos, near)

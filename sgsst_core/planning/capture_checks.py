@@ -7,7 +7,7 @@ renders. The thresholds separate real captures from rotated, scaled and cropped 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from statistics import mean, median
 
@@ -29,6 +29,22 @@ _LITTLE_SHOWN, _MUCH_UNCOVERED = 0.25, 0.1
 _NEARLY_NOTHING, _MOSTLY_UNCOVERED, _HALF = 0.01, 0.4, 0.5
 #: Start of the warning about cameras that show little of the scene.
 OTHER_FRAME = "warning: they may be in another coordinate frame"
+#: What no real capture has: a text, the value of a camera, the scene's center [3] and extent, and its bounds. Telephoto
+#: lenses have 30 times the width of their sensors, anamorphic ones a ratio of 2.
+_BOUNDS: tuple[tuple[str, Callable[[Camera, Tensor, float], float], float, float], ...] = (
+    ("a focal length, relative to the image's side,", lambda camera, *_: camera.fx / camera.width, 0.1, 30.0),
+    ("a ratio of both focal lengths", lambda camera, *_: camera.fx / camera.fy, 0.45, 2.2),
+    ("a principal point, relative to the image's width,", lambda camera, *_: camera.cx / camera.width, 0.0, 1.0),
+    ("a principal point, relative to the image's height,", lambda camera, *_: camera.cy / camera.height, 0.0, 1.0),
+    (
+        "a distance from the scene, relative to its extent,",
+        lambda camera, center, extent: float((camera.center - center).norm()) / extent,
+        0.0,
+        1000.0,
+    ),
+)
+#: Gaussians from which center and extent are estimated, and the part of them that lies within.
+_SAMPLE, _WITHIN = 20_000, 0.9
 #: PSNR in dB below which photos are reported. Right photos have 26 to 31; cropped by 10 %, 20.
 _UNLIKE_PSNR = 22.0
 #: Rendered views that are looked at.
@@ -78,6 +94,28 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
             f"{shown.together:.1%}. Instead, {advice}."
         )
     return [Decision("cameras", f"{OTHER_FRAME}: {text}", advice)]
+
+
+def implausible(means: Tensor, cameras: Sequence[Camera]) -> list[Decision]:
+    """Return warnings about values of cameras that no real capture has.
+
+    Args:
+        means: Positions of the scene, [N, 3].
+    """
+    points = means[:: max(1, len(means) // _SAMPLE)].double()
+    center = points.median(dim=0).values
+    extent = max(float((points - center).norm(dim=1).quantile(_WITHIN)), _TINY)
+    lines = []
+    for text, value_of, low, high in _BOUNDS:
+        values = [(value_of(camera, center, extent), camera.name) for camera in cameras]
+        wrong = [(value, name) for value, name in values if not low <= value <= high]
+        if wrong:
+            warning = f"warning: {len(wrong)} of {len(cameras)} have {text} that no real capture has"
+            reason = f"{wrong[0][1]} has {wrong[0][0]:.3g}; expected {low:g} to {high:g}. Export the cameras again"
+            lines.append(
+                Decision("cameras", warning, f"{reason}, with the sizes of their images and the scene's units")
+            )
+    return lines
 
 
 def compare_photos(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from sgsst_core.files.images import save_png
 from sgsst_core.files.photos import Photo, check_photos
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.choice import OrbitRequest, make_orbit
-from sgsst_core.planning.capture_checks import compare_photos, fitted_psnr, frame_warnings
+from sgsst_core.planning.capture_checks import compare_photos, fitted_psnr, frame_warnings, implausible
 from sgsst_core.planning.shown import shown_by
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
@@ -59,6 +60,30 @@ def verdict(scene: Scene, views: list[Camera]) -> str:
 @pytest.mark.parametrize("scene", [wall(), ball()])
 def test_cameras_of_the_scene_give_no_warning(scene: Scene) -> None:
     assert frame_warnings(scene, cameras(), NEAR) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "reported"),
+    [
+        (lambda camera: camera, []),
+        (lambda camera: replace(camera, fx=100 * camera.fx, fy=100 * camera.fy), ["focal length"]),
+        (lambda camera: replace(camera, fx=camera.fx / 100, fy=camera.fy / 100), ["focal length"]),
+        (lambda camera: replace(camera, fy=3 * camera.fy), ["ratio of both focal lengths"]),
+        (lambda camera: replace(camera, fx=100 * camera.fx), ["focal length", "ratio"]),
+        (lambda camera: replace(camera, cx=-1.0), ["the image's width"]),
+        (lambda camera: replace(camera, cy=camera.height + 1.0), ["the image's height"]),
+        (lambda camera: replace(camera, cx=2.0 * camera.width, cy=2.0 * camera.height), ["width", "height"]),
+        (lambda camera: moved(camera, scale=1e5), ["distance from the scene"]),
+    ],
+)
+def test_cameras_of_no_real_capture_are_reported(change: Callable[[Camera], Camera], reported: list[str]) -> None:
+    views = cameras()
+    lines = implausible(wall().means, [change(views[0]), *views[1:]])
+    assert len(lines) == len(reported)
+    for line, text in zip(lines, reported, strict=True):
+        assert text in line.decision
+        assert line.decision.startswith(f"warning: 1 of {len(views)} have a")
+        assert line.reason.startswith(f"{views[0].name} has ")
 
 
 def test_gaussians_with_centers_in_the_frame_count_as_shown() -> None:
