@@ -16,7 +16,7 @@ import threading
 import time
 from types import FrameType
 
-from service.errors import DamagedWeightsError
+from service.errors import DamagedWeightsError, DatabaseUnavailableError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
 from service.scheduling.clock_watch import ClockWatch
@@ -80,8 +80,9 @@ class Dispatcher:
             try:
                 work()
                 work = self._work_once
-            except Exception:  # the database is away or locked, or a bug; if it stays so, leases expire
-                _log.exception("pass failed, retrying: seconds=%.0f", _OUTAGE_SECONDS)
+            except Exception as error:  # the database is away or locked, or a bug; if it stays so, leases expire
+                is_bug = not isinstance(error, DatabaseUnavailableError)
+                _log.error("pass failed, retrying: seconds=%.0f: %s", _OUTAGE_SECONDS, error, exc_info=is_bug)
                 self._stop.wait(_OUTAGE_SECONDS)
             self._stop.wait(self._settings.poll_seconds)
         self._shut_down()
