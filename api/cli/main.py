@@ -89,13 +89,13 @@ class _Commands(Mapping[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         members = vars(import_module(f"api.cli.{_MODULES[name]}"))
-        made = typer.Typer(rich_markup_mode=None)
+        alone = typer.Typer(rich_markup_mode=None)
         if group := members.get(f"{name}_app"):
-            made.add_typer(group, name=name)
+            alone.add_typer(group, name=name)
         else:
-            made.command(cls=_Command)(members[name] if name in members else members["ACTION_COMMANDS"][name])
-        made.callback()(lambda: None)
-        commands: Any = typer.main.get_command(made)
+            alone.command(cls=_Command)(members[name] if name in members else members["ACTION_COMMANDS"][name])
+        alone.callback()(lambda: None)
+        commands: Any = typer.main.get_command(alone)
         return commands.commands[name]
 
 

@@ -221,7 +221,8 @@ class Tools:
     def _files(self, scene: str, style: list[str], cameras: str | None, photos: str | None) -> dict[str, Any]:
         """Return the files of a job as arguments of the client, after checking each of them."""
         styles = [self._input(each) for each in style]
-        files = JobFiles(self._input(scene), styles, cameras and self._input(cameras), photos and self._inside(photos))
+        folder = self._inside(photos) if photos else None
+        files = JobFiles(self._input(scene), styles, self._input(cameras) if cameras else None, folder)
         for file in input_files(files):
             if isinstance(file.source, Path):
                 self._inside(file.source)

@@ -151,7 +151,7 @@ def test_files_are_scenes_below_the_root_and_new(files: dict[str, str], tmp_path
     (root / "new").symlink_to(outside)
     before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
     own = {name: Path(path).name for name, path in files.items()}
-    inputs = [
+    inputs: list[tuple[dict[str, Any], str]] = [
         ({"scene": str(outside / own["scene"])}, "is not below"),
         ({"scene": f"../outside/{own['scene']}"}, "is not below"),
         ({"scene": "link_scene.ply"}, "is not below"),

@@ -48,7 +48,7 @@ def test_key_is_for_one_origin(monkeypatch: pytest.MonkeyPatch) -> None:
         def do_GET(self) -> None:
             sent.append(self.headers["Authorization"])
             self.send_response(302)
-            self.send_header("Location", f"http://localhost:{self.server.server_address[1]}/")
+            self.send_header("Location", f"{other}/")
             self.end_headers()
 
         def log_message(self, *arguments: Any) -> None:
