@@ -116,7 +116,7 @@ export const words = {
   },
   contents: {
     empty: (/** @type {string} */ name) => `${name} is empty (0 bytes). Choose another file.`,
-    notImage: (/** @type {string} */ name) => `${name} isn't an image.`, brokenImage: (/** @type {string} */ name) => `${name} is incomplete or damaged. Copy or save the image again.`,
+    notImage: (/** @type {string} */ name) => `${name} is not an image.`, brokenImage: (/** @type {string} */ name) => `${name} is incomplete or damaged. Copy or save the image again.`,
     notCameras: (/** @type {string} */ name) => `${name} isn't a camera file. Use cameras.json, transforms.json, or the files of a COLMAP model.`, notJson: (/** @type {string} */ name) => `${name} is incomplete, or not JSON.`,
   },
   select: {
