@@ -132,7 +132,8 @@ def _share(file: SceneFile) -> tuple[SceneFile, _Shared]:
         for name, (offset, _, _) in layout.items():
             data = np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8)
             memory[offset : offset + data.nbytes] = data.data
-    empty = replace(file.scene, **{name: torch.empty(0) for name in TENSORS})
+    nothing: dict[str, Any] = dict.fromkeys(TENSORS, torch.empty(0))
+    empty = replace(file.scene, **nothing)
     in_file = None if stored is None else stored.arguments
     shared = _Shared(os.getpid(), descriptor, size, layout, replace(file, scene=empty, retained=None), in_file)
     return _mapped(shared, f"/proc/self/fd/{descriptor}"), shared

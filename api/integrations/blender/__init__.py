@@ -1,7 +1,8 @@
 """Add-on of Blender that stylizes the Gaussian splat of the active object on a service of sgsst.
 
 A splat is a mesh without faces whose vertices have the properties of a 3DGS PLY as attributes, as Blender's importer of
-PLY files makes it with `Vertex Attributes`.
+PLY files makes it with `Vertex Attributes`; or, from Blender 5.3 on, a point cloud with attributes of its own: scales
+are standard deviations, and opacities are 0 to 1.
 """
 # No postponed annotations: Blender reads the properties of its classes from them.
 
@@ -19,31 +20,56 @@ from .splat_ply import COLORS, REQUIRED, read_colors, write_splat
 
 #: Factor of the first spherical harmonic.
 _SH_C0 = 0.28209479177387814
+#: Attributes of a point cloud: colors and opacity, and each coefficient of the harmonics above degree 0.
+_BASE, _REST = "radiance:base", "radiance:sh_"
+#: Members of attributes that hold their values, by type; "vector" for others.
+_MEMBERS = {"FLOAT": "value", "QUATERNION": "value", "FLOAT_COLOR": "color"}
+#: Opacities whose logits are finite, and least standard deviation.
+_OPACITIES, _LEAST = (1e-6, 1 - 1e-6), 1e-30
 #: Name of the color attribute with the result.
 _STYLIZED = "stylized"
 _LOCAL = ("127.0.0.1", "::1", "localhost")
 
 
-def splat_columns(mesh: Any) -> dict[str, Any]:
-    """Return the splat of a mesh as arrays by the property of a PLY.
+def _values(data: Any, name: str, width: int) -> Any:
+    """Return an attribute of a mesh or point cloud, [N, width] float32."""
+    attribute = data.attributes[name]
+    values = np.empty(width * len(attribute.data), np.float32)
+    attribute.data.foreach_get(_MEMBERS.get(attribute.data_type, "vector"), values)
+    return values.reshape(-1, width)
+
+
+def _set_values(data: Any, name: str, values: Any) -> None:
+    attribute = data.attributes[name]
+    member = _MEMBERS.get(attribute.data_type, "vector")
+    attribute.data.foreach_set(member, np.ascontiguousarray(values, np.float32).ravel())
+
+
+def splat_columns(data: Any) -> dict[str, Any]:
+    """Return the splat of a mesh or point cloud as arrays by the property of a PLY.
 
     Raises:
-        ValueError: If the mesh is no splat.
+        ValueError: If the data is no splat.
     """
-    missing = [name for name in REQUIRED if name not in mesh.attributes]
+    columns = dict(zip("xyz", _values(data, "position", 3).T, strict=True)) if "position" in data.attributes else {}
+    if _BASE in data.attributes:
+        base, scales = _values(data, _BASE, 4).astype(np.float64), _values(data, "scale", 3).astype(np.float64)
+        opacities = np.clip(base[:, 3], *_OPACITIES)
+        values = (*base[:, :3].T, np.log(opacities / (1 - opacities)), *np.log(np.maximum(scales, _LEAST)).T)
+        columns |= dict(zip(REQUIRED, (*values, *_values(data, "rotation", 4).T), strict=True))
+        count = sum(each.name.startswith(_REST) for each in data.attributes)
+        for index in range(count):
+            rest = _values(data, f"{_REST}{index}", 3)
+            columns |= {f"f_rest_{channel * count + index}": rest[:, channel] for channel in range(3)}
+        return columns
+    missing = [name for name in REQUIRED if name not in data.attributes]
     if missing:
         raise ValueError(
             f"The active object has no attribute {missing[0]}, so it is no Gaussian splat. Import one by File > Import "
             "> Stanford PLY, with Vertex Attributes turned on."
         )
-    positions = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", positions)
-    columns = dict(zip("xyz", positions.reshape(-1, 3).T, strict=True))
-    for each in mesh.attributes:
-        if each.name in REQUIRED or each.name.startswith("f_rest_"):
-            columns[each.name] = np.empty(len(mesh.vertices), np.float32)
-            each.data.foreach_get("value", columns[each.name])
-    return columns
+    names = [each.name for each in data.attributes if each.name in REQUIRED or each.name.startswith("f_rest_")]
+    return columns | {name: _values(data, name, 1)[:, 0] for name in names}
 
 
 def show_result(source: Any, path: Path, kind: str) -> Any:
@@ -52,7 +78,7 @@ def show_result(source: Any, path: Path, kind: str) -> Any:
     The second object is a copy, so it has the transform, materials and modifiers of its source.
     """
     colors = read_colors(path)
-    if len(colors) != len(source.data.vertices):  # Gaussians that cannot be drawn were dropped
+    if len(colors) != len(source.data.attributes["position"].data):  # Gaussians that cannot be drawn were dropped
         bpy.ops.wm.ply_import(filepath=str(path), import_attributes=True)
         target = bpy.context.object
         target.matrix_world = source.matrix_world
@@ -66,14 +92,18 @@ def show_result(source: Any, path: Path, kind: str) -> Any:
     mesh = target.data
     if target is not source:
         target.name = f"{source.name} stylized"
-        for index, name in enumerate(COLORS):
-            mesh.attributes[name].data.foreach_set("value", np.ascontiguousarray(colors[:, index]))
+        if _BASE in mesh.attributes:
+            _set_values(mesh, _BASE, np.column_stack([colors, _values(mesh, _BASE, 4)[:, 3]]))
+        else:
+            for index, name in enumerate(COLORS):
+                _set_values(mesh, name, colors[:, index])
     shown = mesh.color_attributes.get(_STYLIZED) or mesh.color_attributes.new(_STYLIZED, "BYTE_COLOR", "POINT")
     rgba = np.ones((len(colors), 4), np.float32)
     rgba[:, :3] = np.clip(0.5 + _SH_C0 * colors, 0, 1)
     shown.data.foreach_set("color_srgb", rgba.ravel())
-    mesh.color_attributes.active_color = shown
-    mesh.update()
+    if target.type == "MESH":
+        mesh.color_attributes.active_color = shown
+    mesh.update_tag()
     return target
 
 
@@ -170,8 +200,8 @@ class SgsstStylize(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        """Return whether a mesh is active and no job runs."""
-        return Current.job is None and context.object is not None and context.object.type == "MESH"
+        """Return whether a mesh or point cloud is active and no job runs."""
+        return Current.job is None and context.object is not None and context.object.type in ("MESH", "POINTCLOUD")
 
     def execute(self, context: Any) -> set[str]:
         """Start the job, which runs in the background."""

@@ -24,7 +24,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -345,7 +345,8 @@ def _view(document: dict[str, Any], index: int, data: range) -> tuple[int, int]:
     return data.start + start, size
 
 
-class _Within(NamedTuple):
+@dataclass
+class _Within:
     """Part of an open scene that is a file of its own."""
 
     path: Path

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 package, scene, style, url = sys.argv[1:]
 
@@ -72,6 +73,47 @@ count = len(bpy.data.objects)
 answer["attribute"] = stylize(source, minutes=0.5, result="ATTRIBUTE")[0]
 answer["added objects"] = len(bpy.data.objects) - count
 answer["colors"] = [list(each.color_srgb) for each in source.data.color_attributes["stylized"].data]
+
+
+def point_cloud(columns):
+    """Return an object with a splat as Blender 5.3 imports it: a point cloud with activated values."""
+    mesh = bpy.data.meshes.new("points")
+    mesh.from_pydata(np.stack([columns[name] for name in "xyz"], axis=1).tolist(), [], [])
+    points = bpy.data.objects.new("points", mesh)
+    bpy.context.collection.objects.link(points)
+    bpy.ops.object.select_all(action="DESELECT")
+    bpy.context.view_layer.objects.active = points
+    points.select_set(True)
+    bpy.ops.object.convert(target="POINTCLOUD")
+    four = "FLOAT4" if bpy.app.version >= (5, 3, 0) else "FLOAT_COLOR"
+    several = {
+        "scale": ("FLOAT_VECTOR", "vector", [np.exp(columns[f"scale_{i}"]) for i in range(3)]),
+        "rotation": ("QUATERNION", "value", [columns[f"rot_{i}"] for i in range(4)]),
+        "radiance:base": (
+            four,
+            "vector" if four == "FLOAT4" else "color",
+            [*(columns[f"f_dc_{i}"] for i in range(3)), 1 / (1 + np.exp(-columns["opacity"]))],
+        ),
+    }
+    for k in range(3):
+        several[f"radiance:sh_{k}"] = ("FLOAT_VECTOR", "vector", [columns[f"f_rest_{3 * c + k}"] for c in range(3)])
+    for name, (kind, member, values) in several.items():
+        attribute = bpy.context.object.data.attributes.new(name, kind, "POINT")
+        attribute.data.foreach_set(member, np.stack(values, axis=1).astype(np.float32).ravel())
+    return bpy.context.object
+
+
+expected = addon.splat_columns(source.data)
+points = point_cloud(expected)
+got = addon.splat_columns(points.data)
+answer["points"] = got.keys() == expected.keys() and all(
+    np.allclose(got[name], expected[name], rtol=1e-4, atol=1e-4) for name in got
+)
+answer["points can be stylized"] = bpy.ops.sgsst.stylize.poll()
+red = {**got, "f_dc_0": got["f_dc_0"] + 1}
+addon.write_splat(Path("red.ply"), red)
+shown = addon.splat_columns(addon.show_result(points, Path("red.ply"), "OBJECT").data)
+answer["points shown"] = all(np.allclose(shown[name], red[name], rtol=1e-4, atol=1e-4) for name in red)
 bpy.ops.mesh.primitive_cube_add()
 answer["cube"] = refusal()
 bpy.context.view_layer.objects.active = source

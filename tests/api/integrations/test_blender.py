@@ -43,6 +43,9 @@ def test_add_on_in_blender(service: Service, files: tuple[Path, Path, Path], tmp
     assert any("left" in text for text in answer["progress"])
     assert answer["moved"] == [1, 2, 3]
     assert answer["unchanged"]
+    assert answer["points"]
+    assert answer["points can be stylized"]
+    assert answer["points shown"]
     assert not answer["timer"]
     with service.client() as client:
         jobs = client.get("/v1/jobs").json()["jobs"]

@@ -245,7 +245,7 @@ def test_colors_for_other_programs_are_linear(tmp_path: Path) -> None:
 def test_linear_colors_become_srgb(tmp_path: Path) -> None:
     """Those of a Gaussian in any direction, as far as they are close to its color of degree 0."""
     scene = cloud(500, degree=1)
-    scene = replace(scene, sh_dc=scene.sh_dc.clamp(-1.5, 3), sh_rest=scene.sh_rest * 1e-3)
+    scene = replace(scene, sh_dc=scene.sh_dc.clamp(-1.5, 3), sh_rest=held(scene.sh_rest) * 1e-3)
     write_scene(tmp_path / "linear.glb", scene, GLB)
     document, data = split((tmp_path / "linear.glb").read_bytes())
     document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"] |= {
