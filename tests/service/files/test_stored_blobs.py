@@ -144,7 +144,12 @@ def test_work_for_a_file_does_not_tell_whether_another_key_has_it(
     host = BlobFolder(fleet.folder / "data", fleet.store.inputs, 0) if local else fleet.host("one")
     read: list[str] = []
     digest = ObjectStore.digest
-    monkeypatch.setattr(ObjectStore, "digest", lambda self, name: (read.append(name), digest(self, name))[1])
+
+    def noted(self: ObjectStore, name: str) -> str:
+        read.append(name)
+        return digest(self, name)
+
+    monkeypatch.setattr(ObjectStore, "digest", noted)
     work = []
     for name in ("first", "second"):
         path = host.incoming / name
