@@ -39,6 +39,8 @@ from sgsst_core.scene.rendering import Rendering
 #: Maximum size of a header. A 3DGS header takes 2 kB; a megabyte allows long comments. The limit avoids searching a
 #: whole file that is not a PLY for `end_header`.
 MAX_HEADER_BYTES = 1 << 20
+#: Maximum number of rows with lists, such as faces. Each is read to find its end, which takes a second for all.
+_MAX_LISTS = 1 << 21
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
@@ -278,6 +280,11 @@ def _end_of_lists(path: Path, element: PlyElement, position: int) -> int:
 
     The length of each list is read, and checked against the size of the file.
     """
+    if element.count > _MAX_LISTS:
+        raise SceneError(
+            f"{path}: element {element.name!r} has {element.count:,} rows with lists, of at most {_MAX_LISTS:,}. Export "
+            "the Gaussians without it."
+        )
     steps = [
         (struct.Struct(element.byte_order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
         for kind, length in ((kind, element.lists.get(name)) for name, kind in element.kinds.items())

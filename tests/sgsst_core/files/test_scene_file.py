@@ -470,6 +470,11 @@ def test_list_beyond_the_file_size_never_allocates(tmp_path: Path) -> None:
     start = data.index(b"end_header\n") + len(b"end_header\n")
     with pytest.raises(SceneError, match="a list of length -1"):
         read_scene(save(tmp_path, data[:start] + b"\xff\xff\xff\xff" + data[start + 4 :]))
+    rows = (1 << 21) + 1
+    data = data.replace(b"list int", b"list char").replace(b"element face 1", f"element face {rows}".encode())
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    with pytest.raises(SceneError, match="has 2,097,153 rows with lists, of at most 2,097,152"):
+        read_scene(save(tmp_path, data[:start] + bytes(rows) + data[start:]))
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
