@@ -80,8 +80,8 @@ function spzScene(head, load, newest) {
   if (!count || degree > 4) throw new SceneError(words.scene.notGaussians);
   // degree 4 is skipped
   const drawn = Math.min(degree, 3), stored = ((degree + 1) ** 2 - 1) * 3, rest = ((drawn + 1) ** 2 - 1) * 3, coefficients = rest / 3;
-  // Spark sets the flag for all scenes; it writes old versions, without extension records.
-  const flags = head.getUint8(14), antialiased = Boolean(flags & 1) && (version === SPZ_4 || Boolean(flags & 2));
+  // Spark sets the flag for all scenes; it writes old versions, without extension records and with 12 fractional bits.
+  const flags = head.getUint8(14), antialiased = Boolean(flags & 1) && (version === SPZ_4 || Boolean(flags & 2) || head.getUint8(13) !== 12);
   /** @type {SpzAttributes | null} */
   let read = null;
   return unpacked(count, drawn, async (begin, into, width, some) => {

@@ -279,7 +279,7 @@ def test_old_spz_is_shown(visit: Visit, tmp_path: Path, version: int, stated: bo
 
 
 def old_spz(scene: Scene, version: int, rub: bool) -> bytes:
-    """Encode a scene as SPZ of version 1 or 2, without spherical harmonics; `rub` states axes with y up, z backward."""
+    """Encode a scene as SPZ of version 1 or 2, without spherical harmonics; `rub` is the default, and not stated."""
     flip = np.array([1, -1, -1] if rub else [1, 1, 1])
     means = scene.means.double().numpy() * flip
     fixed = np.rint(means * 2**12).astype("<i4")
@@ -295,8 +295,8 @@ def old_spz(scene: Scene, version: int, rub: bool) -> bytes:
         (vectors + 1) * 127.5,
     ]
     packed = [np.clip(np.rint(part), 0, 255).astype(np.uint8).tobytes() for part in parts]
-    head = struct.pack("<4sIIBBBB", b"NGSP", version, len(scene), 0, 12, 2 * rub, 0)
-    extension = struct.pack("<III", 0xADBE0003, 4, 4) if rub else b""
+    head = struct.pack("<4sIIBBBB", b"NGSP", version, len(scene), 0, 12, 2 * (not rub), 0)
+    extension = b"" if rub else struct.pack("<III", 0xADBE0003, 4, 6)
     return gzip.compress(b"".join([head, position, *packed, extension]))
 
 
