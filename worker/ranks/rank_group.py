@@ -79,8 +79,8 @@ class RankGroup:
         return f"Worker {self.handles.index(rank)}{where}"
 
 
-#: Seconds that the process of a rank may take to start.
-START_SECONDS = 60.0
+#: Seconds that the processes of all ranks may take to start; eight at once share the cores of a busy machine.
+START_SECONDS = 180.0
 
 #: Function that creates the task of a rank from its number and the "host:port" of rank 0, once all ranks are started.
 MakeTask = Callable[[int, str], RankTask]

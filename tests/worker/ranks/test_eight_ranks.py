@@ -48,7 +48,7 @@ def test_command_matches_one_rank(views: int, alone: dict[int, float], tmp_path:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     environment.pop("RAY_ADDRESS", None)
     command = [sys.executable, "-m", "api.cli", *source, *files, *options, "--workers", "8"]
-    subprocess.run(command, env=environment, check=True, timeout=300)
+    subprocess.run(command, env=environment, check=True, timeout=900)
     report = json.loads(request.out.with_name("s.report.json").read_text())
     assert report["workers"]["used"] == 8
     assert report["loss"]["after"]["total"] == pytest.approx(alone[views], rel=1e-3)
