@@ -125,10 +125,10 @@ class ServiceSettings(BaseSettings):
     @classmethod
     def _check_artifacts(cls, url: str | None) -> str | None:
         """Check the URL as fsspec and its file systems parse it."""
-        from service.files.objects import ObjectStore
+        from fsspec.core import url_to_fs
 
         try:
-            ObjectStore(url or "file:///")
+            url_to_fs(url or "file:///")
         except Exception as error:
             raise ValueError(f"{error}. Give a URL such as s3://BUCKET/PREFIX (extra `s3`) or file:///PATH") from error
         return url

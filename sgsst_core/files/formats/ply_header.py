@@ -282,8 +282,8 @@ def _end_of_lists(path: Path, element: PlyElement, position: int) -> int:
     """
     if element.count > _MAX_LISTS:
         raise SceneError(
-            f"{path}: element {element.name!r} has {element.count:,} rows with lists, of at most {_MAX_LISTS:,}. Export "
-            "the Gaussians without it."
+            f"{path}: element {element.name!r} has {element.count:,} rows with lists, of at most {_MAX_LISTS:,}. "
+            "Export the Gaussians without it."
         )
     steps = [
         (struct.Struct(element.byte_order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
