@@ -76,8 +76,8 @@ def test_estimate_covers_the_whole_job(service: Service, files: dict[str, bytes]
         assert plan["total_seconds"] > expected["job"] + expected["ending"] > plan["estimated_seconds"] > 0
         limited = client.post("/v1/jobs", **request(files, within=0.001)).json()
         (chosen,) = (each for each in limited["plan"]["decisions"] if each["item"] == "time budget")
-        assert chosen["decision"].endswith(f", {limited['views']} view, 1 step")
-        assert limited["pixels"] * plan["views"] == plan["pixels"]
+        assert chosen["decision"].endswith(" 1 step")
+        assert limited["pixels"] < plan["pixels"], "those of the chosen views"
 
 
 def test_views_and_regions_without_gaussians_are_warned_about(service: Service, files: dict[str, bytes]) -> None:
