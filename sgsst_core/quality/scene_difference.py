@@ -60,7 +60,7 @@ class CompressionLoss:
         psnr: PSNR in dB of these views against those of the original scene, with colors clamped to 0 to 1; None if all
             are identical.
         lost_mode: How the file is read if it cannot state the scene's render mode; empty if it can.
-        warnings: What the format cannot hold.
+        warnings: Losses that the format causes.
     """
 
     name: str

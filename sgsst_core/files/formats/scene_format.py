@@ -99,7 +99,7 @@ class SceneHeader:
 
 
 class Limits(NamedTuple):
-    """What a format can store.
+    """Range and precision of a format's values.
 
     Attributes:
         ranges: Lowest and highest value by the name of the array. That of "scales" holds for the largest of each
@@ -135,7 +135,7 @@ class SceneFormat:
             written back.
         write: Writer of a scene's arrays and its render mode, if the format can state one. It raises an OutputError
             without path if it cannot represent the arrays. None if the format is only read.
-        limits: What is lost beyond.
+        limits: Range and precision of its values.
         has_axes: Whether the writer takes axes as a fourth argument.
     """
 
