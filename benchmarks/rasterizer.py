@@ -1,11 +1,11 @@
-"""Relative speed of the rasterizers `reference` (in float32), `cpu` and `cached` at 1280x720.
+"""Relative speed of the rasterizers `reference` (in float32) and `cpu` at 1280x720.
 
     python -m benchmarks.rasterizer [--scene point_cloud.ply --cameras cameras.json] [--repeats 15]
 
 Each rasterizer computes one image from colors and one color gradient from an image gradient. Data that depend on the
-geometry alone (projection, depth order, tile intersections; for `cached` also the blend weights) are prepared in
-advance and timed separately, because a job computes them once per view. The rasterizers take turns, each on one thread
-and on all threads. The fastest turn counts, because other programs disturbed it least.
+geometry alone (projection, depth order, tile intersections) are prepared in advance and timed separately, because a job
+computes them once per view. The rasterizers take turns, each on one thread and on all threads. The fastest turn counts,
+because other programs disturbed it least.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
@@ -59,17 +58,11 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
     cpu = CpuRasterizer(scene)
     CpuRasterizer(scene).intersections(camera)  # compilation
     prepare = timed(lambda: cpu.intersections(camera))
-    caches = {p: CachedRasterizer(scene, precision=p) for p in ("float32", "half")}
-    for cache in caches.values():
-        cache.render(colors, camera)
-    keep = timed(lambda: CachedRasterizer(scene).render(colors, camera)) - prepare
     reference = ReferenceRasterizer(scene, dtype=torch.float32)
     reference.render(colors, camera)  # projection and sorting
     rasterizers: dict[str, Rasterizer] = {
         "reference": reference,
         "cpu": cpu,
-        "cached float32": caches["float32"],
-        "cached half": caches["half"],
     }
     seconds: dict[str, dict[int, list[float]]] = {name: {count: [] for count in threads} for name in rasterizers}
     for turn in range(repeats):
@@ -86,11 +79,7 @@ def measure(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
         "seconds": {name: round(value, 5) for name, value in best.items()},
         "seconds_by_threads": {name: {n: round(v, 5) for n, v in runs.items()} for name, runs in fastest.items()},
         "seconds_prepare": round(prepare, 5),
-        "seconds_keep_weights": round(keep, 5),
-        "bytes_kept": {name: cache.cached_bytes for name, cache in caches.items()},
         "ratio_reference_to_cpu": round(best["reference"] / best["cpu"], 1),
-        "ratio_cpu_to_cached_float32": round(best["cpu"] / best["cached float32"], 2),
-        "ratio_cpu_to_cached_half": round(best["cpu"] / best["cached half"], 2),
     }
 
 
@@ -127,10 +116,7 @@ def main() -> None:
         for run, value in result["seconds"].items():
             print(f"  {run:24} {value * 1e3:9.1f} ms")
         print(f"  prepared once a view     {result['seconds_prepare'] * 1e3:9.1f} ms")
-        print(f"  weights kept once a view {result['seconds_keep_weights'] * 1e3:9.1f} ms")
         print(f"  reference / cpu          {result['ratio_reference_to_cpu']:9.1f}")
-        print(f"  cpu / cached float32     {result['ratio_cpu_to_cached_float32']:9.2f}")
-        print(f"  cpu / cached half        {result['ratio_cpu_to_cached_half']:9.2f}")
     print(write_result("rasterizer", figures))
 
 

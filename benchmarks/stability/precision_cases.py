@@ -1,16 +1,15 @@
-"""Hard cases of precision: long sums, half precision, and the order of summation over partition tiles."""
+"""Hard cases of precision: long sums, and the order of summation over partition tiles."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial, reduce
 
 import numpy as np
 import torch
 
-from benchmarks.stability.case import CLOSE_TO_CUTOFF, Case, CaseResult, camera, ordinary, texture, vgg16
+from benchmarks.stability.case import Case, CaseResult, texture, vgg16
 from sgsst_core.features.statistics import (
     LayerStatistics,
     layer_statistics,
@@ -22,8 +21,6 @@ from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.statistics_terms import style_loss
 from sgsst_core.loss.targets import LayerTarget
-from sgsst_core.rasterizer.cached import CachedRasterizer
-from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.style import Style
 
 #: Relative error bound of a loss that is computed in partition tiles, for any number of tiles.
@@ -43,7 +40,6 @@ def cases() -> list[Case]:
         ("float16 features", in_float32, partial(_in_16_bits, torch.float16, 1.0)),
         ("bfloat16 features", in_float32, partial(_in_16_bits, torch.bfloat16, 1.0)),
         ("bfloat16 features of values up to 100", in_float32, partial(_in_16_bits, torch.bfloat16, 100.0)),
-        ("half-precision blend weights", "image, relative to float64", _half_weights),
         ("statistics of 1, 2, 7 and 64 tiles", "loss and feature gradient, relative", _statistics_of_tiles),
         ("statistics of tiles in any order", "loss and feature gradient, relative", _order_of_tiles),
         ("whole loss of 1, 2, 7 and 64 tiles", "loss, relative to float64", _tiles),
@@ -93,23 +89,6 @@ def _in_16_bits(dtype: torch.dtype, brightest: float, full: bool) -> CaseResult:
     difference = Difference.of(actual, exact)
     note = f"cosine {difference.cosine:.3f}; measured in every plan and report that uses it"
     return CaseResult(difference.relative_error, 0.5, note)
-
-
-def _half_weights(full: bool) -> CaseResult:
-    """Check blend weights in half precision.
-
-    Weights down to 4e-7 are below float16's normal range; they are stored multiplied by 2^14, so none is lost.
-    """
-    scene, view = ordinary(1500, seed=2), camera(100, 60)
-    scene = replace(scene, opacities=torch.linspace(-5.5, 6.0, 1500)[torch.randperm(1500)])
-    colors = 2 * torch.rand(1500, 3, generator=torch.Generator().manual_seed(1))
-    reference = ReferenceRasterizer(scene)
-    image, band = reference.render(colors, view), reference.near_cutoff(view, CLOSE_TO_CUTOFF)
-    actual = CachedRasterizer(scene, precision="half").render(colors, view).double()
-    off = ((actual - image).abs() / image.clamp_min(1e-3))[~band]
-    return CaseResult(
-        float(off.max()) if bool(torch.isfinite(actual).all()) else math.inf, 2**-11 + 1e-5, "bound: 2^-11"
-    )
 
 
 def _split(height: int, width: int, tiles: int) -> list[tuple[slice, slice]]:

@@ -6,7 +6,6 @@ the blend weights and T_final is the final transmittance. The gradient with resp
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar, Literal, Protocol, Self
@@ -19,7 +18,6 @@ from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.timing import wait_for
 
 Color = tuple[float, float, float]
 #: Precision of cached blend weights. `half` stores weights times a power of two as float16, with a relative error of at
@@ -89,14 +87,12 @@ class Rasterizer(ABC):
     Attributes:
         title: Name in texts for users.
         can_cache: Whether `CachedRasterizer` can cache its blend weights, with `count_weights`.
-        caches_exactly: Whether images from cached float32 weights are bit-identical to those from recomputed ones.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     on_gpu: ClassVar[bool] = False
     can_cache: ClassVar[bool] = False
-    caches_exactly: ClassVar[bool] = False
     dtype: torch.dtype = torch.float32
 
     def __init__(
@@ -240,17 +236,3 @@ class Rasterizer(ABC):
 
     def forget_views(self) -> None:
         """Drop all cached data of views, because other views or other rectangles of them are rendered from now on."""
-
-    def step_seconds(self, camera: Camera, visits: int = 1) -> list[float]:
-        """Return the time in seconds of each of several renders with gradient.
-
-        The first one includes the time to prepare the view, unless it is already prepared.
-        """
-        colors = torch.full((len(self.scene), 3), 0.5, device=self.device)
-        seconds = []
-        for _ in range(visits):
-            started = time.perf_counter()
-            self.color_gradient(self.render(colors, camera), camera)
-            wait_for(self.device)
-            seconds.append(time.perf_counter() - started)
-        return seconds

@@ -24,7 +24,6 @@ from sgsst_core.rasterizer.base import (
     Rasterizer,
     camera_key,
 )
-from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -37,26 +36,25 @@ class CachedRasterizer(Rasterizer):
     would exceed `max_bytes`. Nothing is ever evicted: views are visited in rounds, so evicted weights would be needed
     again before the remaining ones.
 
-    If a view has no cached weights, `uncached` computes it in every call. Compared with cached float32 weights, images
-    are then bit-identical on the CPU and equal up to rounding on a GPU; gradients are equal up to rounding on both.
-    Color gradients are reproducible bit for bit.
+    If a view has no cached weights, `uncached` computes it in every call. Images and gradients are then equal up to
+    rounding, for float32 weights. Color gradients are reproducible bit for bit.
 
     Args:
         scene: Scene, whose geometry must not change during this object's lifetime.
         precision: Precision of the cached weights. `half` takes half the memory, with a relative error of at most 2^-11
             per weight.
-        max_bytes: Memory budget for weights; None for no limit. On the CPU, the tile intersections of `uncached` may
-            use the rest of this budget. Those of a view are dropped once the weights of the view are cached.
+        max_bytes: Memory budget for weights; None for no limit. Tile intersections of `uncached` may use the rest.
+            Those of a view are dropped once the weights of the view are cached.
         min_intersection_bytes: Minimum budget for these tile intersections, regardless of the size of the weights.
         at_first_use: Whether to cache weights at first use. If False, only `cache_weights` does, and rendering
             other views does not affect later results.
-        device: Device for the default of `uncached`; None for the CPU.
+        device: Device for the default of `uncached`; None for the current GPU.
         uncached: Rasterizer of the same scene that computes the weights, and renders if there are no cached weights;
-            its class must have `can_cache`. None to create `cpu` or, on a GPU, `triton`.
+            its class must have `can_cache`. None to create `triton`.
         options: Further options of the default of `uncached`.
 
     Raises:
-        SettingsError: If `device` is not the CPU and Triton cannot run on it.
+        SettingsError: If Triton cannot run on `device`.
     """
 
     name = "cached"
@@ -75,8 +73,7 @@ class CachedRasterizer(Rasterizer):
         **options: Any,
     ) -> None:
         if uncached is None:
-            kind = CpuRasterizer if torch.device(device or "cpu").type == "cpu" else TritonRasterizer
-            uncached = kind(scene, device=device, **options)
+            uncached = TritonRasterizer(scene, device=device, **options)
         self._uncached = uncached
         self.scene, self.device, self.near = scene, uncached.device, uncached.near
         self.precision: Precision = precision
@@ -105,8 +102,7 @@ class CachedRasterizer(Rasterizer):
     @property
     def repeatable(self) -> Rasterizer:
         """Rasterizer whose images are bit-identical whether or not weights are cached."""
-        exact = self.precision == "float32" and self.uncached.caches_exactly
-        return self if exact else self.uncached
+        return self.uncached
 
     def count_weights(self, camera: Camera) -> CountedWeights:
         """Count a view's weights without storing them; takes about as long as one render."""

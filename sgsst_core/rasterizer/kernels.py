@@ -2,7 +2,7 @@
 
 All kernels traverse the Gaussians of one raster tile front to back, and compute the blend weights of one Gaussian in a
 16 x 16 block that stays in the L1 cache (`_blend`). They differ only in how they use this block: they add its product
-with a color to the image, multiply it by dL/dimage, or store it. All kernels therefore use bit-identical weights.
+with a color to the image, or multiply it by dL/dimage. All kernels therefore use bit-identical weights.
 
 Accuracy: the offset between a pixel and a Gaussian is computed in float64 once per row, and rounded to float32 after
 large terms have canceled. Within the row, offsets of up to 15 pixels are added in float32. This preserves accuracy for
@@ -17,25 +17,17 @@ slot. The slots of a Gaussian are contiguous, and are then added in order.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from sgsst_core.compiled import compiled
 from sgsst_core.constants import LOG2_ALPHA_MIN, RASTER_TILE
 from sgsst_core.rasterizer.vectors import (
-    BLOCK_ROWS,
     LANES,
-    add_pieces,
     add_scaled,
     blend_row,
-    dot_pieces,
     dot_pixels,
     prefetch,
-    store_vector,
-    sum_lanes,
     sum_weights,
 )
 
@@ -50,6 +42,8 @@ _AHEAD = 8
 #: Number of neighboring tiles that form a block, and a prime stride that scatters such blocks over the image. The prime
 #: is larger than the number of blocks.
 _BLOCK_TILES, _STRIDE = 8, 1_000_003
+#: Strips of `LANES` columns in a raster tile, whose weights fill the registers.
+_STRIPS = RASTER_TILE // LANES
 
 
 @compiled()
@@ -271,148 +265,3 @@ def add_slot_weights(slot_weights, first_slots, gaussians, weights):
         for slot in range(first_slots[rank], first_slots[rank + 1]):
             total += slot_weights[slot]
         weights[gaussians[rank]] = total
-
-
-# Layout of cached weights. A strip is half a raster tile, 8 columns by 16 rows, divided into 4 blocks of 4 rows. An
-# item is one Gaussian in one strip. A piece is one item in one block: 32 weights in row-major order. With this layout,
-# few zeros outside a Gaussian's support are stored, every piece takes the same instructions, and the pixels of a block
-# stay in registers.
-
-STRIP = LANES
-PIECE = LANES * BLOCK_ROWS
-BLOCKS = RASTER_TILE // BLOCK_ROWS
-_STRIPS = RASTER_TILE // STRIP
-
-
-class Strips(NamedTuple):
-    """Cached weights of a view with I items and P pieces. Strips are in the row-major order of raster tiles.
-
-    Kernels unpack this tuple before their parallel loop, because Numba's parallel loops do not support tuple fields.
-    """
-
-    item_starts: NDArray[np.int64]  # [strips + 1]
-    piece_starts: NDArray[np.int64]  # [4 strips + 1], blocks from top to bottom
-    gaussians: NDArray[np.int32]  # [I], indices into the scene
-    slots: NDArray[np.int32]  # [I]; the slots of one Gaussian are contiguous
-    items: NDArray[np.int32]  # [P], the piece's item, relative to the strip's first item
-    weights: NDArray[np.float32] | NDArray[np.uint16]  # [32 P], float32 or half-precision bits (see `vectors`)
-
-
-@compiled()
-def _fill_blocks(block, first, stop):
-    """Zero the weights of unreached rows that share a block with rows first..stop."""
-    for row in range(first // BLOCK_ROWS * BLOCK_ROWS, first):
-        block[1, row] = _ZERO
-    for row in range(stop, (stop + BLOCK_ROWS - 1) // BLOCK_ROWS * BLOCK_ROWS):
-        block[1, row] = _ZERO
-
-
-@compiled()
-def _has_weight(block, row, column):
-    """Return whether the block of 4 rows and 8 columns at (row, column) contains any weight."""
-    largest = _ZERO
-    for down in range(BLOCK_ROWS):
-        for i in range(STRIP):
-            largest = max(largest, block[1, row + down, column + i])
-    return largest > _ZERO
-
-
-@compiled(parallel=True)
-def count_weights(entries, slots, starts, values, height, width, alpha_max, items, pieces, slot_items):
-    """Count the items of every strip, the pieces of every block and the items of every slot, to size their arrays."""
-    for tile in numba.prange(starts.size - 1):
-        x, y, high, _, block, alive = _tile_at(tile, height, width)
-        for position in range(starts[tile], starts[tile + 1]):
-            slot_items[slots[position]] = 0
-            if alive[_TILE] == 0:
-                continue
-            first, stop = _blend(block, alive, values[entries[position]], x, y, high, alpha_max)
-            _fill_blocks(block, first, stop)
-            for side in range(_STRIPS):
-                strip, used = tile * _STRIPS + side, 0
-                for row in range(first // BLOCK_ROWS * BLOCK_ROWS, stop, BLOCK_ROWS):
-                    if _has_weight(block, row, side * STRIP):
-                        pieces[strip * BLOCKS + row // BLOCK_ROWS] += 1
-                        used = 1
-                items[strip] += used
-                slot_items[slots[position]] += used
-
-
-@compiled(parallel=True)
-def store_weights(entries, slots, starts, values, gaussians, alpha_max, slot_starts, strips, transmittance):
-    """Store the items and weights counted by `count_weights`, and the final transmittance [h, w] of the view."""
-    item_starts, piece_starts, item_gaussians, item_slots, piece_items, weights = strips
-    height, width = transmittance.shape
-    for tile in numba.prange(starts.size - 1):
-        x, y, high, columns, block, alive = _tile_at(tile, height, width)
-        blended = block.reshape(2 * _PIXELS)
-        items = item_starts[tile * _STRIPS : (tile + 1) * _STRIPS].copy()
-        pieces = piece_starts[tile * _STRIPS * BLOCKS : (tile + 1) * _STRIPS * BLOCKS].copy()
-        for position in range(starts[tile], starts[tile + 1]):
-            if alive[_TILE] == 0:
-                break
-            rank, slot = entries[position], slot_starts[slots[position]]
-            first, stop = _blend(block, alive, values[rank], x, y, high, alpha_max)
-            _fill_blocks(block, first, stop)
-            for side in range(_STRIPS):
-                item, used = items[side], 0
-                for row in range(first // BLOCK_ROWS * BLOCK_ROWS, stop, BLOCK_ROWS):
-                    if not _has_weight(block, row, side * STRIP):
-                        continue
-                    piece = pieces[side * BLOCKS + row // BLOCK_ROWS]
-                    pieces[side * BLOCKS + row // BLOCK_ROWS] += 1
-                    piece_items[piece] = item - item_starts[tile * _STRIPS + side]
-                    for down in range(BLOCK_ROWS):
-                        source = _PIXELS + (row + down) * _TILE + side * STRIP
-                        store_vector(blended, source, weights, piece * PIECE + down * STRIP)
-                    used = 1
-                if used:
-                    item_gaussians[item], item_slots[item] = gaussians[rank], slot
-                    items[side] += 1
-                    slot += 1
-        _store_transmittance(block, y, x, high, columns, transmittance)
-
-
-@compiled(parallel=True)
-def apply_weights(strips, colors, background, transmittance, image):
-    """Render an image from cached weights. With float32 weights it is bit-identical to `render`."""
-    item_starts, piece_starts, item_gaussians, _, piece_items, weights = strips
-    height, width = transmittance.shape
-    across = (width + _LAST) // _TILE * _STRIPS
-    for strip in numba.prange(item_starts.size - 1):
-        x, y = strip % across * STRIP, strip // across * _TILE
-        begin, end = item_starts[strip], item_starts[strip + 1]
-        pixels = np.zeros((_TILE, 3, LANES), dtype=np.float32)
-        strip_colors = np.empty((end - begin, 3), dtype=np.float32)
-        for item in range(begin, end):
-            gaussian = item_gaussians[item]
-            for channel in range(3):
-                strip_colors[item - begin, channel] = colors[gaussian, channel]
-        for block in range(BLOCKS):
-            piece = piece_starts[strip * BLOCKS + block]
-            count = piece_starts[strip * BLOCKS + block + 1] - piece
-            add_pieces(weights, piece_items, piece, count, strip_colors, pixels, block * BLOCK_ROWS)
-        high, columns = min(height - y, _TILE), min(width - x, STRIP)
-        _store_pixels(pixels, transmittance, background, y, x, high, columns, image)
-
-
-@compiled(parallel=True)
-def apply_transposed_weights(strips, image_gradient, slot_gradients):
-    """Write dL/dcolor of every item to its slot, using cached weights; equals `color_gradient` up to rounding."""
-    item_starts, piece_starts, _, item_slots, piece_items, weights = strips
-    height, width = image_gradient.shape[0], image_gradient.shape[1]
-    across = (width + _LAST) // _TILE * _STRIPS
-    for strip in numba.prange(item_starts.size - 1):
-        x, y = strip % across * STRIP, strip // across * _TILE
-        begin, end = item_starts[strip], item_starts[strip + 1]
-        pixels = np.empty((_TILE, 3, LANES), dtype=np.float32)
-        sums = np.zeros((end - begin, 3, LANES), dtype=np.float32)
-        _load_pixels(image_gradient, y, x, min(height - y, _TILE), min(width - x, STRIP), pixels)
-        for block in range(BLOCKS):
-            piece = piece_starts[strip * BLOCKS + block]
-            count = piece_starts[strip * BLOCKS + block + 1] - piece
-            dot_pieces(weights, piece_items, piece, count, pixels, block * BLOCK_ROWS, sums)
-        for item in range(begin, end):
-            slot = item_slots[item]
-            for channel in range(3):
-                slot_gradients[slot, channel] = sum_lanes(sums, (item - begin) * 3 + channel)

@@ -36,7 +36,6 @@ class TiledRasterizer(Rasterizer, Generic[L]):
         max_intersection_bytes: Memory budget for tile intersections in bytes; None for the rasterizer's default.
     """
 
-    can_cache = True
     default_intersection_bytes: ClassVar[int]
 
     def __init__(self, scene: Scene, *, max_intersection_bytes: int | None = None, **common: Any) -> None:

@@ -73,7 +73,7 @@ class TritonRasterizer(TiledRasterizer[DeviceIntersections]):
 
     name = "triton"
     title = "Triton"
-    on_gpu = True
+    on_gpu = can_cache = True
     default_intersection_bytes = 4 << 30  # 80 bytes per visible Gaussian, and 8 per pair of Gaussian and tile
 
     def __init__(self, scene: Scene, **options: Any) -> None:

@@ -23,8 +23,6 @@ from numba.extending import intrinsic
 from sgsst_core.constants import LOG2_ALPHA_MIN, RASTER_TILE, TRANSMITTANCE_MIN
 
 LANES = 8
-#: Rows of a block of cached weights: 4 rows and 3 channels are 12 vectors of sums, which fit in registers.
-BLOCK_ROWS = 4
 _FLOAT = ir.FloatType()
 _VECTOR = ir.VectorType(_FLOAT, LANES)
 _CHANNELS = 3
@@ -38,12 +36,6 @@ _EXP2_SERIES = (
 _ROUNDER = 12582912.0
 #: Only permitted relaxation of floating-point rules: a product and a sum may be fused, with a single rounding.
 _FUSED = ("contract",)
-
-#: Half precision stores weight * 2^HALF_EXPONENT. The smallest weight, ALPHA_MIN * TRANSMITTANCE_MIN, and the largest,
-#: ALPHA_MAX, are then both normal numbers in float16 (relative error 2^-11), so no conversion meets a denormal.
-HALF_EXPONENT = 14
-#: float16 has 13 fewer bits of mantissa than float32, and an exponent bias that is 112 smaller.
-HALF_SHIFT, HALF_BIAS = 13, 112
 
 
 def _splat(builder: Any, value: Any, vector: Any = _VECTOR) -> Any:
@@ -77,19 +69,8 @@ def _load(builder: Any, pointer: Any, vector_type: Any = _VECTOR, align: int = 4
     return builder.load(builder.bitcast(pointer, vector_type.as_pointer()), align=align)
 
 
-def _load_weights(builder: Any, array_type: types.Array, pointer: Any) -> Any:
-    """Load 8 weights as float32; bits of half-precision weights are shifted, and the exponent is scaled back."""
-    if array_type.dtype == types.float32:
-        return _load(builder, pointer)
-    wide = ir.VectorType(ir.IntType(32), LANES)
-    bits = builder.zext(_load(builder, pointer, ir.VectorType(ir.IntType(16), LANES), align=2), wide)
-    shifted = builder.shl(bits, ir.Constant(wide, [HALF_SHIFT] * LANES))
-    scale = ir.Constant(_VECTOR, [2.0 ** (HALF_BIAS - HALF_EXPONENT)] * LANES)
-    return builder.fmul(builder.bitcast(shifted, _VECTOR), scale)
-
-
 def _is_weights(array: Any) -> bool:
-    return isinstance(array, types.Array) and array.layout == "C" and array.dtype in (types.float32, types.uint16)
+    return isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.float32
 
 
 @intrinsic
@@ -155,40 +136,10 @@ def _exp2(builder: Any, power: Any) -> Any:
 
 
 @intrinsic
-def store_vector(typingctx, source, begin, weights, target):
-    """Store weights[target + i] = source[begin + i] for 8 floats, rounded to nearest even in half precision."""
-    if not _is_weights(weights):
-        return None
-    signature = types.void(source, types.int64, weights, types.int64)
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        source_, begin_, weights_, target_ = args
-        values = _load(builder, _data(context, builder, sig.args[0], source_, begin_))
-        pointer = _data(context, builder, sig.args[2], weights_, target_)
-        align = 4
-        if sig.args[2].dtype == types.uint16:
-            wide = ir.VectorType(ir.IntType(32), LANES)
-
-            def constant(number: int) -> Any:
-                return ir.Constant(wide, [number] * LANES)
-
-            scale = ir.Constant(_VECTOR, [2.0 ** (HALF_EXPONENT - HALF_BIAS)] * LANES)
-            bits = builder.bitcast(builder.fmul(values, scale), wide)
-            odd = builder.and_(builder.lshr(bits, constant(HALF_SHIFT)), constant(1))
-            bits = builder.add(bits, builder.add(odd, constant((1 << (HALF_SHIFT - 1)) - 1)))
-            values = builder.trunc(builder.lshr(bits, constant(HALF_SHIFT)), ir.VectorType(ir.IntType(16), LANES))
-            align = 2
-        builder.store(values, builder.bitcast(pointer, values.type.as_pointer()), align=align)
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-@intrinsic
 def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, blue):
     """Compute pixels[offset + v, c, i] += weights[begin + 8 v + i] * color[c] for v < vectors, 3 channels, 8 lanes.
 
-    `weights` is flat, float32 or half-precision bits (uint16); `pixels` is [P, 3, 8] float32. Bounds are not checked.
+    `weights` is flat, float32; `pixels` is [P, 3, 8] float32. Bounds are not checked.
     """
     if not _is_weights(weights):
         return None
@@ -202,7 +153,7 @@ def add_scaled(typingctx, weights, begin, vectors, pixels, offset, red, green, b
         colors = [_splat(builder, c) for c in color]
         with cgutils.for_range(builder, vectors_) as loop:
             position = builder.mul(loop.index, _number(LANES))
-            w = _load_weights(builder, sig.args[0], builder.gep(source, [position]))
+            w = _load(builder, builder.gep(source, [position]))
             position = builder.mul(position, _number(_CHANNELS))
             for channel, c in enumerate(colors):
                 pointer = builder.gep(target, [builder.add(position, _number(channel * LANES))])
@@ -234,7 +185,7 @@ def dot_pixels(typingctx, weights, begin, vectors, pixels, offset):
             builder.store(zero, total)
         with cgutils.for_range(builder, vectors_) as loop:
             position = builder.mul(loop.index, _number(LANES))
-            w = _load_weights(builder, sig.args[0], builder.gep(source, [position]))
+            w = _load(builder, builder.gep(source, [position]))
             position = builder.mul(position, _number(_CHANNELS))
             for channel, total in enumerate(sums):
                 pointer = builder.gep(other, [builder.add(position, _number(channel * LANES))])
@@ -251,7 +202,7 @@ def sum_weights(typingctx, weights, begin, vectors):
 
     Bit-identical to `dot_pixels` with pixels of 1. `weights` is flat, float32. Bounds are not checked.
     """
-    if not _is_weights(weights) or weights.dtype != types.float32:
+    if not _is_weights(weights):
         return None
     signature = types.float32(weights, types.int64, types.int64)
 
@@ -285,88 +236,5 @@ def prefetch(typingctx, values, index):
         flags = [ir.Constant(ir.IntType(32), flag) for flag in (0, 3, 1)]  # read, high locality, data cache
         builder.call(function, [builder.bitcast(pointer, byte), *flags])
         return context.get_dummy_value()
-
-    return signature, generate
-
-
-@intrinsic
-def add_pieces(typingctx, weights, items, first, count, colors, pixels, offset):
-    """Compute pixels[offset + row, c, i] += sum of weights[32 piece + 8 row + i] * colors[items[piece], c].
-
-    Sums over pieces first..first + count in order; 4 rows, 3 channels, 8 lanes. `weights` is flat, float32 or
-    half-precision bits (uint16); `items` is int32; `colors` [I, 3] and `pixels` [P, 3, 8] are float32. Bounds are not
-    checked.
-    """
-    if not _is_weights(weights):
-        return None
-    signature = types.void(weights, items, types.int64, types.int64, colors, pixels, types.int64)
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        weights_, items_, first_, count_, colors_, pixels_, offset_ = args
-        target = _data(context, builder, sig.args[5], pixels_, builder.mul(offset_, _number(_CHANNELS * LANES)))
-        cells = [(row, c) for row in range(BLOCK_ROWS) for c in range(_CHANNELS)]
-        pointers = {cell: builder.gep(target, [_number((cell[0] * _CHANNELS + cell[1]) * LANES)]) for cell in cells}
-        sums = {cell: cgutils.alloca_once(builder, _VECTOR) for cell in cells}
-        for cell in cells:
-            builder.store(_load(builder, pointers[cell]), sums[cell])
-        with cgutils.for_range(builder, count_) as loop:
-            piece = builder.add(first_, loop.index)
-            item = builder.zext(builder.load(_data(context, builder, sig.args[1], items_, piece)), ir.IntType(64))
-            color = _data(context, builder, sig.args[4], colors_, builder.mul(item, _number(_CHANNELS)))
-            channels = [_splat(builder, builder.load(builder.gep(color, [_number(c)]))) for c in range(_CHANNELS)]
-            source = _data(context, builder, sig.args[0], weights_, builder.mul(piece, _number(BLOCK_ROWS * LANES)))
-            for row in range(BLOCK_ROWS):
-                w = _load_weights(builder, sig.args[0], builder.gep(source, [_number(row * LANES)]))
-                for c in range(_CHANNELS):
-                    product = builder.fmul(w, channels[c], flags=_FUSED)
-                    builder.store(builder.fadd(builder.load(sums[row, c]), product, flags=_FUSED), sums[row, c])
-        for cell in cells:
-            builder.store(builder.load(sums[cell]), builder.bitcast(pointers[cell], _VECTOR.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-@intrinsic
-def dot_pieces(typingctx, weights, items, first, count, pixels, offset, sums):
-    """Compute sums[items[piece], c, i] += weights[32 piece + 8 row + i] * pixels[offset + row, c, i] for 4 rows.
-
-    Processes pieces first..first + count in order. `sums` is [I, 3, 8] float32; other arrays are as in `add_pieces`.
-    """
-    if not _is_weights(weights):
-        return None
-    signature = types.void(weights, items, types.int64, types.int64, pixels, types.int64, sums)
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        weights_, items_, first_, count_, pixels_, offset_, sums_ = args
-        other = _data(context, builder, sig.args[4], pixels_, builder.mul(offset_, _number(_CHANNELS * LANES)))
-        factors = [_load(builder, builder.gep(other, [_number(i * LANES)])) for i in range(BLOCK_ROWS * _CHANNELS)]
-        with cgutils.for_range(builder, count_) as loop:
-            piece = builder.add(first_, loop.index)
-            item = builder.zext(builder.load(_data(context, builder, sig.args[1], items_, piece)), ir.IntType(64))
-            target = _data(context, builder, sig.args[6], sums_, builder.mul(item, _number(_CHANNELS * LANES)))
-            source = _data(context, builder, sig.args[0], weights_, builder.mul(piece, _number(BLOCK_ROWS * LANES)))
-            rows = [builder.gep(source, [_number(row * LANES)]) for row in range(BLOCK_ROWS)]
-            weights_of_rows = [_load_weights(builder, sig.args[0], row) for row in rows]
-            for c in range(_CHANNELS):
-                pointer = builder.gep(target, [_number(c * LANES)])
-                total = _load(builder, pointer)
-                for row in range(BLOCK_ROWS):
-                    product = builder.fmul(weights_of_rows[row], factors[row * _CHANNELS + c], flags=_FUSED)
-                    total = builder.fadd(total, product, flags=_FUSED)
-                builder.store(total, builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-@intrinsic
-def sum_lanes(typingctx, sums, vector):
-    """Return the sum of the 8 lanes of the vector with index `vector` in an array, added as in `_lane_sum`."""
-    signature = types.float32(sums, types.int64)
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _data(context, builder, sig.args[0], args[0], builder.mul(args[1], _number(LANES)))
-        return _lane_sum(builder, _load(builder, pointer))
 
     return signature, generate

@@ -10,12 +10,9 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -25,11 +22,9 @@ from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
 from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer
-from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer, splat
 from sgsst_core.rasterizer.tile_intersections import MAX_INTERSECTIONS, build_tile_intersections, check_intersections
-from sgsst_core.rasterizer.vectors import HALF_BIAS, HALF_EXPONENT, HALF_SHIFT
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
@@ -42,7 +37,6 @@ from tests.sgsst_core.splat_scenes import (
     colors_of,
     empty_scene,
     has_intersections,
-    is_cached,
     pixels_like,
     rotated_pose,
     single,
@@ -54,7 +48,7 @@ CLOSE = 2e-5
 ALL = [name for name, kind in RASTERIZERS.items() if not kind.on_gpu]
 OTHERS = [name for name in ALL if name != "reference"]
 #: Rasterizers whose results are bit-identical for any number of threads.
-REPRODUCIBLE = ["cpu", "cached"]
+REPRODUCIBLE = ["cpu"]
 BLACK = (0.0, 0.0, 0.0)
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
@@ -197,11 +191,10 @@ def test_crops_of_a_view_make_up_the_whole_view(name: str, row: int, column: int
     assert relative_error(gradient, rasterizer.color_gradient(pixels, view)) < 1e-6
 
 
-@pytest.mark.parametrize("name", ["cpu", "cached"])
-def test_crops_have_tile_intersections_of_their_own(name: str) -> None:
+def test_crops_have_tile_intersections_of_their_own() -> None:
     """A crop takes a fraction of the memory, and nothing remains once its view is forgotten."""
     scene, view = cloud(2000, seed=13), camera(200, 120)
-    rasterizer = make_rasterizer(name, scene)
+    rasterizer = make_rasterizer("cpu", scene)
     crop = view.cropped(0, 0, 64, 96)
     whole, part = (build_tile_intersections(scene, each) for each in (view, crop))
     assert part.nbytes < 0.5 * whole.nbytes
@@ -211,8 +204,6 @@ def test_crops_have_tile_intersections_of_their_own(name: str) -> None:
     assert cpu.intersections(crop).nbytes == part.nbytes
     rasterizer.forget_views()
     assert not has_intersections(cpu, crop)
-    if isinstance(rasterizer, CachedRasterizer):
-        assert not is_cached(rasterizer, crop)
 
 
 @pytest.mark.parametrize("name", REPRODUCIBLE)
@@ -318,58 +309,6 @@ def test_scene_far_from_origin_renders_alike() -> None:
     assert_close_outside_band(CpuRasterizer(moved).render(colors_of(scene), elsewhere), image, band, tolerance=1e-4)
 
 
-def as_float(weights: NDArray[Any]) -> NDArray[np.float32]:
-    """Convert weights stored by `store_vector` (float32, or half-precision bits in uint16) to float32 in NumPy."""
-    if weights.dtype == np.float32:
-        return weights
-    return (weights.astype(np.uint32) << HALF_SHIFT).view(np.float32) * np.float32(2.0 ** (HALF_BIAS - HALF_EXPONENT))
-
-
-def test_cached_weights_equal_recomputed_ones() -> None:
-    scene, view = cloud(1500, seed=18), camera(130, 70)
-    colors, pixels = colors_of(scene), pixels_like(view)
-    cpu, cached = CpuRasterizer(scene), CachedRasterizer(scene)
-    assert not is_cached(cached, view)
-    assert torch.equal(cached.render(colors, view), cpu.render(colors, view))
-    assert torch.equal(cached.coverage(view), cpu.coverage(view))
-    assert relative_error(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
-    assert is_cached(cached, view)
-    assert is_cached(cached, replace(view, name="another name"))
-
-
-def test_half_precision_weights_are_rounded_to_float16() -> None:
-    scene, view = cloud(1500, seed=19), camera(130, 70)
-    colors, pixels = colors_of(scene), pixels_like(view)
-    full, half = CachedRasterizer(scene), CachedRasterizer(scene, precision="half")
-    image = full.render(colors, view)
-    # Each weight has a relative error of at most 2^-11, and all weights are positive.
-    assert bool(((half.render(colors, view) - image).abs() <= 2**-11 * image + 1e-6).all())
-    assert relative_error(half.color_gradient(pixels, view), full.color_gradient(pixels, view)) < 5e-4
-    assert half.cached_bytes < 0.65 * full.cached_bytes
-    (one,), (two,) = full._cached.values.values(), half._cached.values.values()
-    exact, rounded = (as_float(cached.strips.weights) for cached in (one, two))  # type: ignore[attr-defined]
-    assert np.array_equal(rounded, (exact * np.float32(2**14)).astype(np.float16).astype(np.float32) / 2**14)
-    assert 0 < float(exact[exact > 0].min()) < 1e-5
-
-
-def test_weights_beyond_the_budget_are_recomputed() -> None:
-    scene = cloud(800, seed=20)
-    views = [camera(), camera(pose=rotated_pose(0.1)), camera(pose=rotated_pose(0.2))]
-    colors, pixels = colors_of(scene), pixels_like(views[0])
-    sizes = [CpuRasterizer(scene).count_weights(view).nbytes("float32") for view in views]
-    budget = sizes[0] + sizes[1]
-    cached, cpu = CachedRasterizer(scene, max_bytes=budget), CpuRasterizer(scene)
-    for _ in range(2):
-        for view in views:
-            assert torch.equal(cached.render(colors, view), cpu.render(colors, view))
-            assert relative_error(cached.color_gradient(pixels, view), cpu.color_gradient(pixels, view)) < 1e-6
-    assert [is_cached(cached, view) for view in views] == [True, True, False]
-    assert cached.cached_bytes == budget
-    weights = cached._cached.values.values()
-    real = sum(array.nbytes for each in weights for array in each.strips)  # type: ignore[attr-defined]
-    assert 0.7 * budget < real <= budget
-
-
 def test_tile_intersections_beyond_the_budget_are_cached_for_the_last_view_only() -> None:
     scene = cloud(300, seed=21)
     views = [camera(), camera(pose=rotated_pose(0.1)), camera(pose=rotated_pose(0.2))]
@@ -379,23 +318,6 @@ def test_tile_intersections_beyond_the_budget_are_cached_for_the_last_view_only(
     assert cpu.intersections(views[0]) is cached[0]
     assert cpu.intersections(views[2]) is cached[2]
     assert cpu.intersections(views[1]) is not cached[1]
-
-
-def test_weights_and_tile_intersections_share_a_budget() -> None:
-    scene = cloud(800, seed=20)
-    views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
-    colors = colors_of(scene)
-    weights = [CpuRasterizer(scene).count_weights(view).nbytes("float32") for view in views]
-    isects = [CpuRasterizer(scene).intersections(view).nbytes for view in views]
-    cpu = CpuRasterizer(scene, max_intersection_bytes=sum(weights[:2]) + isects[2])
-    cached = CachedRasterizer(scene, max_bytes=sum(weights[:2]) + isects[2], uncached=cpu)
-    for view in views:
-        cpu.intersections(view)
-    for view in views:
-        cached.render(colors, view)
-    assert [is_cached(cached, view) for view in views] == [True, True, False, False]
-    assert [has_intersections(cpu, view) for view in views] == [False, False, True, False]
-    assert cached.cached_bytes + cpu._intersections.used <= sum(weights[:2]) + isects[2]
 
 
 def test_arguments_are_checked_before_any_work() -> None:
