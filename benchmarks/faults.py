@@ -135,7 +135,7 @@ def kill_driver(folder: Path, chance: random.Random) -> dict[str, Any]:
     source = request.source
     arguments = ["stylize", str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
     arguments += ["--out", str(request.out), "--backbone", "vgg16", "--steps-sos", "60", "--no-early-stop"]
-    arguments += ["--no-rebalance", "--workers", "2", "--checkpoint-seconds", str(CHECKPOINT_SECONDS)]
+    arguments += ["--workers", "2", "--checkpoint-seconds", str(CHECKPOINT_SECONDS)]
     command = [sys.executable, "-m", "api.cli", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None

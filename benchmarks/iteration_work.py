@@ -187,13 +187,13 @@ class IterationWork:
     def _shares(self, ranks: int) -> Shares:
         pieces = self.rendered or self.pieces
         height, width = max((piece.size[0] << piece.scale, piece.size[1] << piece.scale) for piece in pieces)
-        by_rank = divide(pieces, self.halo, (1.0,) * ranks, self.rendering)
+        by_rank = divide(pieces, self.halo, ranks, self.rendering)
         return Shares.of((height, width), by_rank, self.halo)
 
     def shards(self, ranks: int) -> tuple[tuple[Piece, ...], ...]:
         """Return the pieces that each rank of a group passes through the network."""
         rendering = self.rendering if self.rendered in ((), self.pieces) else 0.0
-        return divide(self.pieces, self.halo, (1.0,) * ranks, rendering)
+        return divide(self.pieces, self.halo, ranks, rendering)
 
     def _image_bytes(self, ranks: int) -> list[tuple[int, int]]:
         """Return the bytes of the image that each rank sends and receives; those of its gradient go the other way."""

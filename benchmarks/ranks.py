@@ -75,7 +75,6 @@ def make(collectives: Collectives, scene: Any, view: Camera, style: Any, argumen
         steps_coarse=0,
         steps_sos=10_000,
         memory_limit=int(arguments.memory * 1e9),
-        rebalance=False,
     )
     return Stylizer.planned(scene, [view], style, settings, collectives=collectives)
 
@@ -107,7 +106,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
     pieces = tuple(Piece(scale, size, Rectangle(0, 0, *size)) for scale, size in sizes.items())
     areas = [[tile.outer.pixels for tile in loss.divider.tiles(piece.size)] for piece in pieces]
     halo = loss.network.halo
-    one, shared = (divide(pieces, halo, (1.0,) * count) for count in (1, collectives.size))
+    one, shared = (divide(pieces, halo, count) for count in (1, collectives.size))
     return {
         "ranks": collectives.size,
         "seconds_one_rank": median(steps["alone"], "total"),

@@ -117,7 +117,7 @@ def forecast(work: IterationWork) -> dict[str, Any]:
             waiting = {purpose: 1e3 * seconds for purpose, seconds in work.waiting(ranks, link).items()}
             links[name] = {"speed_up": one / work.seconds(ranks, link), "milliseconds": waiting}
         by_ranks[str(ranks)] = {
-            "bound_by_halos": unhaloed / max(loads(divide(work.pieces, work.halo, (1.0,) * ranks), work.halo)),
+            "bound_by_halos": unhaloed / max(loads(divide(work.pieces, work.halo, ranks), work.halo)),
             "bytes_sent": work.sent(ranks),
             "milliseconds": computing_parts(work, ranks),
             "links": links,

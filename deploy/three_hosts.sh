@@ -150,7 +150,7 @@ mkdir -p "$OUT"
 field() { python -S -c "import json, sys; d = json.load(sys.stdin); print(d$1)"; }
 job=$(curl -sf "$url/v1/jobs" -F "scene=@$scene/motorcycle.ply" -F "cameras=@$scene/cameras.json" \
   -F "style=@$scene/starry_night.jpg" -F 'parameters={"resolution": 96, "views": 2, "steps_coarse": 0, "steps_sos": 24,
-  "backbone": "vgg16", "rebalance": false, "seed": 1}' | field "['id']")
+  "backbone": "vgg16", "seed": 1}' | field "['id']")
 echo "job $job is accepted"
 killed=
 until=$((SECONDS + PATIENCE))
@@ -185,7 +185,7 @@ done
 echo "computed on: $(field "['workers']['ranks'][0]['host']" < "$OUT/report.json")"
 threads=$(field "['workers']['ranks'][0]['threads']" < "$OUT/report.json") # other numbers of threads round differently
 OMP_NUM_THREADS=$threads sgsst stylize "$scene/motorcycle.ply" --cameras "$scene/cameras.json" --style "$scene/starry_night.jpg" \
-  --out "$OUT/expected.ply" --resolution 96 --views 2 --steps-coarse 0 --steps-sos 24 --backbone vgg16 --no-rebalance \
+  --out "$OUT/expected.ply" --resolution 96 --views 2 --steps-coarse 0 --steps-sos 24 --backbone vgg16 \
   --seed 1 > /dev/null
 cmp "$OUT/stylized.ply" "$OUT/expected.ply" && echo "the result is that of sgsst stylize, byte for byte"
 for name in api head node; do

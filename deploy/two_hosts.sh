@@ -83,7 +83,7 @@ before=$(cat "/sys/class/net/$BRIDGE-b/statistics/rx_bytes")
 scene=$WORK/scene
 on_host a env RAY_ADDRESS="$NET.2:$PORT" sgsst stylize "$scene/motorcycle.ply" --cameras "$scene/cameras.json" \
   --style "$scene/starry_night.jpg" --out "$OUT" --resolution 160 --views 3 --steps-coarse 0 --steps-sos 20 --backbone vgg16 \
-  --no-rebalance --workers 2
+  --workers 2
 after=$(cat "/sys/class/net/$BRIDGE-b/statistics/rx_bytes")
 
 python - "${OUT%.ply}.report.json" $((after - before)) <<'PYTHON'

@@ -33,8 +33,6 @@ class Listener:
         finish: Called like `stop`; returns True to end the job after a step, with its present colors as the result.
         saved: Called with the step of each checkpoint; not used for ranks.
         happened: Called with a sentence about each lost or resumed attempt on ranks, and about a long wait for a rank.
-        left_out: Called with the GPUs that the job released because the plan does not use them, by their names in
-            CUDA_VISIBLE_DEVICES on their machine.
         stored: Called with the workplace's description of each stored file, in order.
     """
 
@@ -45,7 +43,6 @@ class Listener:
     finish: Callable[[], bool] = lambda: False
     saved: Callable[[int], None] = lambda step: None
     happened: Callable[[str], None] = lambda line: None
-    left_out: Callable[[Sequence[str]], None] = lambda gpus: None
     stored: Callable[[Any], None] = lambda file: None
 
 
@@ -130,13 +127,12 @@ def run_rank(
 
     Raises:
         SgsstError: If the job fails.
-        RankLeftOut: If the plan does not use this rank.
     """
     import torch
 
     from sgsst_core import container
     from sgsst_core.parallel.collectives import ALONE
-    from sgsst_core.planning.time_budget import seconds_left
+    from sgsst_core.timing import seconds_left
     from worker.execute import execute
     from worker.prepare import describe, prepare
     from worker.previews import Previews

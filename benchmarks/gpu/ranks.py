@@ -51,7 +51,7 @@ def follow(collectives: Collectives, sizes: Sizes) -> tuple[Tensor, Tensor, Tens
     """Return the gradient of a view before the first step, and the colors [N, 3] before it and after the last step."""
     quick = sizes == QUICK
     settings = make_settings(
-        "standard", steps_sos=sizes.rank_steps, scale_sampling=1, early_stop=False, rebalance=False,
+        "standard", steps_sos=sizes.rank_steps, scale_sampling=1, early_stop=False,
         cached_weights="none", coarsest_side=24 if quick else None,
     )  # fmt: skip
     width, height = sizes.view

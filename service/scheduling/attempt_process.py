@@ -93,7 +93,6 @@ class AttemptProcess:
             stop=self._stopping.is_set,
             finish=self._finishing.is_set,
             happened=log,
-            left_out=lambda gpus: send(Report(left_out=tuple(gpus))),
             stored=lambda file: send(Report(stored=file)),
         )
         options = WorkerOptions(

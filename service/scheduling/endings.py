@@ -88,14 +88,12 @@ class Report(BaseModel):
 
     Attributes:
         prepared: Whether the inputs have been read, so that the first step starts.
-        left_out: GPUs that the plan does not use.
         stored: File that a rank has put into the file store.
         ending: Success or failure of the attempt. A process that is interrupted reports neither.
     """
 
     progress: Progress | None = None
     prepared: bool = False
-    left_out: tuple[str, ...] = ()
     stored: Published | None = None
     ending: Ending | None = None
 

@@ -10,9 +10,8 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -242,8 +241,6 @@ class RunningAttempt:
 
     def _handle(self, report: Report) -> None:
         """Handle a report, except for its ending."""
-        if report.left_out:
-            self._release_gpus(report.left_out)
         if report.stored is not None:
             self._publish_later(partial(self._publisher.publish, [report.stored]))
         if report.prepared:
@@ -255,16 +252,6 @@ class RunningAttempt:
         """Record the attempt's GPUs, which are charged to the job's owner."""
         if self.grant.gpus:
             self._store.leases.hold_gpus(self.lease, len(self.grant.gpus))
-
-    def _release_gpus(self, gpus: Sequence[str]) -> None:
-        """Release GPUs that the plan does not use; on a cluster only their number matters."""
-        left = len(self.grant.gpus) - len(gpus)
-        retained = self.grant.gpus[:left]
-        if not self._stager.cluster:
-            retained = tuple(gpu for gpu in self.grant.gpus if gpu not in gpus)
-        self.grant = replace(self.grant, ranks=len(retained), gpus=retained)
-        self._count_gpus()
-        _log.info("released GPUs: released=%d used=%d", len(gpus), len(retained), extra=self.lease.log_fields)
 
     def _kill(self) -> None:
         if self._process is not None:

@@ -103,14 +103,10 @@ class Divider:
 
     Args:
         collectives: Collectives of the ranks that evaluate each view together.
-
-    Attributes:
-        speeds: Relative speeds of the ranks; work is divided in proportion to them.
     """
 
     def __init__(self, tiling: Tiling, collectives: Collectives = ALONE) -> None:
         self.tiling = tiling
-        self.speeds = (1.0,) * collectives.size
         self.collectives = collectives
 
     def divide(
@@ -130,7 +126,7 @@ class Divider:
             pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
         else:
             pieces = tuple(Piece(scale, size, scaled_region(region, scale, size)) for scale, size in sizes.items())
-        return self._division(divide(pieces, self.tiling.halo, self.speeds), sizes, weights)
+        return self._division(divide(pieces, self.tiling.halo, self.collectives.size), sizes, weights)
 
     def divide_view(
         self, size: Size, scales: Sequence[int], coverage: Sequence[Tensor] | None, region: Rectangle | None
@@ -165,7 +161,7 @@ class Divider:
             Piece(scale, each, scaled_region(whole, scale, each)) for scale, each in zip(scales, sizes, strict=True)
         ]
         rendering = self.tiling.rendering if rendered else 0.0
-        return divide(tuple(pieces), self.tiling.halo, self.speeds, rendering)
+        return divide(tuple(pieces), self.tiling.halo, self.collectives.size, rendering)
 
     def _division(
         self,

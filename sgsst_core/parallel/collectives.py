@@ -103,22 +103,15 @@ class Collectives:
         iteration counts as failed. Before this call, the timeout is long enough for the preparation of a job.
         """
 
-    def form_groups(self, count: int, groups: int) -> tuple[Collectives, Collectives] | None:
-        """Form a group of the first `count` ranks, and `groups` equal groups of consecutive ones of them.
+    def split_group(self, groups: int) -> Collectives:
+        """Split the ranks into `groups` equal groups of consecutive ranks, and return this rank's group.
 
-        Every rank calls this, also those that are in none of the groups.
-
-        Returns:
-            The group of the first ranks, and the one of the smaller groups that this rank is in; None on other ranks.
+        Every rank must call this at the same point.
         """
-        return self, self
+        return self
 
 
 ALONE = Collectives()
-
-
-class RankLeftOut(Exception):  # noqa: N818 (not an error: the job continues without this rank)
-    """Exception on a rank that the plan does not use, because it would only add communication."""
 
 
 def same_on_all(collectives: Collectives, value: Any) -> bool:

@@ -133,14 +133,12 @@ class Shares:
 _NOTHING = Rectangle(0, 0, 0, 0)
 
 
-def divide(
-    pieces: tuple[Piece, ...], halo: int, speeds: tuple[float, ...], rendering: float = 0.0
-) -> tuple[tuple[Piece, ...], ...]:
-    """Divide pieces among ranks in proportion to their speeds.
+def divide(pieces: tuple[Piece, ...], halo: int, ranks: int, rendering: float = 0.0) -> tuple[tuple[Piece, ...], ...]:
+    """Divide pieces among ranks, in equal portions of their cost.
 
     The ranks are recursively split into two halves, and the pieces are divided between the halves. Only pieces that
     cost more than a rank's average are split, because each split adds two halos; smaller pieces go to the half with
-    less work. The largest piece is split last, so that the costs, including halos, match the speeds. Coarse scales are
+    less work. The largest piece is split last, so that the costs, including halos, are alike. Coarse scales are
     thereby spread over the ranks: each rank has few pieces, and no rank receives most of the exchanged images.
 
     Args:
@@ -152,7 +150,7 @@ def divide(
         Pieces of each rank, scale 0 first. A rank may get none if there are fewer than 16 x 16 pixels per rank.
     """
     finest = min((piece.scale for piece in pieces), default=0)
-    return _divide(pieces, speeds, _Costs(halo, finest, rendering))
+    return _divide(pieces, ranks, _Costs(halo, finest, rendering))
 
 
 @dataclass(frozen=True)
@@ -170,12 +168,12 @@ class _Costs:
 
 
 @functools.lru_cache(maxsize=1024)
-def _divide(pieces: tuple[Piece, ...], speeds: tuple[float, ...], costs: _Costs) -> tuple[tuple[Piece, ...], ...]:
-    if len(speeds) == 1:
+def _divide(pieces: tuple[Piece, ...], ranks: int, costs: _Costs) -> tuple[tuple[Piece, ...], ...]:
+    if ranks == 1:
         return (tuple(sorted(pieces, key=lambda piece: piece.scale)),)
-    half = len(speeds) // 2
-    first, second = _halves(pieces, sum(speeds[:half]) / sum(speeds), len(speeds), costs)
-    return _divide(first, speeds[:half], costs) + _divide(second, speeds[half:], costs)
+    half = ranks // 2
+    first, second = _halves(pieces, half / ranks, ranks, costs)
+    return _divide(first, half, costs) + _divide(second, ranks - half, costs)
 
 
 def _halves(

@@ -6,7 +6,6 @@ An attempt is one set of ranks. When one of them dies, hangs or is killed for la
 
 from __future__ import annotations
 
-import os
 import secrets
 import time
 from collections.abc import Callable
@@ -21,8 +20,6 @@ from worker.ranks.rank import RankProcess, RankStatus, RankTask, WorkerOptions
 from worker.ranks.rank_group import (
     AttemptFailedError,
     RankGroup,
-    RankHandle,
-    end_rank,
     end_ranks,
     long_wait,
     look_for_losses,
@@ -75,14 +72,13 @@ class _Attempts:
         self, request: JobSpec, workers: int, listener: Listener, options: WorkerOptions, cluster: Cluster
     ) -> None:
         self._request = request
-        self._requested = self._workers = workers
+        self._workers = workers
         self._listener, self._options, self._cluster = listener, options, cluster
         self._run_id = secrets.token_hex(8)
         self._failed: list[FailedAttempt] = []
         self._lost: list[LostAttempt] = []
         self._relay = Relay(listener, self._report_resumed)
-        self._group = RankGroup(self._leave_out)
-        self._let_go = False  # whether GPUs were released that the local Ray would still assign to ranks
+        self._group = RankGroup()
         self._lost_at = time.monotonic()
 
     def run(self) -> Ended:
@@ -120,12 +116,11 @@ class _Attempts:
         import ray
 
         self._relay.begin_attempt()
-        self._group = RankGroup(self._leave_out)
+        self._group = RankGroup()
         try:
-            if self._let_go or not self._cluster.alive():
+            if not self._cluster.alive():
                 self._cluster.close()
                 self._cluster.open()
-                self._let_go = False
             start_ranks(self._group, self._workers, self._scene_bytes(), self._options.actor or RankProcess, self._task)
             return self._watch()
         except (ray.exceptions.RayError, ConnectionError) as error:
@@ -180,7 +175,7 @@ class _Attempts:
             folder=Path.cwd(),
             resume=resume,
             run_id=self._run_id,
-            workers={"requested": self._requested, "attempts": [asdict(attempt) for attempt in self._lost]},
+            workers={"requested": self._workers, "attempts": [asdict(attempt) for attempt in self._lost]},
             seconds_lost=time.monotonic() - self._relay.safe_at,
             seconds_since_loss=time.monotonic() - self._lost_at,
         )
@@ -193,20 +188,6 @@ class _Attempts:
         except OSError:
             return 0
         return int(size * self._request.settings.growth)
-
-    def _leave_out(self, rank: RankHandle) -> None:
-        """End a rank that the plan does not use, and release its GPU."""
-        end_rank(rank)
-        assert rank.place is not None
-        if not rank.place.gpus:
-            return
-        others = [other for other in self._group.handles if other.place and not other.left_out]
-        gpus = [gpu for other in others if other.place for gpu in other.place.gpus]
-        self._workers = len(gpus)
-        if self._cluster.local:  # another process may use the GPU now, so the next attempt needs a new local Ray
-            self._let_go = True
-            os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(gpus)
-        self._listener.left_out(rank.place.gpus)
 
     def _report_resumed(self) -> None:
         """Report that the job has resumed after a loss, and record how long the recovery took."""

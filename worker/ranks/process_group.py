@@ -382,15 +382,11 @@ class ProcessGroupCollectives(Collectives):
         """See `Collectives`."""
         self._group.set_timeout(max(self._timeout, timedelta(seconds=ITERATIONS * iteration_seconds)))
 
-    def form_groups(self, count: int, groups: int) -> tuple[Collectives, Collectives] | None:
+    def split_group(self, groups: int) -> Collectives:
         """See `Collectives`."""
-        each = count // groups
-        first = self._subgroup(range(count))
-        parts = (
-            [self._subgroup(range(start, start + each)) for start in range(0, count, each)] if groups > 1 else [first]
-        )
-        own = next((part for part in parts if part is not None), None)
-        return None if first is None or own is None else (first, own)
+        each = self.size // groups
+        parts = [self._subgroup(range(start, start + each)) for start in range(0, self.size, each)]
+        return next(part for part in parts if part is not None)
 
     def _subgroup(self, ranks: range) -> Collectives | None:
         """Return a group of ranks; None on other ranks. Every rank of the job must call this, as of `new_group`."""

@@ -158,13 +158,13 @@ class Outcome:
     """Outcome of a rank.
 
     Attributes:
-        kind: "done", "left-out" (the plan does not use this rank) or "failed".
+        kind: "done" or "failed".
         trace: Text of the error's traceback.
         echo: Whether the error occurred in an exchange between ranks. The root cause may then be the loss of another
             rank.
     """
 
-    kind: Literal["done", "left-out", "failed"]
+    kind: Literal["done", "failed"]
     result: Result | None = None
     error: Exception | None = None
     trace: str = ""
@@ -270,7 +270,6 @@ class RankProcess:
     def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
         import torch
 
-        from sgsst_core.parallel.collectives import RankLeftOut
         from worker.ranks.process_group import WAITING, process_group
 
         self._waiting = WAITING
@@ -287,8 +286,6 @@ class RankProcess:
                     place.finish(done=result.stopped != "interrupted")
                     self._leave(place)
                 self._update(outcome=Outcome("done", result))
-            except RankLeftOut:
-                self._update(outcome=Outcome("left-out"))
             except BaseException as error:
                 self._update(outcome=_failure(error))
 

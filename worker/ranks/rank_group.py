@@ -10,7 +10,7 @@ from typing import Any
 
 from sgsst_core.errors import ClusterAwayError, InfrastructureError
 from worker.processes import ProcessId, home, kill
-from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, give_back, reserve
+from worker.ranks.cluster import Cluster, NoCapacityError, Reservation, reserve
 from worker.ranks.failure_policy import Failure, failure_of, first_line
 from worker.ranks.rank import Outcome, RankPlace, RankProcess, RankStatus, RankTask, Workplace
 
@@ -49,14 +49,9 @@ class RankHandle:
         return self.status.outcome
 
     @property
-    def left_out(self) -> bool:
-        """Return whether the job continues without this rank."""
-        return self.outcome is not None and self.outcome.kind == "left-out"
-
-    @property
     def silence(self) -> float:
-        """Return the seconds since the last response; 0 for a rank that was left out."""
-        return 0.0 if self.left_out else time.monotonic() - self.answered_at
+        """Return the seconds since the last response."""
+        return time.monotonic() - self.answered_at
 
 
 @dataclass
@@ -64,12 +59,10 @@ class RankGroup:
     """Ranks of one attempt, ordered by number.
 
     Attributes:
-        on_left_out: Callback for each rank that the plan does not use.
         handles: Handles of the ranks; empty until they are started.
         reservation: Reserved resources; None before the reservation and after its release.
     """
 
-    on_left_out: Callable[[RankHandle], None]
     handles: list[RankHandle] = field(default_factory=list)
     reservation: Reservation | None = None
 
@@ -175,7 +168,7 @@ def poll_ranks(group: RankGroup) -> None:
 
     now = time.monotonic()
     for rank in group.handles:
-        if rank.pending_poll is None and not rank.left_out and now - rank.polled_at >= POLL_SECONDS:
+        if rank.pending_poll is None and now - rank.polled_at >= POLL_SECONDS:
             rank.pending_poll, rank.polled_at = rank.actor.poll.remote(), now
     polls = {rank.pending_poll: rank for rank in group.handles if rank.pending_poll is not None}
     if not polls:
@@ -193,8 +186,6 @@ def _take_answer(group: RankGroup, rank: RankHandle, poll: Any) -> None:
     try:
         rank.status = ray.get(poll, timeout=_FETCH_SECONDS)
         rank.answered_at = time.monotonic()
-        if rank.left_out:
-            group.on_left_out(rank)
     except ray.exceptions.ActorUnavailableError:  # may be temporary: the timeout decides
         return
     except ray.exceptions.ActorDiedError as error:
@@ -313,19 +304,6 @@ def end_ranks(group: RankGroup, cluster: Cluster, workplace: Workplace | None = 
     if workplace is not None:
         workplace.tidy()
     group.reservation = None
-
-
-def end_rank(rank: RankHandle) -> None:
-    """End one rank on any machine, wait until its GPU memory is free, and return its resources to Ray."""
-    import ray
-
-    assert rank.place is not None
-    ray.kill(rank.actor, no_restart=True)
-    if rank.place.process.home == home():
-        kill([rank.place.process])
-    else:
-        ray.wait([_kill_on(rank.place).remote([rank.place.process], None)], timeout=_REMOTE_SECONDS)
-    give_back(rank.group)
 
 
 def _end_remote(group: RankGroup, workplace: Workplace | None) -> None:

@@ -19,7 +19,7 @@ from service.files.blobs import BlobFolder
 from service.scheduling.dispatcher import Dispatcher
 from service.scheduling.endings import Report
 from service.scheduling.machine import Machine, is_dead, own_name
-from service.scheduling.packing import Capacity, Grant, estimated_seconds
+from service.scheduling.packing import Grant, estimated_seconds
 from service.scheduling.running import RunningAttempt
 from service.scheduling.selection import Holding
 from service.scheduling.stager import Stager
@@ -117,21 +117,6 @@ def test_attempt_reports_its_expected_end(settings: ServiceSettings, store: Stor
     assert holding.pace == pytest.approx(1000.0 / estimated, rel=0.06)
     held.job.attempt = 2  # the seconds may be those left after a checkpoint
     assert attempt.holding.pace is None
-
-
-def test_released_gpus_are_free_for_other_jobs(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
-    held = new_lease(store, "one")
-    grant = Grant(3, ("5", "6", "7"))
-    attempt = attempt_of(held, grant, settings, store, tmp_path)
-    capacity = Capacity(Machine(grant.gpus, 2, 10**11), None)
-    assert capacity.free([attempt.grant]) == 0
-    for gpu in ("7", "5"):
-        attempt._handle(Report(left_out=(gpu,)))
-    assert attempt.grant == Grant(1, ("6",))
-    held.job.parameters = {"precision": "float32"}  # so that the job is large enough for two
-    following = capacity.grant(held.job, [attempt.grant], 1)
-    assert following is not None
-    assert (following.ranks, following.gpus) == (2, ("5", "7"))
 
 
 def test_job_with_unsupported_stored_parameters_fails_with_a_message(settings: ServiceSettings, store: Store) -> None:

@@ -31,12 +31,12 @@ def loads(division: Sequence[Sequence[Piece]], halo: int) -> list[int]:
     height=st.integers(1, 700),
     width=st.integers(1, 700),
     scales=st.integers(1, 3),
-    speeds=st.lists(st.floats(0.2, 5.0), min_size=1, max_size=9),
+    ranks=st.integers(1, 9),
 )
-def test_every_pixel_belongs_to_one_rank(height: int, width: int, scales: int, speeds: list[float]) -> None:
+def test_every_pixel_belongs_to_one_rank(height: int, width: int, scales: int, ranks: int) -> None:
     pieces = tuple(piece for piece in view(height, width, scales) if piece.region.pixels)
-    shares = divide(pieces, HALO, tuple(speeds))
-    assert len(shares) == len(speeds)
+    shares = divide(pieces, HALO, ranks)
+    assert len(shares) == ranks
     for piece in pieces:
         owners = torch.zeros(piece.size, dtype=torch.int64)
         for part in itertools.chain.from_iterable(shares):
@@ -52,21 +52,16 @@ def test_every_pixel_belongs_to_one_rank(height: int, width: int, scales: int, s
 )
 def test_loads_are_even_and_halos_small(height: int, width: int, scales: int, ranks: int, least: float) -> None:
     pieces = view(height, width, scales)
-    shared = loads(divide(pieces, HALO, (1.0,) * ranks), HALO)
+    shared = loads(divide(pieces, HALO, ranks), HALO)
     assert min(shared) > 0.9 * max(shared)
-    assert loads(divide(pieces, HALO, (1.0,)), HALO)[0] / max(shared) > least
-
-
-def test_faster_ranks_get_more_work() -> None:
-    slow, fast = loads(divide(view(1024, 1024, 2), HALO, (1.0, 3.0)), HALO)
-    assert fast / slow == pytest.approx(3.0, rel=0.05)
+    assert loads(divide(pieces, HALO, 1), HALO)[0] / max(shared) > least
 
 
 def test_ranks_without_work_have_no_pieces() -> None:
-    shares = divide(view(15, 17, 1), HALO, (1.0,) * 4)
+    shares = divide(view(15, 17, 1), HALO, 4)
     assert sorted(map(len, shares)) == [0, 0, 0, 1]  # split in two, each half would be all halo
     nothing = (Piece(0, (480, 640), Rectangle(0, 0, 0, 0)),)
-    assert sum(loads(divide(nothing, HALO, (1.0, 1.0)), HALO)) == 0
+    assert sum(loads(divide(nothing, HALO, 2), HALO)) == 0
 
 
 @settings(max_examples=60, deadline=None)
@@ -78,7 +73,7 @@ def test_ranks_without_work_have_no_pieces() -> None:
 )
 def test_shares_contain_each_pixel_of_the_finest_scale_once(height: int, width: int, finest: int, ranks: int) -> None:
     pieces = tuple(piece for piece in view(height, width, 4) if piece.scale >= finest)
-    by_rank = divide(pieces, HALO, (1.0,) * ranks)
+    by_rank = divide(pieces, HALO, ranks)
     shares = Shares.of((height, width), by_rank, HALO)
     owners = torch.zeros(height, width, dtype=torch.int64)
     for part, window, own in zip(shares.parts, shares.windows, by_rank, strict=True):
@@ -99,7 +94,7 @@ def test_shares_contain_each_pixel_of_the_finest_scale_once(height: int, width: 
 def test_exchanged_windows_contain_the_pixels_of_coarser_pieces(
     height: int, width: int, scales: int, ranks: int
 ) -> None:
-    by_rank = divide(tuple(piece for piece in view(height, width, scales) if piece.region.pixels), HALO, (1.0,) * ranks)
+    by_rank = divide(tuple(piece for piece in view(height, width, scales) if piece.region.pixels), HALO, ranks)
     shares = Shares.of((height, width), by_rank, HALO)
     exchanges = shares.exchanges(by_rank, HALO)
     assert [*exchanges] == [*range(1, min(scales, 5))], "at larger scales, a pixel may belong to two parts"
@@ -118,7 +113,7 @@ def test_exchanged_windows_contain_the_pixels_of_coarser_pieces(
 def test_coarse_scales_are_spread_over_the_ranks() -> None:
     """Each rank has one piece of a coarser scale at most, and needs little of the exchanged images."""
     size = 3361, 5187
-    by_rank = divide(view(*size, 4), HALO, (1.0,) * 8)
+    by_rank = divide(view(*size, 4), HALO, 8)
     exchanges = Shares.of(size, by_rank, HALO).exchanges(by_rank, HALO)
     assert max(map(len, by_rank)) == 2
     received = [sum(moved(exchange, rank)[1] for exchange in exchanges.values()) for rank in range(8)]

@@ -32,7 +32,7 @@ Place = Literal[
     "all_reduce_statistics",
     "all_gather",
     "checkpoint",
-    "form_groups",
+    "split_group",
     "finish",
 ]
 
@@ -64,7 +64,7 @@ class Fault:
         """Install the fault in this process once the job is planned, unless it belongs to planning."""
         from sgsst_core.stylizing.stylizer import Stylizer
 
-        if self.place == "form_groups":
+        if self.place == "split_group":
             self._install(request)
             return
         create: Callable[..., None] = Stylizer.__init__
@@ -129,7 +129,7 @@ def small_request(folder: Path, steps: int, **settings: Any) -> JobSpec:
     inputs = folder / "inputs"
     inputs.mkdir(parents=True, exist_ok=True)
     ply, cameras, style = write_files(inputs, wall())
-    options = {"steps_sos": steps, "early_stop": False, "rebalance": False, **settings}
+    options = {"steps_sos": steps, "early_stop": False, **settings}
     source = SceneRequest(scene=ply, cameras=cameras)
     chosen, out = make_settings(**options), folder / "out" / "s.ply"
     return JobSpec(source=source, styles=(StyleFile(style),), out=out, settings=chosen, backbone="vgg16")
@@ -177,7 +177,7 @@ def _places() -> dict[str, tuple[Any, str]]:
     from worker import execute
     from worker.ranks.process_group import ProcessGroupCollectives
 
-    exchanges = ("form_groups", "gather_parts", "reduce_parts", "all_reduce", "all_reduce_statistics", "all_gather")
+    exchanges = ("split_group", "gather_parts", "reduce_parts", "all_reduce", "all_reduce_statistics", "all_gather")
     return {
         "render": (Views, "render"),
         "loss": (SosLoss, "evaluate"),

@@ -118,7 +118,7 @@ def undisturbed(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> t
     events = EventRecorder()
     ended = run(request, cluster, events)
     assert ended.attempts == []
-    order = ("planning", "probing", "starting")
+    order = ("planning", "starting")
     passed = [(order.index(now.stage), now.step) for now in events.planned]  # the latest ones that were asked for
     assert passed == sorted(set(passed))
     assert passed
@@ -238,7 +238,7 @@ def command(request: JobSpec, *options: str) -> list[str]:
     """Return the arguments of `sgsst stylize` for the same job."""
     source = request.source
     files = [str(source.scene), "--cameras", str(source.cameras), "--style", str(request.styles[0].path)]
-    settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop", "--no-rebalance"]
+    settings = ["--backbone", "vgg16", "--steps-sos", "400", "--no-early-stop"]
     return ["stylize", *files, "--out", str(request.out), *settings, "--workers", "2", *options]
 
 

@@ -44,7 +44,7 @@ def test_command_matches_one_rank(views: int, alone: dict[int, float], tmp_path:
     request = small_request(tmp_path, STEPS)
     source = ["stylize", str(request.source.scene), "--cameras", str(request.source.cameras), "--backbone", "vgg16"]
     files = ["--style", str(request.styles[0].path), "--out", str(request.out)]
-    options = ["--steps-sos", str(STEPS), "--no-early-stop", "--no-rebalance", "--views-per-step", str(views)]
+    options = ["--steps-sos", str(STEPS), "--no-early-stop", "--views-per-step", str(views)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     environment.pop("RAY_ADDRESS", None)
     command = [sys.executable, "-m", "api.cli", *source, *files, *options, "--workers", "8"]
@@ -66,7 +66,7 @@ def cluster() -> Iterator[Cluster]:
 @pytest.mark.parametrize(
     "fault",
     [
-        Fault(3, "form_groups", 1, "SIGKILL"),
+        Fault(3, "split_group", 1, "SIGKILL"),
         Fault(7, "optimizer", 1, "SIGKILL"),
         Fault(2, "all_reduce", 6, "SIGKILL"),
         Fault(5, "finish", 1, "SIGKILL"),

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import functools
-import time
 from dataclasses import replace
 from typing import Any
-from unittest import mock
 
 import pytest
 import torch
@@ -17,7 +15,6 @@ from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning import choices
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
@@ -50,7 +47,6 @@ def gradient(
     camera: Camera,
     dtype: torch.dtype,
     tile_size: int | None,
-    speeds: tuple[float, ...] | None = None,
     memory: int = 1 << 34,
     style_loss: StyleLossName = "sos",
     regions: Regions | None = None,
@@ -73,7 +69,6 @@ def gradient(
         scales=scale_weights,
         collectives=collectives,
     )
-    loss.divider.speeds = speeds or loss.divider.speeds
     rasterizer = make_rasterizer("cpu" if dtype == torch.float32 else "reference", scene)
     survey = survey_views(scene, [camera], rasterizer)
     weighted = survey.uncovered_fraction > 0.01
@@ -130,14 +125,6 @@ def test_gradient_matches_one_rank(
         assert torch.equal(actual, results[0][0])
 
 
-def test_division_by_speed_preserves_the_gradient() -> None:
-    scene, camera = wall(), cameras(1, 128, 96)[0]
-    expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, None)
-    for actual, actual_loss, _ in on_ranks(3, gradient, scene, camera, torch.float64, None, (1.0, 0.3, 2.0)):
-        assert relative_error(actual, expected) < 1e-9
-        assert actual_loss == pytest.approx(loss, rel=1e-9)
-
-
 @pytest.mark.parametrize("style_loss", ["sos", "mixed"])
 def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> None:
     """Some of the three ranks have no pixel of a region, and one region is frozen."""
@@ -146,7 +133,7 @@ def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> No
     every = (Region("rest"), Region("a", style=other, weight=3.0, content_weight=50.0), Region("b", freeze=True))
     labels = (scene.means[:, 1] > 0.8).to(torch.uint8) + 2 * (scene.means[:, 0] > 1).to(torch.uint8)
     regions = Regions(every, labels.clamp(max=2))
-    arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss, regions
+    arguments = scene, camera, torch.float64, 48, 1 << 34, style_loss, regions
     expected, loss, _ = gradient(ALONE, *arguments)
     for actual, actual_loss, _ in on_ranks(3, gradient, *arguments):
         assert relative_error(actual, expected) < 1e-9
@@ -166,7 +153,7 @@ def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> No
 def test_gradient_of_some_scales_matches_one_rank(
     scales: tuple[int, ...] | None, coarsest: int, scale_weights: ScaleWeights, scene: Scene
 ) -> None:
-    arguments = scene, cameras(1, 157, 131)[0], torch.float64, None, None, 1 << 34
+    arguments = scene, cameras(1, 157, 131)[0], torch.float64, None, 1 << 34
     some = functools.partial(gradient, scales=scales, coarsest=coarsest, scale_weights=scale_weights)
     expected, loss, _ = some(ALONE, *arguments)
     for actual, actual_loss, _ in on_ranks(3, some, *arguments):
@@ -178,7 +165,7 @@ def test_partly_cached_activations_preserve_the_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
     expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, 48)
     memory = int(20_000 * FeatureNetwork(tiny_weights(), dtype=torch.float64).held_bytes_per_pixel())
-    results = on_ranks(2, gradient, scene, camera, torch.float64, 48, None, memory)
+    results = on_ranks(2, gradient, scene, camera, torch.float64, 48, memory)
     assert {flag for result in results for flag in result[2]} == {True, False}
     for actual, actual_loss, _ in results:
         assert relative_error(actual, expected) < 1e-9
@@ -189,7 +176,7 @@ def test_partly_cached_activations_preserve_the_gradient() -> None:
 def test_gradient_of_matched_features_matches_one_rank(style_loss: StyleLossName) -> None:
     """One of the three ranks has almost no features to match."""
     scene, camera = ball(), cameras(1, 128, 96)[0]
-    arguments = scene, camera, torch.float64, 48, None, 1 << 34, style_loss
+    arguments = scene, camera, torch.float64, 48, 1 << 34, style_loss
     expected, loss, _ = gradient(ALONE, *arguments)
     for actual, actual_loss, _ in on_ranks(3, gradient, *arguments):
         assert relative_error(actual, expected) < 1e-9
@@ -200,7 +187,7 @@ def stylize(
     collectives: Collectives, scene: Scene, views: int, values: dict[str, Any], image: Tensor | None = None
 ) -> dict[str, Any]:
     """Run a whole job, by default in `style()`."""
-    settings = make_settings("standard", **{"coarsest_side": 40, "rebalance": False, **values})
+    settings = make_settings("standard", **{"coarsest_side": 40, **values})
     image = style() if image is None else image
     stylizer = Stylizer.planned(scene, cameras(views), image, settings, weights=tiny_weights(), collectives=collectives)
     stopped = run(stylizer)
@@ -221,7 +208,7 @@ def stylize(
 @pytest.mark.slow
 def test_fifty_steps_match_one_rank_and_are_reproducible(scene: Scene) -> None:
     """The learning rate is small: twice as large, fifty steps amplify rounding errors by 1e4 on some processors."""
-    values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "rebalance": False, "learning_rate": 0.005}
+    values = {"steps_coarse": 15, "steps_sos": 35, "early_stop": False, "learning_rate": 0.005}
     alone = stylize(ALONE, scene, 3, values)
     first, second = on_ranks(2, stylize, scene, 3, values)
     assert torch.equal(first["colors"], second["colors"])
@@ -252,7 +239,7 @@ def stylize_each(collectives: Collectives) -> list[dict[str, Any]]:
     results = []
     for count in VIEWS_PER_STEP:
         own: dict[str, Any] = {"steps_coarse": 1, "steps_sos": 1, "learning_rate": 0.01, "views_per_step": count}
-        settings = make_settings("standard", coarsest_side=40, rebalance=False, early_stop=False, **own)
+        settings = make_settings("standard", coarsest_side=40, early_stop=False, **own)
         inputs, weights = (wall(), cameras(8), Style.of(style().double()), settings), tiny_weights()
         job = plan_job(*inputs, weights=weights, collectives=collectives)
         stylizer = Stylizer(job)
@@ -335,28 +322,12 @@ def test_gradients_of_views_in_a_step_are_averaged() -> None:
     assert relative_error(stylizer.sh_dc.grad, mean_gradient_by_hand(views)) < 1e-6
 
 
-def planned_views(collectives: Collectives, views: int, groups: int) -> tuple[int, float]:
-    settings = make_settings(steps_coarse=2, steps_sos=2, coarsest_side=24, views_per_step=groups, rebalance=False)
-    job = plan_job(wall(), cameras(views), Style.of(style()), settings, weights=tiny_weights(), collectives=collectives)
-    record = Stylizer(job).run_step()
-    return job.team.groups, record.loss
-
-
-def test_views_that_groups_cannot_share_evenly_are_tried() -> None:
-    """All groups visit equally many views in the trial, or they would wait for each other in vain."""
-    (groups, loss), other = on_ranks(2, planned_views, 3, 2, timeout=20.0)
-    assert groups == 2
-    assert other == (groups, loss)
-
-
 def planned_in_groups(collectives: Collectives) -> dict[str, Any]:
-    """Plan a job whose steps are not given, with a threshold that makes the choice independent of times."""
+    """Plan a job of small views whose steps are not given, and plan it again as after the loss of a rank."""
     inputs = wall(), cameras(4), Style.of(style())
     settings = make_settings(coarsest_side=24, measure=0)
-    with mock.patch.object(choices, "_LEAST_GROUP_GAIN", -100.0):
-        job = plan_job(*inputs, settings, weights=tiny_weights(), collectives=collectives)
-    settings = settings.model_copy(update={"rebalance": False})
-    resumed = plan_job(*inputs, settings, weights=tiny_weights(), collectives=collectives, groups=job.plan.groups)
+    job = plan_job(*inputs, settings, weights=tiny_weights(), collectives=collectives)
+    resumed = plan_job(*inputs, settings, weights=tiny_weights(), groups=job.plan.groups)
     stylizer = Stylizer(job)
     losses = [stylizer.run_step().loss for _ in range(2)]
     shape = job.plan.groups, job.team.groups, job.settings.views_per_step, job.total_steps
@@ -374,45 +345,3 @@ def test_plan_gives_each_rank_a_view_of_its_own() -> None:
     settings = make_settings(**values, learning_rate=0.2, learning_rate_end=0.02)
     alone = Stylizer.planned(wall(), cameras(4), style(), settings, weights=tiny_weights())
     assert [alone.run_step().loss for _ in range(2)] == pytest.approx(first["losses"], rel=1e-4)
-
-
-def run_with_a_slow_rank(collectives: Collectives, rebalance: bool) -> dict[str, Any]:
-    scene, views = wall(), cameras(2, 192, 144)
-    settings, weights = make_settings("standard", steps_coarse=0, steps_sos=20, rebalance=False), tiny_weights()
-    plan = plan_job(scene, views, Style.of(style()), settings, weights=weights, collectives=collectives).plan
-    settings = settings.model_copy(update={"rebalance": rebalance})
-    job = prepare_job(plan, scene, views, Style.of(style()), settings, weights=weights, collectives=collectives)
-    stylizer = Stylizer(job)
-    forward = stylizer.job.network.forward
-
-    def slowly(rgb: Tensor, **options: Any) -> Any:
-        started = time.perf_counter()
-        result = forward(rgb, **options)
-        time.sleep(12 * (time.perf_counter() - started))
-        return result
-
-    if collectives.rank == 1:
-        stylizer.job.network.forward = slowly  # type: ignore[method-assign]
-    before = stylizer.gradient(0, [0])[0]
-    colors = stylizer.sh_dc.detach().clone()
-    for _ in range(8):
-        stylizer.run_step()
-    speeds = stylizer.job.loss.divider.speeds
-    with torch.no_grad():
-        stylizer.sh_dc.copy_(colors)
-    return {"speeds": speeds, "before": before, "after": stylizer.gradient(0, [0])[0]}
-
-
-def test_slow_rank_gets_less_work_and_gradient_is_unchanged() -> None:
-    first, second = on_ranks(2, run_with_a_slow_rank, True)
-    assert first["speeds"] == second["speeds"]
-    assert first["speeds"][0] > 1.3 * first["speeds"][1]
-    assert relative_error(first["after"], first["before"]) < 1e-5
-    assert torch.equal(first["after"], second["after"])
-
-
-@pytest.mark.slow
-def test_work_is_not_redistributed_without_rebalance() -> None:
-    first, _ = on_ranks(2, run_with_a_slow_rank, False)
-    assert first["speeds"] == (1.0, 1.0)
-    assert torch.equal(first["after"], first["before"])

@@ -18,7 +18,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.errors import SceneError
 from sgsst_core.files.photos import Photo
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.plan import Prediction
+from sgsst_core.planning.facts import Machine
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import Lens
 from worker.capture import Capture
@@ -40,7 +40,7 @@ VALUES = [
     {3: "three", "4": 4, (5, 6): {"tuple": [1]}},
     Path("inputs/scene.ply"),
     LossTerms(gram=1 / 3, content=2.0),
-    Decision("ranks", "2", "measured", seconds=0.1),
+    Decision("ranks", "2", "measured", bytes=3),
     Outputs(Path("out/s.ply")),
     Capture(
         [],
@@ -51,7 +51,7 @@ VALUES = [
         (Decision("axes", "rub", "seen"),),
     ),
     Lens.of("OPENCV", (0.1, -0.02), (640, 480), (500.0, 500.0, 320.0, 240.0)),
-    Prediction(1.0, 2.0, 3),
+    Machine("cpu", 3, problems={"triton": "no GPU"}),
 ]
 
 

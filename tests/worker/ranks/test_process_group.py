@@ -18,7 +18,7 @@ from torch import Tensor
 from sgsst_core.errors import RanksDriftedError, SceneError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
-from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut, same_on_all
+from sgsst_core.parallel.collectives import ALONE, Collectives, same_on_all
 from sgsst_core.parallel.division import ImageExchange
 from sgsst_core.progress import Progress
 from sgsst_core.settings import make_settings
@@ -168,23 +168,23 @@ def merge_empty(collectives: Collectives) -> LayerStatistics:
     return collectives.all_reduce_statistics([LayerStatistics.zero(4)], numbers(0.0))[0][0]
 
 
-def values(collectives: Collectives, count: int, groups: int) -> dict[str, Any]:
-    formed = collectives.form_groups(count, groups)
+def values(collectives: Collectives, groups: int) -> dict[str, Any]:
+    group = collectives.split_group(groups)
     return {
         "all_gather": collectives.all_gather(collectives.rank),
         "broadcast": collectives.broadcast(lambda: f"made by {collectives.rank}"),
         "same": same_on_all(collectives, 5),
         "different": same_on_all(collectives, collectives.rank),
-        "formed": formed and [(each.rank, each.size, each.all_gather(collectives.rank)) for each in formed],
+        "group": (group.rank, group.size, group.all_gather(collectives.rank)),
         "all_reduce": float(collectives.all_reduce(torch.tensor([float(collectives.rank)]))),
         "local": collectives.local_size,
     }
 
 
-@pytest.mark.parametrize(("count", "groups"), [(4, 1), (4, 2), (4, 4), (3, 3), (2, 1), (2, 2), (1, 1)])
-def test_collectives_and_groups_follow_their_definitions(count: int, groups: int) -> None:
-    each = count // groups
-    for rank, result in enumerate(on_ranks(4, values, count, groups)):
+@pytest.mark.parametrize("groups", [1, 2, 4])
+def test_collectives_and_groups_follow_their_definitions(groups: int) -> None:
+    each = 4 // groups
+    for rank, result in enumerate(on_ranks(4, values, groups)):
         assert result["all_gather"] == [0, 1, 2, 3]
         assert result["broadcast"] == "made by 0"
         assert result["same"]
@@ -192,8 +192,7 @@ def test_collectives_and_groups_follow_their_definitions(count: int, groups: int
         assert result["all_reduce"] == 6.0
         assert result["local"] == 4
         first = rank - rank % each
-        own = (rank % each, each, list(range(first, first + each)))
-        assert result["formed"] == ([(rank, count, list(range(count))), own] if rank < count else None)
+        assert result["group"] == (rank % each, each, list(range(first, first + each)))
 
 
 def wait_for_first(collectives: Collectives, seen: Path) -> bool:
@@ -215,7 +214,7 @@ def test_wait_for_another_rank_is_visible(tmp_path: Path) -> None:
     assert on_ranks(2, wait_for_first, tmp_path / "seen") == [False, False]
 
 
-def rank_handle(waiting: float, stage: str | None = None, kind: Literal["left-out"] | None = None) -> RankHandle:
+def rank_handle(waiting: float, stage: str | None = None, kind: Literal["failed"] | None = None) -> RankHandle:
     status = RankStatus(
         waiting=waiting, progress=Progress(stage=stage) if stage else None, outcome=kind and Outcome(kind)
     )
@@ -231,13 +230,13 @@ def rank_handle(waiting: float, stage: str | None = None, kind: Literal["left-ou
             "Worker 0. Still at work: Worker 1 (reading), Worker 2 (planning).",
         ),
         (
-            [rank_handle(LONG_WAIT + 1), rank_handle(0.0, kind="left-out"), rank_handle(LONG_WAIT + 9)],
+            [rank_handle(LONG_WAIT + 1), rank_handle(0.0, kind="failed"), rank_handle(LONG_WAIT + 9)],
             "Worker 0, Worker 2. All wait for each other's messages: check the network between their machines.",
         ),
     ],
 )
 def test_long_wait_names_the_late_ranks(handles: list[RankHandle], said: str | None) -> None:
-    line = long_wait(RankGroup(lambda rank: None, handles))
+    line = long_wait(RankGroup(handles))
     assert line == (said and f"Waiting for more than 60 s: {said}")
 
 
@@ -256,7 +255,7 @@ def test_error_of_first_rank_is_raised_on_all_ranks() -> None:
 
 
 def drift(collectives: Collectives) -> str:
-    settings = make_settings("standard", steps_coarse=0, steps_sos=60, rebalance=False, early_stop=False)
+    settings = make_settings("standard", steps_coarse=0, steps_sos=60, early_stop=False)
     stylizer = Stylizer.planned(wall(), cameras(1), style(), settings, weights=tiny_weights(), collectives=collectives)
     if collectives.rank == 1:
         stylizer.sh_dc.data[::3] += 1e-6
@@ -271,29 +270,6 @@ def drift(collectives: Collectives) -> str:
 def test_drifting_ranks_are_detected() -> None:
     for message in on_ranks(2, drift):
         assert message.startswith("Step 50: the ranks' colors are no longer the same.")
-
-
-def leave_out(collectives: Collectives) -> str | int:
-    settings = make_settings("standard", steps_coarse=0, steps_sos=4)
-    try:
-        stylizer = Stylizer.planned(
-            wall(), cameras(1, 32, 24), style(), settings, weights=tiny_weights(), collectives=collectives
-        )
-    except RankLeftOut:
-        return "left out"
-    decision = next(decision for decision in stylizer.job.plan.decisions if decision.item == "ranks")
-    assert "only add communication" in decision.reason
-    for _ in range(3):
-        stylizer.run_step()
-    return stylizer.job.collectives.size
-
-
-def test_ranks_that_only_add_communication_are_excluded() -> None:
-    """In a view of 32 x 24 pixels, all tiles consist of halo only."""
-    results = on_ranks(4, leave_out)
-    taking_part = [result for result in results if result != "left out"]
-    assert len(taking_part) < 4
-    assert taking_part == [len(taking_part)] * len(taking_part)
 
 
 def test_single_rank_collectives_return_their_input() -> None:

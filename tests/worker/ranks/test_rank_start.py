@@ -11,7 +11,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from sgsst_core.planning.context import make_network
+from sgsst_core.planning.facts import make_network
 from sgsst_core.settings import make_settings
 from tests.networks import tiny_weights
 from worker.ranks.process_group import with_index

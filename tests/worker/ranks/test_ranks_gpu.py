@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("vgg16_weights")]
 def gradient(collectives: Collectives, name: str) -> Tensor:
     """Compute the color gradient [N, 3] of one view at two scales, on the devices that a job would use."""
     scene = wall(sh_degree=1) if name == "wall" else ball()
-    settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=120, rebalance=False)
+    settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=120)
     stylizer = Stylizer.planned(
         scene, cameras(1, 320, 240), style(), settings, weights=load_network_weights("vgg16"), collectives=collectives
     )

@@ -146,7 +146,7 @@ def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
     collectives.reduce_parts([exchange], [torch.zeros(*own.shape, 3)])
     collectives.all_reduce(torch.zeros(1000, 3))
     collectives.union(torch.zeros(300, dtype=torch.bool))
-    _, pair = collectives.form_groups(collectives.size, collectives.size // 2) or (None, ALONE)
+    pair = collectives.split_group(collectives.size // 2)
     pair.all_reduce(torch.zeros(500), "statistics")
     return dict(collectives.sent)
 
@@ -165,7 +165,7 @@ def test_one_rank_sends_nothing() -> None:
 
 
 def run_two_steps(collectives: Collectives) -> dict[str, Any]:
-    own = {"coarsest_side": 40, "rebalance": False, "scale_sampling": 1}
+    own = {"coarsest_side": 40, "scale_sampling": 1}
     settings = make_settings("standard", steps_coarse=0, steps_sos=4, **own)
     camera = cameras(1, WIDTH, HEIGHT)
     stylizer = Stylizer.planned(wall(), camera, style(), settings, weights=tiny_weights(), collectives=collectives)
@@ -184,7 +184,7 @@ def test_step_record_has_sent_bytes() -> None:
     for result in on_ranks(2, run_two_steps):
         sizes = [(HEIGHT >> scale, WIDTH >> scale) for scale in range(result["scales"])]
         pieces = tuple(Piece(scale, size, Rectangle(0, 0, *size)) for scale, size in enumerate(sizes))
-        by_rank = divide(pieces, halo, (1.0, 1.0))
+        by_rank = divide(pieces, halo, 2)
         exchanges = Shares.of((HEIGHT, WIDTH), by_rank, halo).exchanges(by_rank, halo)
         assert [*exchanges] == [*range(1, result["scales"])]
         assert result["steps"][1] == {
