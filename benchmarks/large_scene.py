@@ -25,13 +25,12 @@ from scipy.spatial import cKDTree
 
 from benchmarks.machine import write_result
 from benchmarks.rasterizer import DATA, timed
-from sgsst_core.bench.synthetic import surface_scene
+from sgsst_core.bench.synthetic import surface_scene, texture
 from sgsst_core.budget import peak_memory
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import orbit
-from sgsst_core.planning.context import soft_image
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.tile_intersections import build_tile_intersections, intersections_of_subset
@@ -148,7 +147,7 @@ def measure_unseen(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
 def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """Time a job by part, from a loaded scene to the end of the first step, with network weights installed."""
     settings = make_settings(max_resolution=_RESOLUTION)
-    timer, weights, style = Timer(), load_network_weights("auto"), Style.of(soft_image(512))
+    timer, weights, style = Timer(), load_network_weights("auto"), Style.of(texture(512, 512))
     job = plan_job(scene, cameras, style, settings, weights=weights, timer=timer)
     with timer("preparing"):
         stylizer = Stylizer(job)

@@ -1,11 +1,11 @@
 """Savings in time and memory from each component that a plan leaves out because the scene does not need it.
 
-python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 684] [--views 3] [--rounds 3]
+python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 320] [--views 4] [--rounds 3]
 
-CAMERAS is a camera file, or orbit:N. Each configuration runs in a separate process, so that it has its own memory peak.
-The first configuration leaves out all components that the scene does not need; each of the next ones keeps one of them;
-the last one keeps all. Measured values are seconds per iteration and peak memory, printed beside the plan's
-predictions.
+CAMERAS is a camera file, or orbit:N. The first configuration leaves out all components that the scene does not need;
+each of the next ones keeps one of them; the last one keeps all. Every configuration runs in a process of its own, so
+that it has its own memory peak, and all of them run once in each round, so that a change of the machine's speed meets
+all alike. Medians over the rounds are stored with their range.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import argparse
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,7 +41,9 @@ from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.planner import plan_job
 
 #: Components that can be left out without changing the result.
-EVERYTHING = ("unseen", "uncovered", "activations", "content", "blend-weights")
+EVERYTHING = ("unseen", "uncovered", "activations", "content")
+#: Steps of a whole job.
+STEPS = 24
 
 
 def main() -> None:
@@ -49,9 +51,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE.ply:CAMERAS")
     parser.add_argument("--style", type=Path, required=True)
-    parser.add_argument("--resolution", type=int, default=684)
-    parser.add_argument("--views", type=int, default=3)
-    parser.add_argument("--rounds", type=int, default=3, help="the first one prepares the views and does not count")
+    parser.add_argument("--resolution", type=int, default=320)
+    parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--rounds", type=int, default=3, help="processes of each configuration")
     parser.add_argument("--keep", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.keep is not None:
@@ -60,8 +62,10 @@ def main() -> None:
     results = {}
     for text in arguments.scenes:
         name = text.partition("=")[0]
-        measured = {label: _in_a_process(text, cached) for label, cached in _configurations()}
-        results[name] = _savings(measured)
+        rounds: list[dict[str, dict[str, float]]] = [
+            {label: _in_a_process(text, added) for label, added in _configurations()} for _ in range(arguments.rounds)
+        ]
+        results[name] = {label: _summary(label, rounds) for label, _ in _configurations()}
         _print(name, results[name])
     write_result("left_out", {"style": arguments.style.name, "resolution": arguments.resolution, "scenes": results})
 
@@ -75,8 +79,6 @@ def with_components(
     weights: BackboneWeights | None = None,
 ) -> Stylizer:
     """Return the stylizer of a job that computes some of `EVERYTHING` although it does not need to."""
-    if "blend-weights" in added:
-        settings = settings.model_copy(update={"cached_weights": "none"})
     job = plan_job(scene, cameras, style, settings, weights=weights)
     plan = job.plan
     if "unseen" in added:
@@ -114,59 +116,52 @@ def _configurations() -> list[tuple[str, Sequence[str]]]:
     return [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
 
 
-def _in_a_process(scene: str, cached: Sequence[str]) -> dict[str, Any]:
+def _in_a_process(scene: str, added: Sequence[str]) -> dict[str, float]:
     options = [argument for argument in sys.argv[1:] if "=" not in argument or argument.startswith("--")]
-    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", ",".join(cached)]
+    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", ",".join(added)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    return dict(json.loads(done.stdout.splitlines()[-1]))
+    return dict[str, float](json.loads(done.stdout.splitlines()[-1]))
 
 
-def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return seconds per iteration and peak memory of a job that keeps the components of `--keep`."""
+def _measure(arguments: argparse.Namespace) -> dict[str, float]:
+    """Return the seconds of a step and of a whole job, and the peak memory, with the components of `--keep`."""
     ply, _, cameras = arguments.scenes[0].partition("=")[2].partition(":")
     scene = read_scene(Path(ply)).scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)
-    cached = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
-    settings = make_settings("standard", steps_sos=10_000, scale_sampling=1, early_stop=False)
-    stylizer = with_components(cached, scene, views, Style.of(load_image(arguments.style)), settings)
-    for _ in range(arguments.rounds * len(stylizer.job.views.covered)):
+    added = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
+    settings = make_settings("standard", steps_sos=STEPS, scale_sampling=1, early_stop=False)
+    style, started = Style.of(load_image(arguments.style)), time.perf_counter()
+    stylizer = with_components(added, scene, views, style, settings)
+    while stylizer.step < STEPS:
         stylizer.run_step()
-    steps = [sum(record.parts.values()) for record in stylizer.history[len(stylizer.job.views.covered) :]]
-    prediction = stylizer.job.plan.prediction
-    assert prediction is not None
+    stylizer.stylized()
+    later = stylizer.history[len(stylizer.job.views.covered) :]
     return {
-        "seconds": median(steps),
+        "step_seconds": median(sum(record.parts.values()) for record in later),
+        "job_seconds": time.perf_counter() - started,
         "peak_bytes": peak_memory(),
-        "predicted_seconds": prediction.seconds,
-        "predicted_peak_bytes": prediction.peak_bytes,
-        "loss": stylizer.history[0].loss,
+        "loss": stylizer.history[-1].loss,
     }
 
 
-def _savings(results: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    lean = results["lean"]
-    rows = {
-        label: {
-            **values,
-            "seconds_saved": values["seconds"] - lean["seconds"],
-            "bytes_saved": values["peak_bytes"] - lean["peak_bytes"],
-            "loss_change": values["loss"] / lean["loss"] - 1,
-        }
-        for label, values in results.items()
-    }
-    predicted = {
-        "seconds": lean["predicted_seconds"] / lean["seconds"],
-        "peak_bytes": lean["predicted_peak_bytes"] / lean["peak_bytes"],
-    }
-    return {"configurations": rows, "predicted_over_measured": predicted}
+def _summary(label: str, rounds: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
+    """Return median and range of each figure, and those of its difference from the lean configuration's."""
+    result = {}
+    for name in rounds[0][label]:
+        own = [each[label][name] for each in rounds]
+        more = [each[label][name] - each["lean"][name] for each in rounds]
+        result[name] = {"median": median(own), "least": min(own), "most": max(own)}
+        result[name] |= {"more": median(more), "more_least": min(more), "more_most": max(more)}
+    return result
 
 
-def _print(name: str, result: dict[str, Any]) -> None:
-    print(f"{name}: predicted / measured {result['predicted_over_measured']}")
-    for label, row in result["configurations"].items():
-        seconds = f"{row['seconds']:.2f} s ({row['seconds_saved']:+.2f})"
-        memory = f"{row['peak_bytes'] / 1e9:.2f} GB ({row['bytes_saved'] / 1e9:+.2f})"
-        print(f"  {label:<16}{seconds:<20}{memory:<20} first loss {row['loss_change']:+.1e}", flush=True)
+def _print(name: str, rows: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
+    print(name)
+    for label, row in rows.items():
+        texts = [f"{row[key]['median']:.3g} s ({row[key]['more']:+.2g})" for key in ("step_seconds", "job_seconds")]
+        texts.append(f"{row['peak_bytes']['median'] / 1e9:.2f} GB ({row['peak_bytes']['more'] / 1e9:+.2f})")
+        texts.append(f"loss {row['loss']['more']:+.1e}")
+        print(f"  {label:<14}" + "".join(f"{text:<22}" for text in texts), flush=True)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ class Decision:
     """One line of a plan.
 
     Attributes:
-        seconds: Estimated seconds saved per iteration; None if unknown.
         bytes: Memory saved in bytes; None if unknown.
         error: Possible cost in accuracy; "none" if results change only by rounding.
     """
@@ -24,7 +23,6 @@ class Decision:
     item: str
     decision: str
     reason: str
-    seconds: float | None = None
     bytes: int | None = None
     error: str = "none"
 

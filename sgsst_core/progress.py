@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sgsst_core.number_format import time_left
 
 #: What a step of a stage stands for, if it is not a step of the optimization.
-_UNITS = {"planning": "view", "refining": "view", "probing": "view", "video": "frame"}
+_UNITS = {"planning": "view", "refining": "view", "video": "frame"}
 
 
 def _fraction(known: dict[str, Any]) -> float:
@@ -46,13 +46,11 @@ class Progress(BaseModel):
     )
 
     stage: str = Field(
-        description="`reading`, `planning` (surveying the views), `refining` (choosing Gaussians to split), `probing` "
-        "(measuring the speed of this machine), `starting`, `coarse` (coarsest scale), `sos` (all scales), `measuring` "
+        description="`reading`, `planning` (surveying the views), `refining` (choosing Gaussians to split), "
+        "`starting`, `coarse` (coarsest scale), `sos` (all scales), `measuring` "
         "(checking the quality of some views) or `video` (frames of the video)."
     )
-    step: int = Field(
-        0, description="Completed steps; views while `planning`, `refining` or `probing`; frames while `video`."
-    )
+    step: int = Field(0, description="Completed steps; views while `planning` or `refining`; frames while `video`.")
     total: int = Field(0, description="Maximum number of steps or views; 0 while unknown.")
     fraction: float = Field(default_factory=_fraction, description="Completed fraction of the steps or views, 0 to 1.")
     eta_s: float | None = Field(

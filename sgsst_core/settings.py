@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from annotated_types import Ge, Le
 from pydantic import (
@@ -328,15 +328,10 @@ class Settings(BaseModel):
         description="Average the gradients of V views in each step; groups of workers evaluate them in parallel. "
         "Unless this or the steps are given, each of several workers may get a view of its own, in fewer steps.",
     )
-    rebalance: bool = Field(
-        True,
-        description="Leave out workers that save hardly any time, and give slower workers less work, once. Without it, "
-        "all workers take part, and runs on the same number of workers are bit-identical.",
-    )
-    measure: Annotated[Fraction, Option(unit="fraction of the steps' time", metavar="S")] = Field(
-        0.1,
-        description="Measure novel views, which lie between the cameras, for S of the steps' predicted time, "
-        "or, in short jobs, for half of it, at most 30 s; 0 measures no novel views.",
+    measure: Annotated[Fraction, Option(unit="fraction of the steps' passes", metavar="S")] = Field(
+        0.05,
+        description="Measure novel views, which lie between the cameras, before and after the steps, as far as all "
+        "measurements take at most S as many passes as the steps; 0 measures none.",
     )
 
     @property
@@ -347,6 +342,17 @@ class Settings(BaseModel):
     def learning_rate_at(self, fraction: float) -> float:
         """Return Adam's learning rate after a fraction (0..1) of all steps."""
         return float(self.learning_rate * (self.learning_rate_end / self.learning_rate) ** fraction)
+
+    def with_steps(self, coarse: int, sos: int) -> Self:
+        """Return the settings with other numbers of steps, whose learning rate falls from step to step as before.
+
+        An end of the learning rate that was given remains.
+        """
+        before, steps = self.steps_coarse + self.steps_sos, coarse + sos
+        changed: dict[str, object] = {"steps_coarse": coarse, "steps_sos": sos}
+        if "learning_rate_end" not in self.fixed and before > 1:
+            changed["learning_rate_end"] = self.learning_rate_at(max(steps - 1, 0) / (before - 1))
+        return self.model_copy(update=changed)
 
 
 #: `paper` is the published schedule. The other presets reach a given loss sooner, with larger, decaying steps. Such
@@ -413,10 +419,11 @@ def make_settings(preset: PresetName = "standard", **values: Any) -> Settings:
     chosen.setdefault("fixed", tuple(name for name in _CHOSEN if name in chosen))
     whole = _PRESETS[preset]
     settings = checked(Settings, {"preset": preset, **whole, **chosen})
-    fraction = (settings.steps_coarse + settings.steps_sos) / (whole["steps_coarse"] + whole["steps_sos"])
-    if fraction >= 1 or "learning_rate_end" in chosen:
+    coarse, sos = settings.steps_coarse, settings.steps_sos
+    if coarse + sos >= whole["steps_coarse"] + whole["steps_sos"] or "learning_rate_end" in chosen:
         return settings
-    return settings.model_copy(update={"learning_rate_end": settings.learning_rate_at(fraction)})
+    of_preset = {"steps_coarse": whole["steps_coarse"], "steps_sos": whole["steps_sos"]}
+    return settings.model_copy(update=of_preset).with_steps(coarse, sos)
 
 
 def checked(model: type[M], values: Mapping[str, object]) -> M:

@@ -101,6 +101,20 @@ class Timer:
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
 
+def seconds_left(within: float | None, started: float | None = None) -> Callable[[], float] | None:
+    """Return a function that returns the seconds left of a time budget; None without a budget.
+
+    Args:
+        within: Time budget in seconds.
+        started: Start of the budget, in seconds since the epoch; None for now.
+    """
+    if within is None:
+        return None
+    # The system's clock may be set while the job runs.
+    end = time.monotonic() + within - (0.0 if started is None else time.time() - started)
+    return lambda: end - time.monotonic()
+
+
 def wait_for(device: torch.device) -> None:
     """Wait until a device has finished its queued work."""
     if device.type == "cuda":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +27,16 @@ from tests.pretend_cuda.counts import Counts
 
 if os.environ.get("TRITON_INTERPRET") == "1" and importlib.util.find_spec("triton"):
     triton_interpreter.prepare()
+
+
+#: Start of this process in monotonic seconds, and seconds after which no slow test starts.
+STARTED, LIMIT = time.monotonic(), float(os.environ.get("SGSST_TEST_SECONDS", "inf"))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip slow tests that come too late on a slow machine, where a run has a limit (`.ci/run`)."""
+    if time.monotonic() - STARTED > LIMIT and item.get_closest_marker("slow"):
+        pytest.skip(f"the {LIMIT:.0f} s of this run are over (SGSST_TEST_SECONDS)")
 
 
 def pytest_make_parametrize_id(val: object) -> str | None:

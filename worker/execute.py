@@ -26,6 +26,7 @@ from sgsst_core.report.document import build_report, loss_over_time, plan_json, 
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
+from sgsst_core.stylizing.rates import estimate
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.job import CONTINUABLE, Result
 from worker.options import RunOptions
@@ -73,11 +74,11 @@ def execute(
         job.outputs.ply.parent.mkdir(parents=True, exist_ok=True)
         for path in job.outputs.all:
             remove_leftovers(path)  # of an attempt that was killed
-    stylizer.job.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.job.plan)))
+    stylizer.job.collectives.broadcast(lambda: write_json(job.outputs.plan, plan_json(stylizer.job)))
     if first:
         _write_views(job, listener.warn)
     checkpoint = _CheckpointWriter(job, run_id or secrets.token_hex(8), listener)
-    callbacks = Callbacks(measure=measure, checkpoint_seconds=checkpoint_seconds, left=left)
+    callbacks = Callbacks(checkpoint_seconds=checkpoint_seconds, left=left)
     if first:
         callbacks.progress, callbacks.stop, callbacks.finish = reported, listener.stop, listener.finish
         callbacks.checkpoint, callbacks.preview = checkpoint, preview
@@ -86,9 +87,8 @@ def execute(
             preview.live.share_scene(stylizer.job.scene)
     stopped = run(stylizer, callbacks)
     if first and stopped in ("on-request", "within", "target-loss", "converged"):
-        expected = stylizer.job.plan.prediction
-        remaining = measure.seconds_left(stylizer.step, ends=True) + (expected.ending if expected else 0.0)
-        reported.end_early(remaining)
+        expected = estimate(stylizer.job)
+        reported.end_early(expected.measuring + expected.ending)
     if stopped == "interrupted":
         if checkpoint.error is not None:
             raise checkpoint.error
@@ -188,8 +188,7 @@ def _finish(job: Job, stopped: Stopped, measure: Measurements, left: SecondsLeft
     compressed = stylizer.job.collectives.broadcast(lambda: _write_compressed(job))
     if first and stopped not in CONTINUABLE:
         outputs.checkpoints.remove()
-    needed = measure.seconds_left(stylizer.step, ends=True)
-    if stylizer.job.collectives.broadcast(lambda: stopped != "on-request" and (left is None or left() > needed)):
+    if stylizer.job.collectives.broadcast(lambda: stopped != "on-request" and (left is None or left() > 0)):
         measure.at_the_end()
     # The initial loss is evaluated here, because evaluating it before the first step would delay the job.
     before = measure.evaluate(unstylized=True)

@@ -18,13 +18,12 @@ from typing import Any
 import torch
 
 from sgsst_core import container
-from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.context import Networks, common_device, rasterizer_problem
+from sgsst_core.planning.facts import common_device, rasterizer_problem
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice
@@ -104,7 +103,6 @@ def prepare(
 
     Raises:
         InvalidInputError: If an input cannot be used. Every rank raises the same error.
-        RankLeftOut: If the plan does not use this rank.
     """
     started = time.perf_counter() - start
     timer = Timer()  # no CUDA synchronization needed: no GPU work is pending when a phase ends
@@ -123,10 +121,10 @@ def prepare(
     known: Checkpoint | _HandedOver | None = resumed
     if plan_file and not resumed:
         known = collectives.broadcast(lambda: _handed_over(plan_file, fingerprint, inputs, settings))
-    chosen, networks = known.plan.time_choice if known else None, Networks()
+    chosen = known.plan.time_choice if known else None
     if not known:
         with timer("planning"):
-            chosen = _choose(inputs, settings, left, weights, collectives, show_planning, networks)
+            chosen = _choose(inputs, settings, left, weights, collectives)
     asked, settings = settings, chosen.applied(settings) if chosen else settings
     inputs = inputs.chosen(chosen, settings) if chosen else inputs
     refinement, scene_file = known.plan.refinement if known else None, inputs.scene_file
@@ -146,8 +144,6 @@ def prepare(
         groups=resumed.plan.groups if resumed else None,
         show=show_planning,
         timer=timer,
-        left=None if known else left,
-        networks=networks,
     )
     with timer("preparing"):
         stylizer = Stylizer(stylization)
@@ -165,8 +161,8 @@ def dry_run(
     show: ShowPlanning | None = None,
     hand_over: Path | None = None,
     left: SecondsLeft | None = None,
-) -> Plan:
-    """Plan a job as `prepare` would on one rank.
+) -> StylizationJob:
+    """Plan a job as `prepare` would on one rank, and return it without its photos.
 
     Args:
         hand_over: Existing file to write the plan to, for `prepare`; None writes nothing.
@@ -177,18 +173,17 @@ def dry_run(
     """
     settings = request.settings
     weights = weights_for(load_network_weights(request.backbone), settings)
-    networks, of_job = Networks(), inputs
-    chosen = _choose(inputs, settings, left, weights, ALONE, show, networks)
+    of_job, chosen = inputs, _choose(inputs, settings, left, weights, ALONE)
     applied = chosen.applied(settings) if chosen else settings
     inputs = inputs.chosen(chosen, applied) if chosen else inputs
     refinement = _refine(inputs, applied, weights, ALONE, show)
     scene = refined(inputs.scene_file.scene, refinement)
-    plan = _planner(inputs, settings, weights, scene, refinement, chosen)(show=show, left=left, networks=networks).plan
+    job = _planner(inputs, settings, weights, scene, refinement, chosen)(show=show)
     if hand_over:
-        job = fingerprint_of(of_job, settings, weights.sha256, ALONE)
+        fingerprint = fingerprint_of(of_job, settings, weights.sha256, ALONE)
         with contextlib.suppress(OSError):  # a job without this file plans again
-            save_plan(hand_over, plan, job, _conditions(settings))
-    return plan
+            save_plan(hand_over, job.plan, fingerprint, _conditions(settings))
+    return job
 
 
 @dataclass(frozen=True)
@@ -206,21 +201,18 @@ class _HandedOver:
 def _handed_over(file: Path, fingerprint: str, inputs: Inputs, settings: Settings) -> _HandedOver | None:
     """Return the plan of a dry run of the same job; None if there is none.
 
-    The fingerprint covers the content of all inputs, and the settings that determine the course of the job. What a
-    plan measured holds for the same settings, machine, threads and versions alone, and if the memory that it predicts
-    is free now; otherwise, the job makes a trial of its own.
+    The fingerprint covers the content of all inputs, and the settings that determine the course of the job. A plan
+    holds for the same settings, machine and versions alone; otherwise, only its survey is used.
     """
     try:
         plan, conditions = load_plan(file, fingerprint, inputs.scene_file.scene, inputs.cameras)
     except CheckpointError:
         return None
-    limit = settings.memory_limit or default_memory_limit()
-    fits = plan.prediction is not None and plan.prediction.peak_bytes <= limit
-    return _HandedOver(plan, int(fits and conditions == _conditions(settings)))
+    return _HandedOver(plan, int(conditions == _conditions(settings)))
 
 
 def _conditions(settings: Settings) -> str:
-    """Return a text about everything besides the inputs that determines what a plan has measured."""
+    """Return a text about everything besides the inputs that a plan depends on."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     machine = (socket.gethostname(), *container.memory()[:1], container.cores(), torch.get_num_threads(), device)
     return json.dumps([settings.model_dump(mode="json"), versions(), machine])
@@ -232,14 +224,10 @@ def _choose(
     left: SecondsLeft | None,
     weights: BackboneWeights,
     collectives: Collectives,
-    show: ShowPlanning | None,
-    networks: Networks,
 ) -> TimeChoice | None:
     """Return the choice of the time budget; None without one."""
-    return left and choose_within(
-        inputs.scene_file.scene, inputs.cameras, inputs.style, settings, left, weights=weights,
-        collectives=collectives, regions=inputs.regions, show=show, networks=networks,
-    )  # fmt: skip
+    scene = inputs.scene_file.scene
+    return left and choose_within(scene, inputs.cameras, settings, left, weights=weights, collectives=collectives)
 
 
 def _planner(

@@ -12,7 +12,7 @@ from torch import Tensor
 from sgsst_core.files.images import save_jpg
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.files.stylized_ply import write_colors
-from sgsst_core.planning.measurement_choice import LOSS_VIEWS
+from sgsst_core.planning.choices import LOSS_VIEWS
 from sgsst_core.scene.camera import resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
@@ -110,7 +110,7 @@ def _shown_view(covered: Sequence[int]) -> int:
 
     It is the first of those on which the loss is evaluated, if there is time for all of these.
     """
-    return spread(covered, LOSS_VIEWS[0])[0]
+    return spread(covered, LOSS_VIEWS)[0]
 
 
 def _colors(stylizer: Stylizer) -> Tensor:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -33,7 +33,6 @@ from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
     from sgsst_core.files.scene_file import SceneFile
-    from sgsst_core.planning.plan import Plan
     from worker.video import VideoRequest
 
 #: Number of frames after which the time of a video is estimated.
@@ -60,26 +59,22 @@ def plan(
     request = inputs.request(options, out)
     with job_bar(error_console) as bar:
         plan = make_plan(request, bar.show, sheet, context.obj.started)
-    out_console.print(_decisions_table(plan))
-    if plan.prediction:
-        seconds, peak = plan.prediction.seconds, plan.prediction.peak_bytes / 1e9
-        coarse = f" ({duration(plan.prediction.seconds_coarse, ' ')} in phase 1)" if plan.steps_coarse else ""
-        on_device = plan.prediction.device_bytes
-        gpu = f" (GPU: {on_device / 1e9:.1f} GB)" if on_device is not None else ""
-        expected = f"{duration(seconds, ' ')} per step on all scales{coarse}, peak memory {peak:.1f} GB{gpu}"
-        out_console.print(f"Predicted: {expected}")
+    out_console.print(_decisions_table(plan["decisions"]))
+    expected = plan["prediction"]
+    gpu = f" (GPU: {expected['device_bytes'] / 1e9:.1f} GB)" if expected["device_bytes"] is not None else ""
+    whole = f"about {duration(expected['job'], ' ')} for all steps, {duration(expected['seconds'], ' ')} each"
+    out_console.print(f"Estimated: {whole}; memory at most {expected['peak_bytes'] / 1e9:.1f} GB{gpu}")
     if sheet is not None:
         print_field("views", sheet)
     print_field("plan", out)
 
 
-def _decisions_table(plan: Plan) -> Table:
+def _decisions_table(decisions: list[dict[str, Any]]) -> Table:
     table = Table(Column("item", no_wrap=True), "decision and reason", Column("saves", no_wrap=True), show_lines=True)
-    for item in plan.decisions:
-        saved = [f"{duration(item.seconds, ' ')} per step"] if item.seconds is not None else []
-        saved += [f"{item.bytes / 1e6:.1f} MB"] if item.bytes is not None else []
-        error = "" if item.error == "none" else f" Costs: {item.error}."
-        table.add_row(item.item, f"{item.decision}: {item.reason}.{error}", "\n".join(saved))
+    for each in decisions:
+        saved = "" if each["bytes"] is None else f"{each['bytes'] / 1e6:.1f} MB"
+        error = "" if each["error"] == "none" else f" Costs: {each['error']}."
+        table.add_row(each["item"], f"{each['decision']}: {each['reason']}.{error}", saved)
     return table
 
 

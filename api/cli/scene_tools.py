@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from api.cli.arguments import local_path
 from sgsst_core.decision import Decision, warnings_of
@@ -16,15 +17,14 @@ from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.atomic import ensure_writable_folder, write_json
 from sgsst_core.files.blending import normalized
 from sgsst_core.files.images import load_image, save_png
-from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning
-from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.timing import seconds_left
 from worker.derive import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
@@ -38,8 +38,8 @@ from worker.styles import split_weight
 
 def make_plan(
     request: JobSpec, show_planning: ShowPlanning | None = None, sheet: Path | None = None, started: float | None = None
-) -> Plan:
-    """Plan a job as `sgsst stylize` would, without making a step, and write the plan as JSON.
+) -> dict[str, Any]:
+    """Plan a job as `sgsst stylize` would, without making a step, and return the plan that is written as JSON.
 
     Args:
         request: Request whose `out` is the file of the plan.
@@ -67,9 +67,9 @@ def make_plan(
         sheet.parent.mkdir(parents=True, exist_ok=True)
         scene = inputs.scene_file.scene
         write_views(sheet, scene, inputs.cameras, background=settings.background, near=settings.near)
-    plan = dry_run(request, inputs, show_planning, left=left)
+    job = dry_run(request, inputs, show_planning, left=left)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(out, plan_json(plan))
+    write_json(out, plan := plan_json(job))
     return plan
 
 

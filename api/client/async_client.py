@@ -121,8 +121,7 @@ class AsyncClient:
         """Plan a job without queueing it, and return the plan. The other arguments are the same as for `submit`.
 
         Args:
-            planning: Callback that receives the number of completed views and of all, first of the survey and
-                then of the trial.
+            planning: Callback that receives the number of completed views of the survey, and of all.
         """
         files = _files(scene, style, cameras, photos, masks)
         return await uploads.plan_job(self._transport, files, parameters, progress=progress, planning=planning)

@@ -44,7 +44,7 @@ def _documented(model: type[BaseModel], description: str, progress: str, result:
 DRY_RUN = _documented(
     PlanView,
     "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: `planning`, the stage "
-    "(`planning`, `refining` or `probing`) and its number of completed views (`total` is 0 if it has none); finally "
+    "(`planning` or `refining`) and its number of completed views (`total` is 0 if it has none); finally "
     "`plan`, or a `problem` that occurred after the response started.",
     "planning",
     "plan",

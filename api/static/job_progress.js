@@ -6,7 +6,7 @@ import { words } from "./words.js";
 
 const say = words.job;
 /** Stages before the steps. */
-const PLANNING = new Set(["planning", "refining", "probing"]);
+const PLANNING = new Set(["planning", "refining"]);
 
 /** Describe how a job ended; empty if it made all steps and its loss fell. @param {any} result */
 export function outcomeOf(result) {

@@ -158,7 +158,7 @@ export const words = {
       feature_scale: "Layer weighting", style_loss: "Style comparison", position_weights: "Ignore empty background", precision: "Precision", training_background: "Background while painting",
       scales: "Scale weights", scale_sampling: "Fine details in one visit of", seed: "Random seed", memory_limit: "Memory limit", coarsest_side: "Smallest view size", warm_start: "Start from the painting's colors",
       clamp_aware_gradient: "Recover clamped colors", bounded: "Keep colors displayable", early_stop: "Stop when nothing changes", target_loss: "Stop at this loss", cached_weights: "Cached blend weights",
-      views_per_step: "Views per step", rebalance: "Balance the workers", measure: "Quality check", backbone: "Feature network", pad_sh: "PLY for Unity plugins", workers: "Workers",
+      views_per_step: "Views per step", measure: "Quality check", backbone: "Feature network", pad_sh: "PLY for Unity plugins", workers: "Workers",
     }),
     help: /** @type {Record<string, string>} */ ({
       content_weight: "The strength as a number: lower values give more style, higher ones keep more of the original.",
@@ -188,7 +188,7 @@ export const words = {
   },
   job: {
     stages: /** @type {Record<string, string>} */ ({
-      reading: "Reading the files", planning: "Analyzing views", refining: "Choosing Gaussians to split", probing: "Measuring the speed", starting: "Starting to paint", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality", video: "Rendering the video",
+      reading: "Reading the files", planning: "Analyzing views", refining: "Choosing Gaussians to split", starting: "Starting to paint", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality", video: "Rendering the video",
     }),
     unnamed: "Unnamed job", rename: "Rename", newName: "New name", save: "Save", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`, frame: (/** @type {number} */ n, /** @type {number} */ all) => `frame ${count(n)} of ${count(all)}`,
     starts: (/** @type {number} */ s) => (s < 10 ? "starts soon" : `starts in about ${seconds(s)}`),

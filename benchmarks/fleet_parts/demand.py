@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-from sgsst_core.planning.choices import LEAST_GAIN
 from sgsst_core.settings import PresetName, make_settings
 
+#: Least fraction of a step's time that another GPU must save.
+_LEAST_GAIN = 0.03
 #: Bytes of a Gaussian with SH of degree 3 in a PLY file.
 GAUSSIAN_BYTES = 248
 #: Overhead before a job's first step: seconds to start the process, CUDA and the network; download rate from the file
@@ -153,7 +154,7 @@ class SimulatedJob:
         if self.parameters.get("workers"):
             return offered
         seconds = [self.seconds(gpus) for gpus in range(1, offered + 1)]
-        return next(gpus for gpus, each in enumerate(seconds, 1) if each <= min(seconds) * (1 + LEAST_GAIN))
+        return next(gpus for gpus, each in enumerate(seconds, 1) if each <= min(seconds) * (1 + _LEAST_GAIN))
 
 
 @cache

@@ -13,6 +13,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PlannedPrecision, make_settings
 from sgsst_core.stylizing.loop import Callbacks
 from sgsst_core.stylizing.loop import run as run_steps
+from sgsst_core.stylizing.rates import estimate
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Warm-up steps, in which views are prepared and libraries choose their algorithms.
@@ -59,7 +60,7 @@ def _measure(
     records = stylizer.history[-sizes.step_repeats :]
     names = {name for record in records for name in record.parts}
     parts = {name: statistics.median(record.parts.get(name, 0.0) for record in records) for name in sorted(names)}
-    prediction = stylizer.job.plan.prediction
+    plan, expected = stylizer.job.plan, estimate(stylizer.job)
     findings.add(f"{place}/gaussians", len(scene))
     findings.add(f"{place}/rasterizer", stylizer.job.plan.rasterizer)
     findings.add(f"{place}/precision", stylizer.job.plan.precision)
@@ -70,9 +71,9 @@ def _measure(
         milliseconds, kernels = kernel_times(stylizer.run_step)
         findings.add(f"{place}/milliseconds_of_kernels", milliseconds)
         findings.add(f"{place}/kernels", kernels)
-    findings.add(f"{place}/planned_seconds", prediction.seconds if prediction else None)
+    findings.add(f"{place}/planned_seconds", expected.seconds)
     findings.add(f"{place}/device_allocated_bytes", peak_bytes(device()))
     findings.add(f"{place}/device_reserved_bytes", reserved_bytes(device()))
-    findings.add(f"{place}/planned_device_bytes", prediction.device_bytes if prediction else None)
+    findings.add(f"{place}/planned_device_bytes", plan.device_bytes)
     findings.add(f"{place}/process_peak_bytes", peak_memory())
-    findings.add(f"{place}/planned_process_bytes", prediction.peak_bytes if prediction else None)
+    findings.add(f"{place}/planned_process_bytes", plan.peak_bytes)

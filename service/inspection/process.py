@@ -49,13 +49,14 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.choice import find_upright_subject
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.capture_checks import OTHER_FRAME
-from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.progress import Progress
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import versions
+from sgsst_core.stylizing.rates import estimate
+from sgsst_core.timing import seconds_left
 from worker.capture import choose_axes, orbit_request
 from worker.derive import blend, convert
 from worker.exported_page import write_page
@@ -173,28 +174,21 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
     send({"checked": findings})
     to_write = request.output and request.output_file
     left = seconds_left(settings.within, time.time() - _seconds_to_start() - (time.perf_counter() - started))
-    job_plan = dry_run(spec, inputs, lambda now: _show(now, send), to_write, left)
-    if job_plan.time_choice:
-        settings = job_plan.time_choice.applied(settings)
-        inputs = inputs.chosen(job_plan.time_choice, settings)
-    seconds = total = memory = on_device = None
-    if expected := job_plan.prediction:
-        steps = expected.job - expected.measuring
-        # The job starts a process with the same modules as this one, then reads and plans as was done here.
-        total = _seconds_to_start() + time.perf_counter() - started + steps + expected.measuring + expected.ending
-        memory, on_device = expected.peak_bytes, expected.device_bytes
-        coarse = expected.seconds_coarse or expected.seconds
-        seconds = expected.seconds * settings.steps_sos + coarse * job_plan.steps_coarse
+    job = dry_run(spec, inputs, lambda now: _show(now, send), to_write, left)
+    if chosen := job.plan.time_choice:
+        inputs = inputs.chosen(chosen, chosen.applied(settings))
+    # The job starts a process with the same modules as this one, then reads and plans as was done here.
+    expected, before = estimate(job), _seconds_to_start() + time.perf_counter() - started
     return {
         **findings,
         "views": len(inputs.cameras),
         "pixels": _pixels(inputs.cameras),
-        "plan": plan_json(job_plan),
-        "estimated_seconds": seconds,
-        "total_seconds": total,
-        "warnings": warnings_of(job_plan.decisions),
-        "memory_bytes": memory,
-        "device_memory_bytes": on_device,
+        "plan": plan_json(job),
+        "estimated_seconds": expected.job - expected.measuring,
+        "total_seconds": before + expected.job + expected.ending,
+        "warnings": warnings_of(job.plan.decisions),
+        "memory_bytes": job.plan.peak_bytes,
+        "device_memory_bytes": job.plan.device_bytes,
     }
 
 

@@ -102,7 +102,7 @@ def findings() -> Iterator[Diagnosis]:
     yield _memory(device)
     rasterizer, finding = _rasterizer(gpu=gpu)
     yield finding
-    yield _precision(device)
+    yield _precision()
     yield from _results(rasterizer, device)
     yield _kernels()
 
@@ -217,7 +217,7 @@ def _memory(device: torch.device) -> Diagnosis:
 def _rasterizer(*, gpu: bool) -> tuple[str, Diagnosis]:
     """Return the rasterizer of jobs on this machine, and the finding about it."""
     from sgsst_core.parallel.collectives import ALONE
-    from sgsst_core.planning.context import gpu_problems
+    from sgsst_core.planning.facts import gpu_problems
     from sgsst_core.rasterizer import RASTERIZERS, rasterizer_for
 
     problems = gpu_problems(ALONE) if gpu else {}
@@ -250,24 +250,16 @@ def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:
         yield Diagnosis("results", "works", f"{total} checks agree with float64 references, and repeat bit by bit")
 
 
-def _precision(device: torch.device) -> Diagnosis:
-    from sgsst_core.features.vgg import has_bfloat16, has_float16, has_tf32
-    from sgsst_core.planning.context import convolution_ratio
-    from sgsst_core.settings import PlannedPrecision
+def _precision() -> Diagnosis:
+    """Return the precision that jobs choose, and those that can be requested."""
+    from sgsst_core.parallel.collectives import ALONE
+    from sgsst_core.planning.choices import choose_precision
+    from sgsst_core.planning.facts import describe_machine
+    from sgsst_core.settings import make_settings
 
-    kind: Literal["cpu", "cuda"] = "cuda" if device.type == "cuda" else "cpu"
-    has: dict[PlannedPrecision, bool] = {
-        "tf32": has_tf32(device),
-        "float16": has_float16(device),
-        "winograd": kind == "cpu",
-        "bfloat16": has_bfloat16(device),
-    }
-    texts = [
-        f"{name.replace('tf', 'TF')} convolutions are {convolution_ratio(name, kind):.1f} times as fast as float32"
-        for name in has
-        if has[name]
-    ]
-    return Diagnosis("precision", "works", "; ".join(texts) or "float32 only")
+    machine, settings = describe_machine(make_settings(), ALONE), make_settings(precision="auto")
+    names = ", ".join(("float32", *machine.precisions))
+    return Diagnosis("precision", "works", f"jobs use {choose_precision(settings, machine)}; possible: {names}")
 
 
 def _kernels() -> Diagnosis:

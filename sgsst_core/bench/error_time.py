@@ -24,7 +24,7 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import ratio
-from sgsst_core.planning.measurement_choice import LOSS_VIEWS
+from sgsst_core.planning.choices import LOSS_VIEWS
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.judge import Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
@@ -182,7 +182,7 @@ def error_time(
     exact = Float32Reference(reference, style_loss="sos")
     lpips = load_lpips_or_none()
     judge = make_judge(reference, make_novel_views(reference), lpips) if lpips else None
-    views = spread(exact.views.covered, LOSS_VIEWS[0])
+    views = spread(exact.views.covered, LOSS_VIEWS)
     start = exact.evaluate(views, scene.sh_dc)
     running = [_prepared(variant, (scene, cameras, style), base, weights) for variant in variants]
 
@@ -218,10 +218,10 @@ def _prepared(
     curve states the reason.
     """
     settings = base.model_copy(update=variant.settings)
-    stylizer = Stylizer.planned(*inputs, settings, weights=weights)
-    if settings.precision not in ("auto", stylizer.job.network.precision):
-        reason = next(d.reason for d in stylizer.job.plan.decisions if d.item == "precision")
-        return Curve(variant, [], left_out=reason), None
+    try:
+        stylizer = Stylizer.planned(*inputs, settings, weights=weights)
+    except SettingsError as error:  # a precision that this machine lacks
+        return Curve(variant, [], left_out=str(error)), None
     started = time.perf_counter()
     for index in stylizer.job.views.covered:
         chosen = stylizer.job.scales(index)

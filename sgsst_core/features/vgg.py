@@ -135,12 +135,13 @@ def has_bfloat16(device: torch.device | str) -> bool:
     return not _is_nvidia(device) or has_tf32(device)
 
 
-def has_bfloat16_instructions(device: torch.device | str) -> bool:
-    """Return whether a device computes in bfloat16 without emulation, as far as PyTorch knows."""
-    if torch.device(device).type != "cpu":
-        return has_bfloat16(device)
+def has_matrix_units() -> bool:
+    """Return whether the CPU has matrix units for bfloat16 (AMX), as far as PyTorch knows.
+
+    Vector instructions for bfloat16 (AVX-512, ARM) are about as fast as Winograd's algorithm, and less accurate.
+    """
     capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
-    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+    return bool(capabilities.get("amx_bf16"))
 
 
 def _is_nvidia(device: torch.device | str) -> bool:

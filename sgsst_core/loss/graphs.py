@@ -28,16 +28,13 @@ FIRST_VISITS = 2
 FIRST_TORCH = 2, 13
 
 
-def failure_is_fatal() -> bool:
-    """Return whether this process cannot use the GPU after a failed capture: the allocator stays in capture mode."""
-    return tuple(map(int, torch.__version__.split(".")[:2])) < FIRST_TORCH
+def can_use_graphs(device: torch.device | str) -> bool:
+    """Return whether CUDA graphs are used on a device: on NVIDIA GPUs, the only ones known to replay them.
 
-
-def graphs_problem(device: torch.device | str) -> str | None:
-    """Return the reason why CUDA graphs are not used on a device; None if they are."""
-    if torch.device(device).type != "cuda" or torch.version.hip is not None:
-        return "only NVIDIA GPUs are known to replay them"
-    return None
+    Before PyTorch 2.13, the allocator stays in capture mode after a failed capture, so the process could not continue.
+    """
+    version = tuple(map(int, torch.__version__.split(".")[:2]))
+    return torch.device(device).type == "cuda" and torch.version.hip is None and version >= FIRST_TORCH
 
 
 def can_be_captured(tiling: Tiling, areas: Sequence[int]) -> bool:
@@ -101,7 +98,7 @@ class LossGraphs:
     is at most the memory that `can_be_captured` reserves.
 
     Args:
-        loss: Loss of a single rank, on a device that supports CUDA graphs (`graphs_problem`).
+        loss: Loss of a single rank, on a device that supports CUDA graphs (`can_use_graphs`).
 
     Attributes:
         problem: Reason why capturing failed; None if it has not failed.

@@ -1,25 +1,27 @@
-"""Choices of a plan: what a job leaves out or does differently for its scene, and the plan lines with the reasons."""
+"""Choices of a plan: what a job leaves out or does differently for its scene, and the plan lines with the reasons.
+
+`make_plan` is a pure function of the facts and the settings. Thresholds were measured once; what they rest on stands
+beside them.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from sgsst_core.budget import memory_for
+from sgsst_core.budget import measuring_memory, memory_for
 from sgsst_core.decision import ANOTHER_LOSS, VIEWS, Decision
+from sgsst_core.errors import SettingsError
 from sgsst_core.loss.convergence import MIN_FALL, window_length
-from sgsst_core.loss.graphs import FIRST_VISITS, failure_is_fatal
 from sgsst_core.loss.nearest import MAX_VECTORS, NEAREST_WEIGHTS
 from sgsst_core.loss.scale_weights import ScaleWeights, scale_count
 from sgsst_core.loss.statistics_terms import has_statistics
-from sgsst_core.number_format import duration
-from sgsst_core.parallel.division import Size
-from sgsst_core.planning.context import LEAST_VISITS, Facts, NetworkPixels, Saving
-from sgsst_core.planning.measurement_choice import LOSS_VIEWS
-from sgsst_core.planning.plan import Plan, Shape
+from sgsst_core.planning.facts import Facts, Machine, NetworkPixels
+from sgsst_core.planning.plan import Plan, Work
+from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.settings import CachedWeights, PlannedBackground, PlannedPrecision, Settings
 
@@ -33,50 +35,80 @@ _SCAN = 0.2
 _VIEW_DEPENDENT = 0.05
 #: Default training background for such an object (docs/quality.md).
 _SCAN_BACKGROUND: PlannedBackground = "palette"
-#: Speedup of convolutions from which on a CPU uses a precision instead of the more accurate one before it. Runs on one
-#: machine must choose alike, also if it is busy: Winograd's algorithm reaches 1.7 to 2.2, and processors with
-#: instructions for bfloat16 2.0 to 2.4, or several times more with matrix units. The speedup of a view's loss would
-#: depend on its size.
-_LEAST_SPEEDUP: dict[PlannedPrecision, float] = {"winograd": 1.0, "bfloat16": 2.0}
-#: GPU that computes in each precision.
+#: Precision with "auto" by device: the first one that all ranks compute without emulation. The loss after a job is the
+#: same in all of them (benchmarks/results/README.md). float16 continues in bfloat16 if it overflows.
+_PREFERRED: dict[str, tuple[PlannedPrecision, ...]] = {
+    "cpu": ("bfloat16", "winograd"),
+    "cuda": ("float16", "bfloat16", "tf32"),
+}
+#: What a requested precision needs.
 _GPU = "an NVIDIA GPU of compute capability 8.0 or higher"
-#: Fraction of the greatest speedup that a more accurate precision must reach on a GPU.
-_AS_FAST = 0.9
-#: Relative error of the pixel gradient up to which a precision is chosen. With errors of 0.3, the float32 loss falls as
-#: with float32 (docs/quality.md).
-_LARGEST_ERROR = 0.5
-#: Pixels through the network in all steps below which no precisions are compared: seconds on two cores.
-_COMPARED_PIXELS = 1_000_000
-#: Minimum visits per view size for which a CUDA graph of the loss is considered at all.
-LEAST_GRAPH_VISITS = 20
-#: The same if the capture is first tried in a child process, whose start takes as long as so many visits save: 6 s.
-LEAST_TRIED_VISITS = 1000
-#: Minimum fraction of a step's time that additional ranks must save.
-LEAST_GAIN = 0.03
-#: Fraction of the steps' time that steps with a view for each rank must save in comparison with divided views.
-_LEAST_GROUP_GAIN = 0.1
+_NEEDED: dict[PlannedPrecision, str] = {
+    "winograd": "a CPU",
+    "bfloat16": f"a CPU with matrix units (AMX), an AMD GPU, or {_GPU}",
+    "float16": _GPU,
+    "tf32": _GPU,
+}
+#: Error of the pixel gradient in each precision, relative to float32's, at ordinary contrast.
+_ERRORS: dict[PlannedPrecision, str] = {
+    "winograd": "3e-3",
+    "tf32": "1e-2",
+    "float16": "3e-2",
+    "bfloat16": "0.2; up to 0.9 where contrast is low",
+}
+#: Minimum visits of each view size for which CUDA graphs of the loss pay off, and maximum pixels of a view: a step of
+#: 980x545 takes 19 ms without and 8 ms with a graph, because the GPU waits for 15 ms of launches, which larger views
+#: hide (99 ms at 5187x3361, H200 and H100).
+_GRAPH_VISITS, _GRAPH_PIXELS = 20, 2_600_000
+#: Minimum visits of a view for which caching its blend weights pays off on a GPU: storing them takes 14 to 26 ms, and
+#: each visit saves 2.2 (a million Gaussians) to 10 ms (6 million, H200).
+_CACHED_VISITS = 8
+#: Network pixels of a rank in a step on all scales below which each rank gets a view of its own: two CPU ranks are 1.72
+#: times as fast as one on divided views of 1280x720, and worth 1.9 with views of their own. GPUs gain nothing by
+#: dividing 980x545, and 8 of them are 6.2 times as fast as one at 5187x3361.
+_OWN_VIEW_PIXELS = {"cpu": 500_000, "cuda": 2_000_000}
 #: Number of steps with one view that a step with several is worth, by the loss left (benchmarks/results/README.md).
 #: More views were not measured.
 _WORTH = {1: 1.0, 2: 1.9, 4: 2.6, 8: 3.4}
+#: Maximum numbers of views on which the loss is evaluated before the steps, and of novel views.
+LOSS_VIEWS, NOVEL_VIEWS = 4, 4
+#: Forward passes of a novel view: for the Gram distance before and after the steps, each beside its renders.
+_NOVEL_PASSES = 2
 #: Bytes per optimized Gaussian: color, gradient and two moments, float32.
 OPTIMIZER_BYTES = 4 * 3 * 4
+#: Bytes of a process before it reads a scene: libraries, compiled kernels and the network (peak_memory.json).
+_PROCESS_BYTES = 900_000_000
+#: Bytes per Gaussian beside its stored values: the file's, those of the rendered scene, and the neighbor search.
+_GAUSSIAN_BYTES = 400
+#: Bytes per pixel and scale of a view's targets: content features (relu4_2), coverage, and its image.
+_TARGET_BYTES = 32
 
 
 # --- choices -------------------------------------------------------------------------------------------------------
 
 
-def draft_plan(facts: Facts, settings: Settings, *, measured: bool) -> Plan:
-    """Choose everything that needs no trial. The plan lacks ranks, graphs, measurements, decisions and prediction.
+def make_plan(
+    facts: Facts,
+    settings: Settings,
+    *,
+    groups: int | None = None,
+    measured: bool = False,
+    about: Sequence[Decision] = (),
+) -> Plan:
+    """Decide everything about a job.
 
     Args:
-        measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
+        groups: `Plan.groups` of an earlier plan of the same job; None to choose them.
+        measured: Whether quality is measured and a report is written, as in `sgsst stylize`.
+        about: Decisions about the inputs, which come first.
     """
-    survey, requested = facts.survey, settings.position_weights
-    weighted = requested == "on" or (requested == "auto" and survey.uncovered_fraction > _UNCOVERED)
+    survey, machine = facts.survey, facts.machine
+    weighted = is_weighted(survey, settings)
     scan = weighted and survey.uncovered_fraction > _SCAN
     background, warm = settings.training_background, settings.warm_start
     seen = survey.total_blend_weights > 0
-    draft = Plan(
+    pixels = NetworkPixels.of(facts, settings, weighted=weighted)
+    plan = Plan(
         survey=survey,
         optimized=seen if facts.frozen is None else seen & ~facts.frozen,
         seen=seen,
@@ -87,58 +119,64 @@ def draft_plan(facts: Facts, settings: Settings, *, measured: bool) -> Plan:
         warm_start=scan or settings.preserve_colors != "luminance" if warm is None else warm,
         training_background=(_SCAN_BACKGROUND if scan else "background") if background == "auto" else background,
         steps_coarse=0 if _has_one_phase(facts, settings) else settings.steps_coarse,
-        memory_limit=facts.machine.memory_limit,
-        device=facts.machine.device,
+        memory_limit=machine.memory_limit,
+        device=machine.device,
         rasterizer=facts.rasterizer,
         uncached=facts.rasterizer,
-        precision=choose_precision(facts, settings),
+        precision=facts.precision,
         measured=measured,
-        loss_views=min(LOSS_VIEWS[0], len(survey.covered)),
+        ranks=machine.ranks,
+        loss_views=min(LOSS_VIEWS, len(survey.covered)),
     )
-    cached = _blend_weights(draft, facts, settings)[0]
-    return draft if cached == "none" else replace(draft, rasterizer="cached", cached_weights=cached)
+    plan = replace(plan, groups=groups or _groups(plan, facts, settings, pixels))
+    settings = with_groups(settings, plan.groups)
+    plan = replace(plan, steps_coarse=min(plan.steps_coarse, settings.steps_coarse))
+    cached, about_weights = _blend_weights(plan, facts, settings)
+    if cached != "none":
+        plan = replace(plan, rasterizer="cached", cached_weights=cached)
+    graphs, novel = _why_no_graphs(plan, facts, settings) is None, _novel_views(plan, settings)
+    plan = replace(plan, graphs=graphs, novel_views=novel)
+    plan = _with_memory(plan, facts, pixels)
+    per_rank = settings.views_per_step / plan.ranks
+    passes = (plan.loss_views + _NOVEL_PASSES * plan.novel_views) / 3 if measured else 0.0
+    work = Work(per_rank * pixels.sampled, per_rank * pixels.coarse, passes * pixels.all / plan.ranks)
+    lines = (
+        *about,
+        *_about_gaussians(plan, facts, settings),
+        *_about_coverage(plan, facts, settings, pixels),
+        *_about_network(facts, settings, pixels),
+        *_about_rasterizer(plan, facts, settings),
+        about_weights,
+        *_about_schedule(plan, facts, settings),
+        *_about_ranks(plan, facts, settings),
+        *_about_precision(plan, settings),
+        *_about_measuring(plan, settings),
+    )
+    return replace(plan, work=work, decisions=lines)
 
 
-def compares_precisions(sizes: Sequence[Size], settings: Settings) -> bool:
-    """Return whether a job without float32 would save enough time to compare precisions.
+def is_weighted(survey: Survey, settings: Settings) -> bool:
+    """Return whether statistics are weighted by coverage."""
+    requested = settings.position_weights
+    return requested == "on" or (requested == "auto" and survey.uncovered_fraction > _UNCOVERED)
 
-    Args:
-        sizes: (height, width) of each view.
+
+def choose_precision(settings: Settings, machine: Machine) -> PlannedPrecision:
+    """Return the requested precision of the network; with "auto", the fastest that the processors have.
+
+    Raises:
+        SettingsError: If the requested precision cannot be computed here.
     """
-    if settings.precision != "auto":
-        return settings.precision != "float32"
-    pixels = 0.0
-    for height, width in sizes:
-        coarsest = scale_count(height, width, settings.coarsest_side) - 1
-        pixels += height * width * (settings.steps_sos + settings.steps_coarse / 4**coarsest) / len(sizes)
-    return settings.views_per_step * pixels >= _COMPARED_PIXELS
-
-
-def choose_precision(facts: Facts, settings: Settings) -> PlannedPrecision:
-    """Choose the precision of the network: the requested one if its convolutions are faster than in float32.
-
-    With "auto", a CPU uses a less accurate precision if it is much faster; a GPU uses the most accurate of the fastest
-    precisions.
-    """
-    measured = facts.precisions or {}
-    if settings.precision != "auto":
-        requested = measured.get(settings.precision) if settings.precision != "float32" else None
-        return settings.precision if requested and requested.error else "float32"
-    on_cpu = facts.machine.device == "cpu"
-    errors = {
-        name: own.error.relative_error
-        for name, own in measured.items()
-        if own.error and own.error.relative_error <= _LARGEST_ERROR and (on_cpu or own.speedup > 1)
-    }
-    if on_cpu:
-        chosen: PlannedPrecision = "float32"
-        for name, least in _LEAST_SPEEDUP.items():
-            before = 1.0 if chosen == "float32" else measured[chosen].convolution
-            chosen = name if name in errors and measured[name].convolution >= least * before else chosen
-        return chosen
-    most = max((measured[name].speedup for name in errors), default=0.0)
-    fastest = [name for name in errors if measured[name].speedup >= _AS_FAST * most]
-    return min(fastest, key=lambda name: errors[name], default="float32")
+    wanted = settings.precision
+    if wanted == "auto":
+        return next((name for name in _PREFERRED[machine.device] if name in machine.precisions), "float32")
+    if wanted != "float32" and wanted not in machine.precisions:
+        where = "this GPU" if machine.device == "cuda" else "this CPU"
+        raise SettingsError(
+            f"--precision {wanted} needs {_NEEDED[wanted]}, which {where} is not. Give another one, or none for the "
+            "fastest one here."
+        )
+    return wanted
 
 
 def _has_one_phase(facts: Facts, settings: Settings) -> bool:
@@ -157,56 +195,21 @@ def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
     return warm and not has_statistics(settings.style_loss)
 
 
-def considers_graphs(plan: Plan, facts: Facts, settings: Settings) -> bool:
-    """Return whether CUDA graphs of the loss are possible, and may pay off."""
-    least = LEAST_TRIED_VISITS if failure_is_fatal() else LEAST_GRAPH_VISITS
-    often = _visits_of_a_size(plan, facts, settings) >= least
-    return plan.device == "cuda" and often and not _divides_views(facts, settings)
-
-
-def uses_graphs(plan: Plan, facts: Facts, settings: Settings, cost: Saving | None) -> bool:
-    """Choose whether the loss of a view is captured as a CUDA graph, one per image size and phase.
-
-    Args:
-        cost: Cost of launching a view's loss; None if it was not measured.
-    """
-    if cost is None or cost.least_visits is None or _divides_views(facts, settings):
-        return False
-    phases = bool(plan.steps_coarse) + bool(settings.steps_sos)
-    return _visits_of_a_size(plan, facts, settings) >= phases * (FIRST_VISITS + cost.least_visits)
-
-
-def choose_ranks(seconds: Mapping[Shape, float]) -> Shape:
-    """Choose the number of ranks and of their groups.
-
-    Returns:
-        The smallest number of ranks whose seconds per step are within `LEAST_GAIN` of the best with as few groups as
-        possible, unless a view for each rank saves much more.
-    """
-    least = min(groups for _, groups in seconds)
-    few = {shape: own for shape, own in seconds.items() if shape[1] == least}
-    best = min(shape for shape, own in few.items() if own <= min(few.values()) * (1 + LEAST_GAIN))
-    most = (1 - _LEAST_GROUP_GAIN) * few[best] / worth(least)
-    more = (shape for shape, own in seconds.items() if shape[1] > least and own / worth(shape[1]) <= most)
-    return min(more, default=best)
-
-
 def worth(views: int) -> float:
     """Return how many steps with one view leave as little of the loss as a step with several views."""
     return float(np.interp(math.log2(views), [math.log2(known) for known in _WORTH], list(_WORTH.values())))
 
 
-def considers_groups(plan: Plan, facts: Facts, settings: Settings, seconds: Mapping[Shape, float]) -> bool:
-    """Return whether a view for each rank in every step may save time, given the seconds of steps on divided views.
+def _groups(plan: Plan, facts: Facts, settings: Settings, pixels: NetworkPixels) -> int:
+    """Choose the number of groups of ranks, each with a view of its own in every step; 1 leaves it to the settings.
 
     Steps that were given, and those of the published schedule, remain as they are.
     """
-    ranks = facts.machine.ranks
+    ranks = plan.ranks
     given = {"views_per_step", "steps_coarse", "steps_sos"} & {*settings.fixed}
-    if settings.preset == "paper" or given or settings.within or not settings.rebalance or ranks == 1:
-        return False
-    possible = len(plan.covered) >= 2 * ranks
-    return possible and choose_ranks({**seconds, (ranks, ranks): seconds[1, 1]}) == (ranks, ranks)
+    if ranks == 1 or settings.preset == "paper" or given or settings.within or len(plan.covered) < 2 * ranks:
+        return 1
+    return ranks if pixels.all / ranks < _OWN_VIEW_PIXELS[facts.machine.device] else 1
 
 
 def with_groups(settings: Settings, groups: int) -> Settings:
@@ -230,80 +233,88 @@ def _visits_of_a_size(plan: Plan, facts: Facts, settings: Settings) -> int:
     return _visits(plan, settings) // different
 
 
-def _divides_views(facts: Facts, settings: Settings) -> bool:
+def _divides_views(plan: Plan, settings: Settings) -> bool:
     """Return whether several ranks work on the same view."""
-    return facts.machine.ranks > math.gcd(settings.views_per_step, facts.machine.ranks)
+    return plan.ranks > math.gcd(settings.views_per_step, plan.ranks)
 
 
 def _blend_weights(plan: Plan, facts: Facts, settings: Settings) -> tuple[CachedWeights, Decision]:
     """Choose the format of cached blend weights: float32 or half precision, as fits; none if it saves no time."""
-    cost, item = facts.weights, "blend weights"
-    why_not = _why_not_cached(plan, facts, settings)
+    item, why_not = "blend weights", _why_not_cached(plan, facts, settings)
+    whole, halved = facts.weight_bytes or (0, 0)
     if why_not is not None:
-        return "none", Decision(item, "recomputed in every step", why_not, bytes=cost.bytes)
+        return "none", Decision(item, "recomputed in every step", why_not, bytes=whole or None)
     budget, cached = memory_for("rasterizer", facts.machine.memory), settings.cached_weights
     if cached == "auto":
-        cached = "float32" if (cost.bytes or 0) <= budget or settings.preset == "paper" else "half"
-    name, size, error = "float32", cost.bytes or 0, "none"
+        cached = "float32" if whole <= budget or settings.preset == "paper" else "half"
+    name, size, error = "float32", whole, "none"
     if cached == "half":
-        name, size = "half precision", cost.half_bytes or 0
+        name, size = "half precision", halved
         error = "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
     of_a_view = size / len(plan.covered)
     portion = "all" if size <= budget else f"{budget // of_a_view * of_a_view / size:.0%} of the views'"
     reason = f"they take {size / 1e9:.2f} GB for all views; {budget / 1e9:.1f} GB are available for blend weights"
-    if cost.saving.problem is None:
-        reason += f"; {cost.saving.text('cached', 'recomputed')}"
     return cached, Decision(item, f"{portion} cached in {name}", reason, error=error)
 
 
 def _why_not_cached(plan: Plan, facts: Facts, settings: Settings) -> str | None:
     """Return the reason why blend weights are not cached; None if they are."""
-    cost, visits = facts.weights, _visits(plan, settings) / len(plan.covered)
-    visited = f"a view is visited {visits:.1f} times"
+    visits = _visits(plan, settings) / len(plan.covered)
     if settings.cached_weights == "none":
         return "requested"
-    if cost.bytes is None or cost.half_bytes is None:
-        return f"{RASTERIZERS[facts.rasterizer].title} cannot cache them"
+    if facts.weight_bytes is None:
+        return f"{RASTERIZERS[facts.rasterizer].title} does not cache them"
     if settings.cached_weights != "auto":
         return None
-    if not RASTERIZERS[facts.rasterizer].on_gpu:
-        return visited if visits < LEAST_VISITS else None
-    if cost.saving.problem is not None:
-        return cost.saving.problem
-    least, measured = cost.saving.least_visits, cost.saving.text("cached", "recomputed")
-    if least is None:
-        return f"cached weights are not faster here: {measured}"
-    return f"{visited}, but caching pays off from {least:.1f} visits; {measured}" if visits < least else None
+    if facts.weight_bytes[1] / len(plan.covered) > memory_for("rasterizer", facts.machine.memory):
+        return "the weights of one view do not fit"
+    return f"a view is visited only {visits:.1f} times" if visits < _CACHED_VISITS else None
+
+
+def _why_no_graphs(plan: Plan, facts: Facts, settings: Settings) -> str | None:
+    """Return the reason why the loss of a view is not captured as a CUDA graph; None if it is."""
+    visits = _visits_of_a_size(plan, facts, settings)
+    if not facts.machine.graphs:
+        return "CUDA graphs need an NVIDIA GPU and PyTorch 2.13 or later"
+    if _divides_views(plan, settings):
+        return "a graph cannot contain communication between workers"
+    if visits < _GRAPH_VISITS:
+        return f"views of one size are visited only {visits:,} times"
+    if max(height * width for height, width in facts.sizes) > _GRAPH_PIXELS:
+        return "views are so large that the GPU does not wait for launches"
+    return None
+
+
+def _novel_views(plan: Plan, settings: Settings) -> int:
+    """Choose how many novel views are measured: passes outside of the steps are at most a fraction of those in them."""
+    passes = int(settings.measure * _visits(plan, settings)) - plan.loss_views
+    return max(min(NOVEL_VIEWS, passes // _NOVEL_PASSES), 0) if plan.measured else 0
+
+
+def _with_memory(plan: Plan, facts: Facts, pixels: NetworkPixels) -> Plan:
+    """Add to a plan the bound on its memory, and what a single rank on a GPU can spare of that for activations."""
+    memory, budget = facts.machine.memory, memory_for("activations", facts.machine.memory)
+    needed = activations = min(int(pixels.held * facts.pixel_bytes), budget)
+    if plan.measured and plan.is_approximated:  # features of the float32 reference are larger
+        size = 2 if plan.precision in ("bfloat16", "float16") else 1
+        needed = min(size * activations, budget)
+    # A CUDA graph does not share its memory: evaluating the loss without the graph needs the same amount again.
+    needed += activations * plan.graphs
+    spare = max(budget - needed, 0) if plan.device == "cuda" and facts.machine.ranks == 1 else 0
+    areas = sum(facts.sizes[index][0] * facts.sizes[index][1] for index in plan.covered)
+    of_views = int(4 / 3 * _TARGET_BYTES * areas) + 12 * facts.gaussians * len(plan.covered) * bool(facts.used_degree)
+    cached = 0 if plan.cached_weights == "none" else (facts.weight_bytes or (0, 0))[plan.cached_weights == "half"]
+    used = needed + min(of_views, memory_for("views", memory) + spare // 2)
+    used += min(facts.intersection_bytes + cached, memory_for("rasterizer", memory) + spare // 2)
+    used += min(measuring_memory(memory), 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered))
+    of_scene = facts.gaussians * (_GAUSSIAN_BYTES + 24 * (facts.sh_degree + 1) ** 2)
+    process, device = _PROCESS_BYTES + of_scene + (used if plan.device == "cpu" else 0), None
+    if plan.device == "cuda":
+        device = used + of_scene
+    return replace(plan, spare=spare, peak_bytes=process, device_bytes=device)
 
 
 # --- plan lines ----------------------------------------------------------------------------------------------------
-
-
-def decisions(
-    plan: Plan,
-    facts: Facts,
-    settings: Settings,
-    pixels: NetworkPixels,
-    parts: Mapping[str, float],
-    cost: Saving | None,
-    seconds: Mapping[Shape, float],
-) -> Iterator[Decision]:
-    """Yield the decisions of a plan, with their reasons.
-
-    Args:
-        parts: Seconds of a step per view by activity; "cached weights" are the seconds that these save.
-        cost: Cost of launching a view's loss; None if it was not measured.
-        seconds: Measured mean seconds of a step by number of ranks and groups.
-    """
-    yield from _about_gaussians(plan, facts, settings)
-    yield from _about_coverage(plan, facts, settings, pixels, parts)
-    yield from _about_network(facts, settings, pixels, parts)
-    yield from _about_rasterizer(plan, facts, settings, cost)
-    weights = _blend_weights(plan, facts, settings)[1]
-    yield weights if plan.cached_weights == "none" else replace(weights, seconds=parts["cached weights"])
-    yield from _about_schedule(plan, facts, settings)
-    yield from _about_ranks(plan, facts, seconds)
-    yield from _about_precision(plan, facts, settings, parts)
 
 
 def _about_gaussians(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
@@ -341,9 +352,7 @@ def _about_gaussians(plan: Plan, facts: Facts, settings: Settings) -> Iterator[D
             yield Decision(item, f"evaluated up to degree {used}", zeros, bytes=saved)
 
 
-def _about_coverage(
-    plan: Plan, facts: Facts, settings: Settings, pixels: NetworkPixels, parts: Mapping[str, float]
-) -> Iterator[Decision]:
+def _about_coverage(plan: Plan, facts: Facts, settings: Settings, pixels: NetworkPixels) -> Iterator[Decision]:
     """Yield the decisions about empty views, uncovered pixels, backgrounds, and the colors at the start."""
     uncovered = f"{plan.survey.uncovered_fraction:.1%} of the views' pixels are uncovered"
     total, blind = len(facts.sizes), len(facts.sizes) - len(plan.covered)
@@ -351,9 +360,7 @@ def _about_coverage(
         yield Decision(VIEWS, f"{blind} of {total} are skipped", "they see no Gaussian")
     if pixels.all < pixels.without_region:
         skipped = f"{1 - pixels.all / pixels.without_region:.0%} of the pixels skip the network"
-        seconds = sum(parts.get(name, 0.0) for name in ("vgg_forward", "vgg_backward", "statistics"))
-        seconds *= pixels.without_region / pixels.all - 1
-        yield Decision("uncovered pixels", skipped, uncovered, seconds=seconds)
+        yield Decision("uncovered pixels", skipped, uncovered)
     if plan.weighted:
         yield Decision("position weights", "statistics are weighted by coverage", uncovered, error=ANOTHER_LOSS)
     if plan.training_background != "background":
@@ -362,8 +369,7 @@ def _about_coverage(
         requested = settings.training_background != "auto"
         reason = "requested" if requested else f"{uncovered}: colors would be fitted to a fixed background"
         if settings.content_weight:
-            recomputed = duration(parts.get("prepare", 0.0), " ")
-            reason += f"; content features are recomputed with it, {recomputed} per step"
+            reason += "; content features are recomputed with it in every step"
         yield Decision("training background", f"{color} each time", reason, error=ANOTHER_LOSS)
     by_luminance = settings.preserve_colors == "luminance"
     if plan.warm_start:
@@ -383,19 +389,16 @@ def _about_coverage(
         yield Decision("colors", line, "requested", error=ANOTHER_LOSS)
 
 
-def _about_network(
-    facts: Facts, settings: Settings, pixels: NetworkPixels, parts: Mapping[str, float]
-) -> Iterator[Decision]:
+def _about_network(facts: Facts, settings: Settings, pixels: NetworkPixels) -> Iterator[Decision]:
     """Yield the decisions about layers, style loss, content, partition and forward passes."""
     layers = f"up to {facts.deepest}, the deepest one used"
     yield Decision("network layers", layers, "the loss reads no deeper layer")
     if settings.style_loss != "sos":
         weight = NEAREST_WEIGHTS[settings.style_loss]
         what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
-        search = duration(parts.get("matching", 0.0), " ")
         distance = (
             f"the distance of relu3 features to the nearest of at most {MAX_VECTORS:,} style features {what}, with "
-            f"weight {weight:.3g}; the search takes {search} per view"
+            f"weight {weight:.3g}"
         )
         yield Decision("style loss", distance, f"{settings.style_loss} was requested", error=ANOTHER_LOSS)
     if not settings.content_weight:
@@ -411,11 +414,11 @@ def _about_network(
         reason = f"activations of {1 - again:.0%} of the pixels fit in {memory}"
         yield Decision("second forward", f"for {again:.0%} of the pixels", reason)
     else:
-        none, forward = "none: activations are cached between statistics and gradient", parts.get("vgg_forward", 0.0)
-        yield Decision("second forward", none, f"they fit in {memory}", seconds=forward)
+        none = "none: activations are cached between statistics and gradient"
+        yield Decision("second forward", none, f"they fit in {memory}")
 
 
-def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings, cost: Saving | None) -> Iterator[Decision]:
+def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
     """Yield the decisions about the rasterizer and kernel launches on a GPU; on the CPU there is no choice."""
     if plan.device != "cuda":
         return
@@ -428,26 +431,11 @@ def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings, cost: Saving
     if used.on_gpu:
         reasons.append(f"{used.title} works here")
     yield Decision("rasterizer", how, "; ".join(reasons) or "requested")
-    visited = f"views of one size are visited about {_visits_of_a_size(plan, facts, settings):,} times"
-    measured = ""
-    if cost is not None:
-        measured = f"{cost.text('as a graph', 'kernel by kernel')}, {1e3 * cost.once:.3g} ms to capture"
-    if plan.graphs and cost is not None:
-        graph = "the loss of a view is captured as a CUDA graph"
-        yield Decision("launches", graph, f"{measured}; {visited}", seconds=cost.saved)
-        return
-    if _divides_views(facts, settings):
-        reason = "a graph cannot contain communication between workers"
-    elif cost is None:
-        reason = visited
-    elif cost.problem is not None:
-        reason = f"CUDA graphs are unavailable: {cost.problem}"
-    elif cost.least_visits is None:
-        reason = f"a graph saves hardly any time: {measured}"
+    if reason := _why_no_graphs(plan, facts, settings):
+        yield Decision("launches", "kernel by kernel", reason)
     else:
-        least = FIRST_VISITS + cost.least_visits
-        reason = f"{visited}, but one graph per phase pays off from {least:.1f} visits; {measured}"
-    yield Decision("launches", "kernel by kernel", reason)
+        visited = f"views of one size are visited {_visits_of_a_size(plan, facts, settings):,} times"
+        yield Decision("launches", "the loss of a view is captured as a CUDA graph", visited)
 
 
 def _about_schedule(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
@@ -489,79 +477,49 @@ def _about_schedule(plan: Plan, facts: Facts, settings: Settings) -> Iterator[De
         yield Decision("early stop", when, "later steps would gain little", error="the remaining decrease of the loss")
 
 
-def _about_ranks(plan: Plan, facts: Facts, seconds: Mapping[Shape, float]) -> Iterator[Decision]:
-    """Yield the decisions about ranks that share a GPU, and about the number of ranks and their groups."""
-    available, chosen = facts.machine.ranks, plan.ranks
+def _about_ranks(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
+    """Yield the decisions about ranks that share a GPU, and about views that ranks divide or have for themselves."""
     if plan.device != "cpu" and facts.machine.sharing > 1:
         reason = f"{facts.machine.sharing} of them share a GPU, which NCCL does not support; give each a GPU of its own"
         yield Decision("communication", "ranks exchange data over the CPU (gloo)", reason)
-    if available == 1:
+    if plan.ranks == 1:
         return
-    measured = "a step takes " + ", ".join(
-        f"{duration(own, ' ')} on {ranks}" + (f" with {groups} views, worth {worth(groups):.1f} steps" * (groups > 1))
-        for (ranks, groups), own in seconds.items()
-    )
-    one = 1, min(groups for _, groups in seconds)
-    if one not in seconds:
-        yield Decision("ranks", f"all {available} take part", f"requested; {measured}")
-        return
-    speeds = {shape: seconds[one] / own * worth(shape[1]) / worth(one[1]) for shape, own in seconds.items()}
-    who = f"all {available}" if chosen == available else f"{chosen} of {available}"
-    if chosen < available:
-        every = f"all of them would be {speeds[available, one[1]]:.2f} times as fast"
-        measured = f"{every}, because the others would only add communication; {measured}"
-    faster = f"{speeds[chosen, plan.groups]:.2f} times as fast as one"
     if plan.groups > 1:
-        each = f"{who} take part, each with a view of its own in fewer steps, {faster}"
-        yield Decision("ranks", each, measured, error="steps average the gradients of several views")
+        each = f"all {plan.ranks} take part, each with a view of its own in fewer steps"
+        error = "steps average the gradients of several views"
+        yield Decision("ranks", each, "views are too small to divide among so many", error=error)
         return
-    yield Decision("ranks", f"{who} take part, {faster}", measured)
+    groups = math.gcd(settings.views_per_step, plan.ranks)
+    how = f"{plan.ranks // groups} divide each view" if groups < plan.ranks else "each has a view of its own"
+    yield Decision("ranks", f"all {plan.ranks} take part", how)
 
 
-def _about_precision(plan: Plan, facts: Facts, settings: Settings, parts: Mapping[str, float]) -> Iterator[Decision]:
+def _about_precision(plan: Plan, settings: Settings) -> Iterator[Decision]:
     """Yield the decision about the network's precision; none if float32 was requested."""
-    requested, measured = settings.precision, facts.precisions or {}
+    name, requested = plan.precision, settings.precision
     if requested == "float32":
         return
-    compared = [
-        f"convolutions {_in(name)} are {own.convolution:.2g} times as fast as in float32"
-        + (
-            f", a view's loss {own.speedup:.2g} times, with an error of {own.error.relative_error:.2g}"
-            if own.error
-            else ""
-        )
-        for name, own in measured.items()
-    ]
-    reason = "; ".join(compared)
-    if plan.precision != "float32":
-        own = measured[plan.precision]
-        assert own.error is not None
-        colors = "is measured during the run" if plan.is_approximated else "is that of rounding"
-        known = (
-            f"the first view's pixel gradient has a relative error of {own.error.relative_error:.2g} (cosine "
-            f"{own.error.cosine:.5f}); the error of the colors {colors}"
-        )
-        what = f"{'convolutions' if plan.precision in ('tf32', 'winograd') else 'features'} {_in(plan.precision)}"
-        saved = max(own.speedup - 1, 0.0) * sum(
-            parts.get(name, 0.0) for name in ("vgg_forward", "vgg_backward", "statistics")
-        )
-        how = "requested" if requested != "auto" else "measured on the first view"
-        yield Decision("precision", what, f"{how}: {reason}", seconds=saved, error=known)
+    if name == "float32":
+        yield Decision("precision", "features in float32", "exact; this device has no faster precision")
         return
-    if requested != "auto":
-        needed = {"winograd": "a CPU", "bfloat16": f"a CPU, an AMD GPU, or {_GPU}"}.get(requested, _GPU)
-        missing = f"{requested} needs {needed}"
-        reason = f"{requested} was requested, but {reason or missing}"
-    elif facts.precisions is None:
-        reason = "exact; the steps take too little time to compare others"
-    elif not measured:
-        reason = "exact; this device has no faster precision"
-    else:
-        faster = "much faster convolutions" if facts.machine.device == "cpu" else "a faster loss"
-        reason = f"exact; {reason}, but {faster} and an error of at most {_LARGEST_ERROR} are needed"
-    yield Decision("precision", "features in float32", reason)
+    how = {"winograd": "by Winograd's algorithm", "tf32": "in TF32"}.get(name, f"in {name}")
+    what = f"{'convolutions' if name in ('tf32', 'winograd') else 'features'} {how}"
+    reason = "requested" if requested != "auto" else "the fastest that the processor computes"
+    yield Decision("precision", what, reason, error=f"a relative error of the pixel gradient of about {_ERRORS[name]}")
 
 
-def _in(precision: PlannedPrecision) -> str:
-    """Return how something is computed in a precision."""
-    return {"winograd": "by Winograd's algorithm", "tf32": "in TF32"}.get(precision, f"in {precision}")
+def _about_measuring(plan: Plan, settings: Settings) -> Iterator[Decision]:
+    """Yield the decision about measurements outside of the steps."""
+    if not plan.measured:
+        return
+    what = f"the loss before the steps on {_count(plan.loss_views, 'view')}"
+    if plan.novel_views:
+        what += f", and {_count(plan.novel_views, 'novel view')} before and after"
+    visits = _visits(plan, settings)
+    reason = f"at most {settings.measure:.0%} of the {visits:,} passes in the steps"
+    reason += "" if plan.novel_views else ", too few for novel views"
+    yield Decision("measuring", what, reason)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

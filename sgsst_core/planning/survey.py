@@ -6,7 +6,6 @@ distributed among ranks.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -29,16 +28,14 @@ SEEN_COVERAGE = 1 / 255
 ShowPlanning = Callable[[Progress], None]
 
 
-def progress_of(surveyed: int, total: int, ranks: int, seconds: float, stage: str = "planning") -> Progress:
+def progress_of(surveyed: int, total: int, ranks: int, stage: str = "planning") -> Progress:
     """Return the progress of all ranks, assuming that they are as fast as this one.
 
     Args:
         surveyed: Number of views that this rank has surveyed.
         total: Number of views that all ranks survey.
-        seconds: Seconds since the stage started.
     """
-    done = min(total, surveyed * ranks)
-    return Progress(stage=stage, step=done, total=total, eta_s=seconds * (total - done) / done if done else None)
+    return Progress(stage=stage, step=min(total, surveyed * ranks), total=total)
 
 
 def sees_something(coverage: Tensor) -> bool:
@@ -83,10 +80,9 @@ def survey_views(
     weights = torch.zeros(len(scene), dtype=torch.float64, device=rasterizer.device)
     views: dict[int, tuple[Rectangle, float, bool]] = {}  # region, uncovered pixels, whether anything is seen
     indices = range(collectives.rank, len(cameras), collectives.size)
-    started = time.perf_counter()
     for done, index in enumerate([*indices, None]):
         if show:
-            show(progress_of(done, len(cameras), collectives.size, time.perf_counter() - started))
+            show(progress_of(done, len(cameras), collectives.size))
         if index is not None:
             coverage, summed = rasterizer.survey(cameras[index])
             uncovered, seen = float((1 - coverage).sum(dtype=torch.float64)), sees_something(coverage)

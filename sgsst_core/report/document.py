@@ -18,19 +18,19 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.convergence import ratio, smoothed
 from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.parallel.collectives import TRAFFIC
-from sgsst_core.planning.measurement_choice import allowed_seconds
-from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.findings import Finding
 from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, relative_loss
+from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.loop import Stopped
+from sgsst_core.stylizing.rates import estimate
 from sgsst_core.stylizing.schedule import StepRecord
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Version of report.json, raised whenever a field is removed or changes its meaning.
 REPORT_VERSION = 3
 #: Version of plan.json.
-PLAN_VERSION = 2
+PLAN_VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,8 @@ def build_report(
         **_outcome_json(stylizer, stopped, before, after),
         "findings": [asdict(finding) for finding in findings],
         **_inputs_json(stylizer, sources),
-        "plan": {**stylizer.job.plan.as_dict(), "measured": _measured(stylizer)},
+        "plan": {**plan_json(stylizer.job), "measured": _measured(stylizer)},
+        "repeat": repeating_options(stylizer),
         "rasterizer": stylizer.job.views.rasterizer.name,
         "memory": {
             "limit_bytes": stylizer.job.memory,
@@ -197,88 +198,71 @@ def _regions_json(stylizer: Stylizer) -> list[dict[str, Any]]:
     ]
 
 
-def plan_json(plan: Plan) -> dict[str, Any]:
-    """Return a plan as JSON-serializable values."""
-    return {"version": PLAN_VERSION, **plan.as_dict()}
+def plan_json(job: StylizationJob) -> dict[str, Any]:
+    """Return the plan of a job as JSON-serializable values, with an estimate of its seconds and a bound on memory."""
+    plan = job.plan
+    return {
+        "version": PLAN_VERSION,
+        "decisions": [asdict(decision) for decision in plan.decisions],
+        "prediction": {**asdict(estimate(job)), "peak_bytes": plan.peak_bytes, "device_bytes": plan.device_bytes},
+    }
+
+
+def repeating_options(stylizer: Stylizer) -> str | None:
+    """Return the options that repeat a job with a time budget exactly, instead of `--within`; None without one."""
+    choice, coarse = stylizer.job.plan.time_choice, stylizer.job.plan.steps_coarse
+    if choice is None:
+        return None
+    steps = min(coarse, stylizer.step), max(stylizer.step - coarse, 0)
+    settings = stylizer.job.settings.model_copy(update={"steps_coarse": coarse}).with_steps(*steps)
+    return (
+        f"--resolution {settings.max_resolution} --views {len(choice.views)} --steps-coarse {steps[0]} "
+        f"--steps-sos {steps[1]} --learning-rate-end {settings.learning_rate_end!r}"
+    )
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:
     """Return the measured values that correspond to the plan's prediction.
 
-    `seconds` and `seconds_coarse` are the seconds of a step on a view visited before, in the phase on all scales and on
-    the coarsest one. `first_visit` and `first_visit_coarse` are the additional seconds of first visits.
-    `communication` is the median seconds per step spent waiting for other ranks, in the phase on all scales. `speed_up`
-    is relative to the predicted time of one rank. `measuring` is the total seconds spent on measurements. Peak memory
-    is that of the process and of its GPU, in bytes.
+    `seconds` and `seconds_coarse` are the seconds of a step in the phase on all scales and on the coarsest one.
+    `communication` is the median seconds per step spent waiting for other ranks, in the phase on all scales.
+    `measuring` is the total seconds spent on measurements. Peak memory is that of the process and of its GPU, in bytes.
     """
-    seconds, first_visits = zip(*(_step_seconds(stylizer, stage) for stage in ("sos", "coarse")), strict=True)
     waited = [record.parts.get("communication", 0.0) for record in stylizer.history if record.stage == "sos"]
-    expected = stylizer.job.plan.prediction
-    one_rank = expected.seconds_one_rank if expected else None
     return {
-        "seconds": seconds[0],
-        "seconds_coarse": seconds[1],
-        "first_visit": first_visits[0],
-        "first_visit_coarse": first_visits[1],
+        "seconds": _step_seconds(stylizer, "sos"),
+        "seconds_coarse": _step_seconds(stylizer, "coarse"),
         "communication": median(waited) if waited else None,
-        "speed_up": one_rank / seconds[0] if one_rank and seconds[0] else None,
         "peak_bytes": peak_memory(),
         "device_bytes": device_peak(stylizer.job.network.device),
         "measuring": stylizer.seconds_by_part.get("measuring"),
     }
 
 
-def _step_seconds(stylizer: Stylizer, stage: str) -> tuple[float | None, float | None]:
-    """Return the `_typical` seconds of a phase's steps on views visited before, and the extra seconds of first visits.
+def _step_seconds(stylizer: Stylizer, stage: str) -> float | None:
+    """Return the mean over a phase's steps of the median seconds of the steps with as many scales; None without any.
 
-    The extra seconds are averaged over first visits. The job's first step is excluded if the phase has other first
-    visits, because it also prepares the style. If no view is visited twice, or if steps use several views (records name
-    only one of them), the first value is that of all steps without their recorded preparation, and the second value is
-    None.
+    Steps are thereby typical: first visits, which prepare a view, hardly count.
     """
-    again: list[tuple[int, float]] = []
-    first: list[float] = []
-    bare: list[tuple[int, float]] = []
-    visited: set[int] = set()
+    steps: list[tuple[int, float]] = []
     before = 0.0
     for record in stylizer.history:
         if record.stage == stage:
-            seconds, scales = record.seconds - before, len(record.evaluated)
-            if record.view in visited:
-                again.append((scales, seconds))
-            else:
-                first.append(seconds)
-            visited.add(record.view)
-            bare.append((scales, sum(own for name, own in record.parts.items() if name != "prepare")))
+            steps.append((len(record.evaluated), record.seconds - before))
         before = record.seconds
-    if stylizer.job.settings.views_per_step > 1 or not again:
-        return (_typical(bare) if bare else None), None
-    known = _typical(again)
-    first = first[1:] if stylizer.history[0].stage == stage and len(first) > 1 else first
-    return known, max(mean(first) - known, 0.0)
-
-
-def _typical(steps: Sequence[tuple[int, float]]) -> float:
-    """Return the mean over steps (number of scales, seconds) of the median of the steps with as many scales."""
     medians = {count: median(seconds for scales, seconds in steps if scales == count) for count, _ in steps}
-    return mean(medians[scales] for scales, _ in steps)
+    return mean(medians[scales] for scales, _ in steps) if steps else None
 
 
 def _measuring_json(stylizer: Stylizer) -> dict[str, Any]:
     """Return the number of measurements, their time, and its ratio to the time of the steps."""
-    seconds, expected = stylizer.seconds_by_part.get("measuring", 0.0), stylizer.job.plan.prediction
-    fraction = stylizer.job.settings.measure
+    seconds = stylizer.seconds_by_part.get("measuring", 0.0)
     return {
-        "fraction": fraction,
-        "allowed": allowed_seconds(stylizer.job.settings, expected.job - expected.measuring) if expected else None,
+        "fraction": stylizer.job.settings.measure,
         "seconds": round(seconds, 3),
         "of_steps": seconds / stylizer.seconds if stylizer.seconds else None,
         "loss_views": len(stylizer.job.evaluation_views),
         "novel_view_count": len(stylizer.measured[0].get("novel_view_names", [])) if stylizer.measured else 0,
-        "moments": [
-            {"step": entry["step"], "seconds": round(entry["seconds"], 3) if "seconds" in entry else None}
-            for entry in stylizer.measured
-        ],
     }
 
 

@@ -85,10 +85,10 @@ def decision_table(report: dict[str, Any]) -> Table:
     """Return the plan's decisions with their reasons, savings and costs."""
     texts = ["item", "decision", "reason", "error"]
     rows = [
-        [*(entry[name] for name in texts[:3]), duration(entry["seconds"]), byte_count(entry["bytes"]), entry["error"]]
+        [*(entry[name] for name in texts[:3]), byte_count(entry["bytes"]), entry["error"]]
         for entry in report["plan"]["decisions"]
     ]
-    return Table([*texts[:3], "saves per step", "saves memory", "error"], rows, texts)
+    return Table([*texts[:3], "saves memory", "error"], rows, texts)
 
 
 def prediction_table(report: dict[str, Any]) -> Table:
@@ -104,24 +104,11 @@ def prediction_table(report: dict[str, Any]) -> Table:
         add(title, text, predicted.get(name), measured.get(name))
 
     add_value("step on all scales", duration, "seconds")
-    # The other rows apply to views visited before.
-    if measured.get("first_visit") is not None:
-        add_value("first visit of a view, in addition", duration, "first_visit")
-    if measured.get("first_visit_coarse") is not None:
-        add_value("the same in phase 1", duration, "first_visit_coarse")
-    add_value("peak memory", byte_count, "peak_bytes")
-    measuring = predicted.get("measuring"), measured.get("measuring")
-    if measuring[0] and measuring[1] is not None:
-        add("measuring, total", duration, *measuring)
-        wholes = predicted["job"] - measuring[0], report["seconds"]
-        parts = [part / whole if whole else None for part, whole in zip(measuring, wholes, strict=True)]
-        add("measuring, relative to the steps' time", percent, *parts)
+    add_value("peak memory (upper bound)", byte_count, "peak_bytes")
+    if predicted.get("measuring"):
+        add_value("measuring, total", duration, "measuring")
     if any(values.get("device_bytes") is not None for values in (predicted, measured)):
-        add_value("peak memory of the GPU", byte_count, "device_bytes")
-    one_rank, seconds = predicted.get("seconds_one_rank"), predicted.get("seconds")
-    if one_rank and seconds:
-        add("waiting for other ranks, per step", duration, predicted["communication"], measured.get("communication"))
-        add("speedup over one rank", number, one_rank / seconds, measured.get("speed_up"))
+        add_value("peak memory of the GPU (upper bound)", byte_count, "device_bytes")
     return Table(["", "predicted", "measured", "measured / predicted"], rows)
 
 

@@ -27,7 +27,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.loss.feature_scale import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCALE
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.planning.plan import Plan, Work
 from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.refine.split import Refinement
@@ -351,7 +351,7 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
     regions = [Rectangle(**region) for region in survey.pop("regions")]
     decisions = tuple(Decision(**decision) for decision in values.pop("decisions"))
     covered = tuple(values.pop("covered"))
-    expected = values.pop("prediction")
+    work = Work(**values.pop("work"))
     if chosen := values.pop("time_choice", None):
         chosen = TimeChoice(**{**chosen, "views": tuple(chosen["views"])})
     refined, refinement = values.pop("refinement", None), None
@@ -363,7 +363,7 @@ def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
         seen=tensors["plan.seen"],
         covered=covered,
         decisions=decisions,
-        prediction=Prediction(**expected) if expected else None,
+        work=work,
         refinement=refinement,
         time_choice=chosen,
         **values,

@@ -24,7 +24,7 @@ from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.choices import ends_with_transfer
-from sgsst_core.planning.context import PlanningContext, make_network, sharing_memory
+from sgsst_core.planning.facts import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.base import Color
@@ -87,6 +87,7 @@ class StylizationJob:
         view_targets: Targets of the views, except the style's.
         memory_limit: Memory budget in bytes of all ranks on one machine together. It determines the partition, and
             thereby rounding, so it is identical on all ranks.
+        survey_seconds: About the seconds of the rasterizer's pass over a view; 0 if unknown.
     """
 
     plan: Plan
@@ -104,6 +105,7 @@ class StylizationJob:
     memory_limit: int
     memory: int
     style_targets: StyleTargetCache
+    survey_seconds: float = 0.0
 
     @property
     def style(self) -> Style:
@@ -225,9 +227,6 @@ def prepare_job(
             for unstylized renders.
         planning_context: Planning context of the plan; None to create its objects again.
         regions: Regions for which the plan was made, each with its own style or frozen; None for one style everywhere.
-
-    Raises:
-        RankLeftOut: If the job continues without this rank.
     """
     weights = weights_for(weights, settings)
     attenuated = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
@@ -235,10 +234,11 @@ def prepare_job(
     styles = _job_styles(plan, scene, fitted, style, settings, regions)
     forget_device_peak(plan.device)
     network = (
-        planning_context.network if planning_context else make_network(weights, settings, plan.precision, plan.device)
+        planning_context.network(plan.precision)
+        if planning_context
+        else make_network(weights, settings, plan.precision, plan.device)
     )
-    team = Team(plan, settings, collectives)
-    team.expect(plan)
+    team = Team(settings, collectives)
     memory_limit = settings.memory_limit or plan.memory_limit
     memory = memory_limit // sharing_memory(team.everybody, plan.device)
     loss = make_loss(
@@ -265,7 +265,8 @@ def prepare_job(
         divider=loss.divider,
         timer=loss.timer,
     )
-    _limit_intersections(views, plan, memory)
+    if plan.spare:
+        views.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare // 2)
     repeatable = rasterizer.repeatable
     view_targets = ViewTargets(
         views,
@@ -296,16 +297,6 @@ def prepare_job(
         memory=memory,
         style_targets=StyleTargetCache(styles.to(network.device), loss),
     )
-
-
-def continued(job: StylizationJob, plan: Plan, settings: Settings) -> StylizationJob:
-    """Return the job of a trial under its completed plan and settings. What the trial has cached stays if it fits."""
-    job.team.expect(plan)
-    memory = view_memory(plan, job.memory)
-    job.views.limit(memory)
-    job.view_targets.limit(memory)
-    _limit_intersections(job.views, plan, job.memory)
-    return replace(job, plan=plan, settings=settings, graphs=LossGraphs(job.loss) if plan.graphs else None)
 
 
 def in_bfloat16(job: StylizationJob, step: int) -> StylizationJob:
@@ -366,19 +357,13 @@ def _make_rasterizer(
 
 
 def view_memory(plan: Plan, memory: int) -> int:
-    """Return the budget in bytes for data of the views: what other caches leave of it, and `Plan.spare`."""
-    left = memory_for("views", memory) + plan.spare
+    """Return the budget in bytes for data of the views: what other caches leave of it, and half of `Plan.spare`."""
+    left = memory_for("views", memory) + plan.spare // 2
     if plan.cached_weights != "none":
         left -= least_intersection_memory(memory)
     if plan.measured:
         left -= (2 if plan.is_approximated else 1) * measuring_memory(memory)
     return left
-
-
-def _limit_intersections(views: Views, plan: Plan, memory: int) -> None:
-    """Let tile intersections use the memory that a plan has to spare for them."""
-    if plan.spare_intersections:
-        views.caches["intersections"].limit(memory_for("rasterizer", memory) + plan.spare_intersections)
 
 
 def with_second_attempt(job: StylizationJob, work: Callable[[], T]) -> T:

@@ -11,38 +11,28 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, Protocol
+from typing import Literal
 
 from sgsst_core.loss.convergence import has_converged, has_reached, window_length
-from sgsst_core.planning.plan import Prediction
-from sgsst_core.planning.time_budget import SecondsLeft as BudgetLeft
-from sgsst_core.planning.time_budget import seconds_left
+from sgsst_core.planning.time_budget import SecondsLeft, ending_seconds
 from sgsst_core.progress import Progress
 from sgsst_core.stylizing.evaluation import RunningRound, mean_loss
-from sgsst_core.stylizing.seconds_left import Pace, SecondsLeft
+from sgsst_core.stylizing.rates import NETWORK_PARTS, Rates, estimate
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.timing import seconds_left
 
 Stopped = Literal["finished", "within", "target-loss", "converged", "on-request", "interrupted"]
 
 
-class Measuring(Protocol):
-    """Measurement of a job at certain steps."""
-
-    def __call__(self, stylizer: Stylizer) -> None:
-        """Measure now, and append an entry to `Stylizer.measured`."""
-
-    def due(self, step: int) -> bool:
-        """Return whether the job is to be measured after this many steps."""
-
-    def seconds_left(self, step: int, *, ends: bool = False) -> float:
-        """Return the expected seconds of the remaining measurements after this many steps, with `ends` the last."""
+#: Number of latest steps that the remaining time follows from, and number from which on it does.
+_LATEST, _KNOWN = 30, 10
+#: Number of steps between two choices of how many remain of a time budget, and number of steps before the first.
+_STEERED, _FIRST_STEERED = 5, 4
 
 
 @dataclass
 class Callbacks:
-    """Optional callbacks of the loop, called between iterations.
-
-    `measure` must be the same on every rank; give the other callbacks to the first rank only.
+    """Optional callbacks of the loop, called between iterations; give them to the first rank only.
 
     Attributes:
         progress: Called after the first and the last iteration, and between them about every `progress_seconds`.
@@ -50,9 +40,8 @@ class Callbacks:
         finish: Called before every iteration but the first; True ends the loop as "on-request".
         checkpoint: Called with the stylizer about every `checkpoint_seconds`, and once if the loop ends early.
         preview: Called with the stylizer before the first step and about every `preview_seconds`.
-        measure: Called with the stylizer after each step for which it is due; its time does not count toward
-            `Stylizer.seconds`.
-        left: Seconds left of the time budget (`Settings.within`); None to count it from the start of the loop.
+        left: Seconds left of the time budget (`Settings.within`), on every rank; None to count it from the start of
+            the loop.
 
     Example:
         >>> steps = []
@@ -72,8 +61,7 @@ class Callbacks:
     checkpoint_seconds: float = 300.0
     preview: Callable[[Stylizer], None] | None = None
     preview_seconds: float = 60.0
-    measure: Measuring | None = None
-    left: BudgetLeft | None = None
+    left: SecondsLeft | None = None
 
 
 def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
@@ -90,23 +78,25 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     callbacks.left = callbacks.left or seconds_left(stylizer.job.settings.within)
     try:
         last_checkpoint = last_preview = time.perf_counter()
-        pace, ended = _pace(stylizer), partial(_end_requested, stylizer, callbacks, stylizer.step)
+        pace, ended = _Pace(stylizer), partial(_end_requested, stylizer, callbacks, stylizer.step)
         report = _Reports(stylizer, callbacks, pace)
         if callbacks.preview and not stylizer.step:
             callbacks.preview(stylizer)
-        _measure(stylizer, callbacks)  # a resumed job may have been stopped before this measurement
+        if stylizer.step:  # a resumed job may have had more steps than were chosen at first
+            _steer(stylizer, callbacks, pace, at_once=True)
         while stylizer.step < stylizer.job.total_steps:
-            reason = stylizer.job.collectives.broadcast(ended) or _enough(stylizer)
+            reason = stylizer.job.collectives.broadcast(partial(ended, pace)) or _enough(stylizer)
             if reason:
                 stylizer.read_step()
+                pace.remember()
                 report(last=True)
                 if callbacks.checkpoint:
                     _checkpoint(stylizer, callbacks.checkpoint)
                 return reason
-            _step(stylizer, pace)
+            stylizer.queue_step()
+            _steer(stylizer, callbacks, pace)
             now = time.perf_counter()
-            measures = callbacks.measure is not None and callbacks.measure.due(stylizer.step)
-            last = measures or stylizer.step == stylizer.job.total_steps
+            last = stylizer.step == stylizer.job.total_steps
             if last:
                 stylizer.read_step()
             report(last=last)
@@ -117,13 +107,85 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
                 callbacks.preview(stylizer)
                 last_preview = time.perf_counter()
             pace.add_beside(time.perf_counter() - now)
-            _measure(stylizer, callbacks)
-        return "finished"
+        pace.remember()
+        choice = stylizer.job.plan.time_choice
+        return "within" if choice and stylizer.job.settings.steps_sos < choice.all_steps else "finished"
     finally:
         stylizer.job.view_targets.end_prefetch()
 
 
-def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int) -> Stopped | None:
+class _Pace:
+    """Pace of a job's steps: seconds per pixel that this rank passes through the network.
+
+    Before the first ten steps, it is that of the estimate.
+    """
+
+    def __init__(self, stylizer: Stylizer) -> None:
+        self._stylizer, self._estimate, self._first = stylizer, estimate(stylizer.job), len(stylizer.history)
+        self._earlier, self._beside = stylizer.seconds, 0.0
+        stylizer.job.team.expect(self._estimate.seconds)
+
+    def add_beside(self, seconds: float) -> None:
+        """Record time that is not a step: a checkpoint or a preview."""
+        self._beside += seconds
+
+    def step_seconds(self, *, coarse: bool = False, least: int = _KNOWN) -> float:
+        """Return the seconds of a mean step of a phase, with what happens between steps.
+
+        Args:
+            least: Number of steps from which on they count instead of the estimate.
+        """
+        work, expected, history = self._stylizer.job.plan.work, self._estimate, self._stylizer.history
+        start = max(self._first, len(history) - _LATEST)
+        pixels = sum(record.pixels for record in history[start:])
+        if len(history) - start < least or not pixels:
+            return expected.seconds_coarse if coarse else expected.seconds
+        seconds = history[-1].seconds - (history[start - 1].seconds if start else 0.0)
+        beside = self._beside / (history[-1].seconds - self._earlier)
+        return (work.coarse if coarse else work.sos) * seconds / pixels * (1 + beside)
+
+    def ending_seconds(self) -> float:
+        """Return the seconds from the last step to the last file, with the measurements."""
+        work = self._stylizer.job.plan.work
+        measuring = work.measuring / work.sos * self.step_seconds() if work.sos else 0.0
+        return measuring + ending_seconds(len(self._stylizer.job.scene))
+
+    def left(self) -> float:
+        """Return the remaining seconds of the job."""
+        job, step = self._stylizer.job, self._stylizer.step
+        coarse = max(job.plan.steps_coarse - step, 0)
+        sos = job.total_steps - max(step, job.plan.steps_coarse)
+        return coarse * self.step_seconds(coarse=True) + sos * self.step_seconds() + self.ending_seconds()
+
+    def remember(self) -> None:
+        """Leave the rate of the network in this run's steps behind for later jobs."""
+        job, records = self._stylizer.job, self._stylizer.history[self._first + 1 :]  # the first one prepares the style
+        seconds = sum(record.parts.get(name, 0.0) for record in records for name in NETWORK_PARTS)
+        rate = sum(record.pixels for record in records) / max(seconds, 1e-9)
+        if job.collectives.rank == 0 and rate and seconds:
+            Rates(job.network, job.plan.precision, job.settings).remember(job.plan.work.sos, rate)
+
+
+def _steer(stylizer: Stylizer, callbacks: Callbacks, pace: _Pace, *, at_once: bool = False) -> None:
+    """Let the pace of a job with a time budget decide, every few steps, how many steps remain."""
+    job = stylizer.job
+    choice, done = job.plan.time_choice, stylizer.step - job.plan.steps_coarse
+    if choice is None or choice.most_steps is None or done < _FIRST_STEERED:
+        return
+    if not at_once and (done - _FIRST_STEERED) % _STEERED:
+        return
+
+    def total() -> int:
+        usable = (callbacks.left() if callbacks.left else 0.0) - pace.ending_seconds()
+        more = math.floor(usable / pace.step_seconds(least=_FIRST_STEERED))
+        return min(max(done + more, done), choice.most_steps or done)
+
+    settings = job.settings.model_copy(update={"steps_coarse": job.plan.steps_coarse})
+    settings = settings.with_steps(job.plan.steps_coarse, job.collectives.broadcast(total))
+    stylizer.job = replace(job, settings=settings)
+
+
+def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int, pace: _Pace) -> Stopped | None:
     """Return the reason if the user or the time limit ends the run before the next step. Ranks may disagree.
 
     A run that is to have a result makes a step at least, given the step that it starts at: resuming it gets further.
@@ -134,15 +196,10 @@ def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int) -> Stop
         return None
     if callbacks.finish and callbacks.finish():
         return "on-request"
-    return "within" if callbacks.left and callbacks.left() <= _reserved(stylizer, callbacks) else None
-
-
-def _reserved(stylizer: Stylizer, callbacks: Callbacks) -> float:
-    """Return the seconds of a time budget that the next step and the end of the job need."""
-    expected = stylizer.job.plan.prediction or Prediction(0.0, 0.0, 0)
-    step = stylizer.seconds / stylizer.step if stylizer.step else expected.seconds
-    measuring = callbacks.measure.seconds_left(stylizer.step, ends=True) if callbacks.measure else 0.0
-    return step + measuring + expected.ending
+    if callbacks.left is None:
+        return None
+    coarse = stylizer.phase.scale is not None
+    return "within" if callbacks.left() <= pace.step_seconds(coarse=coarse, least=1) + pace.ending_seconds() else None
 
 
 def _enough(stylizer: Stylizer) -> Stopped | None:
@@ -170,35 +227,10 @@ def _enough(stylizer: Stylizer) -> Stopped | None:
     return "converged" if stops_early and has_converged(losses, stylizer.job.round_length) else None
 
 
-def _measure(stylizer: Stylizer, callbacks: Callbacks) -> None:
-    measured = stylizer.measured and stylizer.measured[-1]["step"] == stylizer.step  # by an earlier session
-    if callbacks.measure and not measured and callbacks.measure.due(stylizer.step):
-        callbacks.measure(stylizer)
-
-
-def _pace(stylizer: Stylizer) -> SecondsLeft:
-    """Return the estimator of the remaining time."""
-    expected = stylizer.job.plan.prediction or Prediction(0.0, 0.0, 0)
-    seconds = {
-        "coarse": (expected.seconds_coarse, expected.first_visit_coarse),
-        "sos": (expected.seconds, expected.first_visit),
-    }
-    phases = {phase.stage: Pace(phase.steps, *seconds.get(phase.stage, ())) for phase in stylizer.job.schedule}
-    return SecondsLeft(phases, stylizer.job.views.covered, stylizer.job.settings.views_per_step)
-
-
-def _step(stylizer: Stylizer, pace: SecondsLeft) -> None:
-    """Run and time one step, without the one-off style setup."""
-    before, style_before, stage = stylizer.seconds, stylizer.job.style_targets.seconds, stylizer.phase.stage
-    stylizer.queue_step()
-    style = stylizer.job.style_targets.seconds - style_before
-    pace.add_step(stage, stylizer.latest, stylizer.seconds - before - style)
-
-
 class _Reports:
     """Reports of the progress, with the mean loss of the last round of views."""
 
-    def __init__(self, stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft) -> None:
+    def __init__(self, stylizer: Stylizer, callbacks: Callbacks, pace: _Pace) -> None:
         self._stylizer, self._callbacks, self._pace = stylizer, callbacks, pace
         self._running = RunningRound(stylizer.job.round_length, stylizer.job.loss.weights, stylizer.history)
         self._added = self._reported = len(stylizer.history)
@@ -214,28 +246,22 @@ class _Reports:
         self._added = len(history)
         if self._reported < self._added and (last or now - self._at >= self._callbacks.progress_seconds):
             self._reported, self._at = self._added, now
-            self._callbacks.progress(_progress(self._stylizer, self._callbacks, self._pace, self._running))
+            self._callbacks.progress(self._progress())
 
-
-def _progress(stylizer: Stylizer, callbacks: Callbacks, pace: SecondsLeft, running: RunningRound) -> Progress:
-    record, measure, expected = stylizer.history[-1], callbacks.measure, stylizer.job.plan.prediction
-    limit = callbacks.left() - _reserved(stylizer, callbacks) if callbacks.left else None
-    left = pace.left(stylizer.step, limit=limit)
-    left += measure.seconds_left(stylizer.step) if measure else 0.0
-    stage = "measuring" if measure and measure.due(stylizer.step) else record.stage
-    if expected:
-        left += expected.ending
-    return Progress(
-        stage=stage,
-        step=record.step,
-        total=stylizer.job.total_steps,
-        eta_s=left,
-        loss=record.loss,
-        scales=_by_scale({scale: terms.total for scale, terms in record.terms.items()}),
-        mean_loss=running.loss,
-        mean_scales=_by_scale(running.scales()),
-        seconds=stylizer.seconds,
-    )
+    def _progress(self) -> Progress:
+        stylizer, record, running = self._stylizer, self._stylizer.history[-1], self._running
+        left = self._pace.left()
+        return Progress(
+            stage=record.stage,
+            step=record.step,
+            total=stylizer.job.total_steps,
+            eta_s=left if self._callbacks.left is None else min(left, max(self._callbacks.left(), 0.0)),
+            loss=record.loss,
+            scales=_by_scale({scale: terms.total for scale, terms in record.terms.items()}),
+            mean_loss=running.loss,
+            mean_scales=_by_scale(running.scales()),
+            seconds=stylizer.seconds,
+        )
 
 
 def _by_scale(losses: Mapping[int, float]) -> list[float | None] | None:

@@ -1,10 +1,11 @@
-"""Planner: survey all views, decide what a job leaves out, make a trial of it, and predict its cost."""
+"""Planner: survey all views, and prepare the job that the plan describes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from statistics import median
 
 from sgsst_core.budget import memory_for
 from sgsst_core.decision import ANOTHER_LOSS, Decision
@@ -15,23 +16,19 @@ from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.statistics_terms import has_statistics
 from sgsst_core.orbit.choice import Orbit, orbit_decisions
-from sgsst_core.parallel.collectives import ALONE, Collectives, RankLeftOut
+from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning import choices
-from sgsst_core.planning.context import (
+from sgsst_core.planning.facts import (
     Facts,
-    NetworkPixels,
-    Networks,
     PlanningContext,
-    available_precisions,
-    common_device,
-    compare_precisions,
+    count_intersections,
+    count_weights,
     equip,
-    weight_cost,
+    evaluated_pixels,
 )
-from sgsst_core.planning.plan import Device, Plan, Shape
+from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
-from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice, ViewCost, choosable, choose, pixels_of
-from sgsst_core.progress import Progress
+from sgsst_core.planning.time_budget import Pace, SecondsLeft, TimeChoice, choosable, choose
 from sgsst_core.refine.choice import refine_decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions, region_decisions
@@ -39,25 +36,15 @@ from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.colors import color_subspace_of
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import harmonics_energy
-from sgsst_core.settings import PlannedPrecision, Settings
+from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import StylizationJob, continued, prepare_job
+from sgsst_core.stylizing.job import StylizationJob, prepare_job
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
-from sgsst_core.stylizing.prediction import (
-    completed_plan,
-    ending_seconds,
-    sos_seconds,
-    step_seconds,
-    with_spare_memory,
-)
-from sgsst_core.stylizing.trial import Trial, launch_cost, run_trial
+from sgsst_core.stylizing.rates import Rates
 from sgsst_core.timing import Timer
 
-#: Longer side in pixels of the views that a time budget is chosen from, and their number for each rank. The time of
-#: larger views is about in proportion to their pixels; smaller ones take a third more for each pixel on a CPU, and hide
-#: how much a GPU can do at once.
-_TRIED_SIDE: dict[Device, int] = {"cpu": 256, "cuda": 1280}
-_TRIED_VIEWS = 4
+#: Longer side in pixels of the views that a time budget is chosen from, and their number.
+_SMALL_SIDE, _SMALL_VIEWS = 256, 4
 
 
 def plan_job(
@@ -81,12 +68,8 @@ def plan_job(
     regions: Regions | None = None,
     refinement: Refinement | None = None,
     chosen: TimeChoice | None = None,
-    left: SecondsLeft | None = None,
-    networks: Networks | None = None,
 ) -> StylizationJob:
     """Plan and prepare a job. Every rank must call this with the same arguments, and gets the same plan.
-
-    The job keeps what the survey and the trial have computed.
 
     Args:
         scene: Scene, after refinement if there was one.
@@ -97,109 +80,74 @@ def plan_job(
         plan: Plan from an earlier run of the same job, which is used unchanged; None to make one.
         survey: Survey from an earlier plan of the same job; None to survey the views.
         groups: `Plan.groups` of an earlier plan of the same job; None to choose them.
-        measured: Whether quality is measured between steps and a report is written, as in `sgsst stylize`.
-        show: Callback for the progress of the survey and the trial.
-        timer: Timer that records the survey as "survey", other planning as "planning", and the preparation of a job
-            with an earlier plan as "preparing".
+        measured: Whether quality is measured and a report is written, as in `sgsst stylize`.
+        show: Callback for the progress of the survey.
+        timer: Timer that records the survey as "survey", other planning as "planning", and the preparation of the job
+            as "preparing".
         orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
         about_inputs: Decisions about cameras and photos that start the plan.
         regions: Regions of the scene; None if there are none.
         refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
         chosen: Choice of the time budget, to which `cameras` and `photos` belong (`choose_within`); None without one.
-        left: Seconds left of the time budget, for which the trial corrects the number of steps; None to leave it.
-        networks: Networks of earlier plans of the same job, to reuse and to replace; None if this is the first plan.
 
     Raises:
         CameraError: If there are no cameras, or none sees a Gaussian.
-        SettingsError: If regions freeze everything visible, views lack requested scales, or the rasterizer does not
-            work here.
+        SettingsError: If regions freeze everything visible, views lack requested scales, or the rasterizer or the
+            precision does not work here.
         WeightsError: If there are no weights.
-        RankLeftOut: If the plan does not use this rank.
     """
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
     timer, weights = timer or Timer(), weights_for(weights or load_network_weights("auto"), settings)
-    asked, settings = settings, chosen.applied(settings) if chosen else settings
-
-    def prepared(plan: Plan, context: PlanningContext | None = None) -> StylizationJob:
-        return prepare_job(
+    asked, settings, context = settings, chosen.applied(settings) if chosen else settings, None
+    if plan is None:
+        with timer("planning"):
+            fitted = fit_cameras(cameras, settings)
+            check_scales(settings.scales, fitted, settings.coarsest_side)
+            check_stroke_depth(settings, fitted, regions=regions is not None)
+            context = equip(scene, fitted, settings, weights, collectives, rasterizer)
+            if survey is None:
+                with timer("survey"):
+                    survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
+            about = [*about_inputs]
+            if chosen:
+                about.append(chosen.decision(asked.within, settings.steps_coarse + settings.steps_sos))
+            if refinement is not None:
+                about.append(refine_decision(refinement, settings))
+            if orbit is not None:
+                about += orbit_decisions(orbit, fitted, survey.uncovered)
+            if regions is not None:
+                covered = [fitted[index] for index in survey.covered]
+                about += region_decisions(regions, survey.total_blend_weights, covered)
+            about += _about_styles(style, regions, settings)
+            facts = collectives.broadcast(lambda: _facts(context, survey, regions))
+            plan = choices.make_plan(facts, settings, groups=groups, measured=measured, about=about)
+            plan = replace(plan, refinement=refinement, time_choice=chosen)
+    with timer("preparing"):
+        job = prepare_job(
             plan, scene, cameras, style, choices.with_groups(settings, plan.groups), weights=weights, photos=photos,
             collectives=collectives, planning_context=context, regions=regions,
         )  # fmt: skip
-
-    if plan is not None:
-        with timer("preparing"):
-            return prepared(plan)
-    with timer("planning"):
-        fitted = fit_cameras(cameras, settings)
-        check_scales(settings.scales, fitted, settings.coarsest_side)
-        check_stroke_depth(settings, fitted, regions=regions is not None)
-        context = equip(scene, fitted, settings, weights, collectives, rasterizer, networks)
-        if survey is None:
-            with timer("survey"):
-                survey = survey_views(context.scene, fitted, context.rasterizer, collectives, show)
-        if show:
-            show(Progress(stage="probing"))
-        precisions = available_precisions(settings, context.machine.device, collectives)
-        facts = collectives.broadcast(lambda: _facts(context, survey, regions, precisions))
-        draft = choices.draft_plan(facts, settings, measured=measured)
-        network = context.networks.get(draft.precision, context.weights, settings, draft.device)
-        context.networks.created, context.networks.precisions = {draft.precision: network}, facts.precisions
-        context = replace(context, network=network)
-        activations = memory_for("activations", context.machine.memory)
-        pixels = NetworkPixels.of(draft, facts.sizes, make_loss(context.network, settings, activations).tiling)
-        of_a_view = int(pixels.held * context.network.held_bytes_per_pixel())
-        draft = with_spare_memory(draft, facts, of_a_view)
-        lines = [*about_inputs]
-        if refinement is not None:
-            lines.append(refine_decision(refinement, settings))
-        if orbit is not None:
-            lines += orbit_decisions(orbit, fitted, survey.uncovered)
-        if regions is not None:
-            lines += region_decisions(regions, survey.total_blend_weights, [fitted[index] for index in draft.covered])
-        lines += _about_styles(style, regions, settings)
-
-        def shaped(shape: Shape) -> StylizationJob:
-            return prepared(replace(draft, ranks=shape[0], groups=shape[1]), context)
-
-        job, trials = _try_shapes(shaped, draft, facts, settings, groups, collectives, show)
-        if chosen and left:
-            correct = partial(_corrected, chosen, draft, asked, trials.values(), facts, left)
-            chosen = collectives.broadcast(correct)
-            settings = chosen.applied(asked)
-            draft = replace(draft, steps_coarse=settings.steps_coarse if draft.steps_coarse else 0)
-        cost = launch_cost(job) if job and choices.considers_graphs(draft, facts, job.settings) else None
-        plan = collectives.broadcast(lambda: completed_plan(draft, facts, settings, pixels, trials, cost))
-        plan = with_spare_memory(plan, facts, of_a_view)  # graphs, which the draft lacks, leave less
-        lines += [chosen.decision(asked.within, plan.steps_coarse + settings.steps_sos)] if chosen else []
-        intersections = max(trials[plan.ranks, plan.groups].spare - (draft.spare - plan.spare), 0)
-        plan = replace(plan, spare_intersections=intersections, refinement=refinement, time_choice=chosen)
-        plan = replace(plan, decisions=(*lines, *plan.decisions))
-        if job and (plan.ranks, plan.groups) == (job.collectives.size, job.plan.groups):
-            return continued(job, plan, choices.with_groups(settings, plan.groups))
-        job = None  # frees its memory
-        return prepared(plan, context)
+    cache = context.rasterizer.caches.get("intersections") if context else None
+    costs = [seconds for _, seconds in cache.costs.values()] if cache is not None else []
+    # The median, because the first view may compile kernels; a pass takes about as long as the intersections.
+    return replace(job, survey_seconds=2 * median(costs)) if costs else job
 
 
 def choose_within(
     scene: Scene,
     cameras: Sequence[Camera],
-    style: Style,
     settings: Settings,
     left: SecondsLeft,
     *,
     weights: BackboneWeights | None = None,
     rasterizer: str | None = None,
     collectives: Collectives = ALONE,
-    regions: Regions | None = None,
-    show: ShowPlanning | None = None,
-    networks: Networks | None = None,
 ) -> TimeChoice | None:
-    """Choose what fits a time budget, from a trial of a few small views. Every rank must call this function.
+    """Choose what fits a time budget, from a survey of a few small views. Every rank must call this function.
 
     Args:
         left: Seconds left of the budget.
-        networks: Networks to create for the trial, which `plan_job` can reuse; None if it does not.
 
     Returns:
         The choice; None if the settings give everything.
@@ -208,113 +156,52 @@ def choose_within(
         return None
     if not cameras:
         raise CameraError("There are no cameras. Give a camera file, or use --orbit.")
-    fitted, side, timer = fit_cameras(cameras, settings), _TRIED_SIDE[common_device(collectives)], Timer()
-    small = [resized(each, min(side, each.side)) for each in spread(fitted, _TRIED_VIEWS * collectives.size)]
-    own = {"max_resolution": side, "rebalance": False, "scales": (), "stroke_depth": False, "refine": 1.0}
-    tried = plan_job(
-        scene, small, style, settings.model_copy(update=own), weights=weights, rasterizer=rasterizer,
-        collectives=collectives, regions=regions, timer=timer, show=show, networks=networks,
-    ).plan.prediction  # fmt: skip
-    assert tried is not None
-    # The trial visits up to half of the views, so the prediction has half of the first visits.
-    first, survey = 2 * tried.first_visit, timer.seconds.get("survey", 0.0) / len(small)
-    cost = ViewCost(pixels_of(small, side, settings)[0], tried.seconds, first, survey)
-    return collectives.broadcast(lambda: choose(fitted, settings, cost, left(), ending_seconds(len(scene))))
+    fitted = fit_cameras(cameras, settings)
+    weights = weights_for(weights or load_network_weights("auto"), settings)
+    small = [resized(each, min(_SMALL_SIDE, each.side)) for each in spread(fitted, _SMALL_VIEWS)]
+    context = equip(scene, small, settings, weights, collectives, rasterizer)
+    precision = choices.choose_precision(settings, context.machine)
+
+    def choice() -> TimeChoice:
+        context.rasterizer.survey(small[0])  # the first pass starts libraries and compiles kernels
+        context.rasterizer.forget_views()
+        started = time.perf_counter()
+        survey = survey_views(context.scene, small, context.rasterizer)
+        seconds = (time.perf_counter() - started) / len(small)
+        areas = [camera.width * camera.height for camera in small]
+        weighted = choices.is_weighted(survey, settings)
+        passed = [survey.regions[index].pixels if weighted else areas[index] for index in survey.covered]
+        pixels = evaluated_pixels(fitted, settings)[0] * settings.views_per_step / collectives.size
+        rate = collectives.size * Rates(context.network(precision), precision, settings).rate(pixels)
+        portion = sum(passed) / sum(areas[index] for index in survey.covered)
+        pace = Pace(rate, seconds, sum(areas) / len(areas), portion)
+        return choose(fitted, settings, pace, left(), len(scene))
+
+    return collectives.broadcast(choice)
 
 
-def _corrected(
-    chosen: TimeChoice, draft: Plan, settings: Settings, trials: Collection[Trial], facts: Facts, left: SecondsLeft
-) -> TimeChoice:
-    """Return the choice of a time budget with the steps that fit after the trial.
-
-    Args:
-        draft: Plan of the chosen views.
-        settings: Settings without the choice.
-        left: Seconds left of the budget.
-    """
-    coarse = settings.steps_coarse if draft.steps_coarse else 0
-
-    def seconds_of(trial: Trial) -> float:
-        return coarse * trial.coarse.seconds + settings.steps_sos * sos_seconds(trial, facts, settings)
-
-    best = min(trials, key=seconds_of)
-    first = best.sos.first + (best.coarse.first if coarse else 0.0)
-    once = min(chosen.steps_sos * settings.views_per_step, len(draft.covered)) * first
-    return chosen.corrected(settings, seconds_of(best), once + ending_seconds(facts.gaussians), left())
-
-
-def _try_shapes(
-    prepared: Callable[[Shape], StylizationJob],
-    draft: Plan,
-    facts: Facts,
-    settings: Settings,
-    groups: int | None,
-    collectives: Collectives,
-    show: ShowPlanning | None,
-) -> tuple[StylizationJob | None, dict[Shape, Trial]]:
-    """Make a trial of a job with some numbers of ranks that divide each view, and with a view for each if that may pay.
-
-    Args:
-        groups: Groups of the job if they were chosen before.
-
-    Returns:
-        The last job, or None if this rank does not take part in it; and the trials by number of ranks and groups.
-    """
-    trials: dict[Shape, Trial] = {}
-    ranks, shapes = facts.machine.ranks, [(count, groups or 1) for count in _rank_counts(facts.machine.ranks, settings)]
-
-    def show_views(visited: int, views: int) -> None:
-        if show:
-            show(Progress(stage="probing", step=len(trials) * views + visited, total=len(shapes) * views))
-
-    for shape in shapes:
-        job = own = None  # frees the memory of the last one
-        try:
-            job = prepared(shape)
-            own = run_trial(job, show_views)
-        except RankLeftOut:
-            pass
-        of_first = collectives.all_gather(own)[0]
-        assert of_first is not None  # the first rank takes part in every trial
-        trials[shape] = of_first
-        if shape == (ranks, 1) and not groups:
-            seconds = step_seconds(draft, facts, settings, trials)
-            shapes += [(ranks, ranks)] * choices.considers_groups(draft, facts, settings, seconds)
-    return job, trials
-
-
-def _rank_counts(available: int, settings: Settings) -> list[int]:
-    """Return the numbers of ranks to try: all, half of them and so on. The job of the last trial can be continued."""
-    if not settings.rebalance:
-        return [available]
-    return sorted({max(available >> halvings, 1) for halvings in range(available.bit_length())})
-
-
-def _facts(
-    context: PlanningContext, survey: Survey, regions: Regions | None, precisions: Sequence[PlannedPrecision]
-) -> Facts:
-    """Gather the facts on which the decisions before the trial depend; one rank does this for all."""
-    scene, settings = context.scene, context.settings
+def _facts(context: PlanningContext, survey: Survey, regions: Regions | None) -> Facts:
+    """Gather the facts on which the plan depends; one rank does this for all."""
+    scene, settings, machine = context.scene, context.settings, context.machine
     views = [context.cameras[index] for index in survey.covered]
-    budget = memory_for("rasterizer", context.machine.memory)
-    sizes = tuple((camera.height, camera.width) for camera in context.cameras)
-    # A CPU compares on an image as small as the first trial's; on a GPU, speeds depend on the size of views.
-    compared = context.networks.precisions if context.machine.device == "cpu" else None
-    if compared is None and choices.compares_precisions(sizes, settings):
-        compared = compare_precisions(context, views[0], precisions)
+    precision = choices.choose_precision(settings, machine)
+    network = context.network(precision)
     return Facts(
         gaussians=len(scene),
         sh_degree=context.sh_degree,
         used_degree=scene.used_degree(survey.total_blend_weights > 0),
         harmonics_energy=harmonics_energy(scene, survey.total_blend_weights),
-        sizes=sizes,
+        sizes=tuple((camera.height, camera.width) for camera in context.cameras),
         survey=survey,
-        machine=context.machine,
+        machine=machine,
         rasterizer=context.rasterizer.name,
-        weights=weight_cost(context.rasterizer, views, settings, budget),
+        precision=precision,
+        tiling=make_loss(network, settings, memory_for("activations", machine.memory)).tiling,
+        pixel_bytes=network.held_bytes_per_pixel(),
+        weight_bytes=count_weights(context.rasterizer, views),
+        intersection_bytes=count_intersections(context.rasterizer, len(views)),
         frozen=None if regions is None else regions.resolved(survey.total_blend_weights).frozen,
-        deepest=max(context.network.layers),
-        precisions=compared,
+        deepest=max(network.layers),
     )
 
 

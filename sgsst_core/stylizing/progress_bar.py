@@ -17,7 +17,6 @@ LOG_SECONDS = 60.0
 _TITLES = {
     "planning": "Surveying the views",
     "refining": "Choosing Gaussians to split",
-    "probing": "Measuring the speed",
     "coarse": "coarsest scale",
     "sos": "all scales",
     "measuring": "checking quality",

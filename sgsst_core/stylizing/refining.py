@@ -9,7 +9,6 @@ gradient shows where texture is needed.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,7 +25,7 @@ from sgsst_core.loss.gradient_error import psnr
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.targets import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.context import PlanningContext, equip
+from sgsst_core.planning.facts import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer
@@ -190,12 +189,12 @@ class _Refining:
     def _gradient_disagreement(self, views: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return the sum over some views of the `disagreement` of the style loss gradient."""
         settings, cameras, total = self._settings, self._planning_context.cameras, self._footprints.weights
-        device = self._planning_context.network.device
+        network = self._planning_context.network()
         style = prepared_style(self._given, settings, self._scene.sh_dc, total)
-        style = style.map(lambda image: image.to(device))
+        style = style.map(lambda image: image.to(network.device))
         scene = replace(self._scene, sh_dc=with_moments(self._scene.sh_dc, total, style))
         loss = make_loss(
-            self._planning_context.network,
+            network,
             settings.model_copy(update={"content_weight": 0.0}),
             memory_for("activations", self._planning_context.machine.memory),
         )
@@ -270,11 +269,9 @@ class _Refining:
 
     def _shown(self, views: Sequence[int], stage: Literal["planning", "refining"]) -> Iterator[int]:
         """Yield the views that this rank processes, one by one, and report progress."""
-        started = time.perf_counter()
         for done, index in enumerate(self._of_this_rank(views)):
             if self._show:
-                seconds = time.perf_counter() - started
-                self._show(progress_of(done, len(views), self._collectives.size, seconds, stage))
+                self._show(progress_of(done, len(views), self._collectives.size, stage))
             yield index
 
     def _sum(self, values: Tensor) -> Tensor:

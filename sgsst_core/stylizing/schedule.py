@@ -112,6 +112,7 @@ class StepRecord:
         sent: Bytes sent by this rank to others, by purpose (`collectives.Traffic`); empty for a single rank.
         device_memory: Peak GPU memory of tensors so far, in bytes; None on a CPU.
         evaluated: Scales that the step has evaluated.
+        pixels: Pixels that this rank has passed through the network.
     """
 
     step: int
@@ -125,6 +126,7 @@ class StepRecord:
     sent: dict[str, int] = field(default_factory=dict)
     device_memory: int | None = None
     evaluated: tuple[int, ...] = ()
+    pixels: int = 0
 
 
 @dataclass

@@ -15,7 +15,6 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import F, as_scene, stylized
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.stylized_ply import check_sh_attenuation
-from sgsst_core.planning.time_budget import seconds_left
 from sgsst_core.progress import Progress
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.rendering import RenderMode
@@ -25,6 +24,7 @@ from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.photo_prefetch import PhotoLoader
 from sgsst_core.stylizing.progress_bar import JobBar, job_bar
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.timing import seconds_left
 
 
 def stylize(

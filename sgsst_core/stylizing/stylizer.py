@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
+import numpy as np
 import psutil
 import torch
 from numpy.typing import NDArray
@@ -23,9 +24,8 @@ from sgsst_core.features.network_weights import BackboneWeights, load_network_we
 from sgsst_core.files.images import Color
 from sgsst_core.loss.sos import SosResult
 from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
-from sgsst_core.planning.context import Networks
 from sgsst_core.planning.survey import ShowPlanning
-from sgsst_core.planning.time_budget import SecondsLeft, seconds_left
+from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, checked_cameras
 from sgsst_core.scene.gaussians import Scene, checked_scene
@@ -57,7 +57,7 @@ from sgsst_core.stylizing.schedule import (
     phase_at,
 )
 from sgsst_core.stylizing.training_background import drawn_color
-from sgsst_core.timing import Timer
+from sgsst_core.timing import Timer, seconds_left
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,7 @@ class _QueuedStep:
 
     Attributes:
         results: Results of this group's views, without gradients.
+        pixels: Pixels that this rank passes through the network.
         values: Largest magnitude in the gradient, then the values of the results; in host memory, valid after `copied`.
         copied: Event after the copy of `values`; None if there is nothing to wait for.
         sent: Bytes that had been sent before the step.
@@ -75,6 +76,7 @@ class _QueuedStep:
     phase: Phase
     views: list[int]
     results: list[SosResult]
+    pixels: int
     values: Tensor
     copied: torch.cuda.Event | None
     timer: Timer
@@ -97,7 +99,7 @@ class Stylizer:
 
     Attributes:
         sh_dc: [n, 3], present colors of the rendered Gaussians, on the rasterizer's device.
-        measured: Measurements between steps (`loop.Callbacks.measure`), JSON-serializable and preserved by a resume.
+        measured: Measurements before and after the steps, JSON-serializable.
     """
 
     def __init__(self, job: StylizationJob) -> None:
@@ -164,11 +166,10 @@ class Stylizer:
         style, regions = Style.given(style), regions and regions.with_checked_styles()
         scene, cameras = checked_scene(scene), checked_cameras(cameras)
         weights = weights or load_network_weights("auto")
-        left, networks = left or seconds_left(settings.within), Networks()
+        left = left or seconds_left(settings.within)
         chosen = left and choose_within(
-            scene, cameras, style, settings, left, weights=weights, rasterizer=rasterizer, collectives=collectives,
-            regions=regions, show=show, networks=networks,
-        )  # fmt: skip
+            scene, cameras, settings, left, weights=weights, rasterizer=rasterizer, collectives=collectives
+        )
         views = chosen.views if chosen else range(len(cameras))
         cameras = [cameras[index] for index in views]
         applied = chosen.applied(settings) if chosen else settings
@@ -189,8 +190,6 @@ class Stylizer:
             collectives=collectives,
             show=show,
             chosen=chosen,
-            left=left,
-            networks=networks,
         )
         return cls(job)
 
@@ -250,16 +249,11 @@ class Stylizer:
         phase = self.phase
         self.latest = views = [self._order.next_view() for _ in range(self.job.settings.views_per_step)]
         before = self._queued
-        cost, timer = self._queue(views, phase, sent)
+        self._queue(views, phase, sent)
         if self.job.plan.precision == "float16" and self._queued is not None and is_too_large(self._queued.largest()):
             self.job = in_bfloat16(self.job, self.step + 1)  # colors and moments are unchanged
-            cost, timer = self._queue(views, phase, sent)
+            self._queue(views, phase, sent)
         self.step += 1
-        if phase.scale is None:
-            speeds = self.job.team.compare_speeds(cost, timer.read()) if self.job.collectives.size > 1 else None
-            if speeds:  # divide the work again, once in phase 2
-                self.job.loss.divider.speeds = speeds
-                self.job.view_targets.forget_division()
         self.seconds += time.perf_counter() - started
         if before is not None:
             self._record(before)
@@ -294,22 +288,26 @@ class Stylizer:
             sent={kind: total - queued.sent[kind] for kind, total in every.items() if total > queued.sent[kind]},
             device_memory=device_peak(self.job.network.device),
             evaluated=tuple(evaluated),
+            pixels=queued.pixels,
         )
         self.history.append(record)
 
-    def _queue(self, views: list[int], phase: Phase, sent: dict[Traffic, int]) -> tuple[int, Timer]:
-        """Queue a step, and return the cost of `_mean_gradient`, and the timer of its parts."""
-        gradient, results, cost = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
+    def _queue(self, views: list[int], phase: Phase, sent: dict[Traffic, int]) -> None:
+        """Queue a step."""
+        gradient, results, pixels = with_second_attempt(self.job, lambda: self._mean_gradient(views, phase))
         with self.job.timer("optimizer"):
             done = self.step / max(self.job.total_steps - 1, 1)
-            largest = self._optimizer.update(gradient, self.job.settings.learning_rate_at(done))
+            # In float32, so that the rate does not depend on the number of steps by rounding (`Settings.with_steps`).
+            rate = self.job.settings.learning_rate
+            if self.job.settings.learning_rate_end != rate:
+                rate = float(np.float32(self.job.settings.learning_rate_at(done)))
+            largest = self._optimizer.update(gradient, rate)
         with self.job.timer("communication"):
             self.job.team.check_drift(self.step + 1, self.sh_dc)
         values, copied = self._copied(largest, results)
         results = [replace(result, image_gradient=None) for result in results]  # frees the gradients
         timer = self.job.timer.lap()
-        self._queued = _QueuedStep(self.step + 1, phase, views, results, values, copied, timer, sent)
-        return cost, timer
+        self._queued = _QueuedStep(self.step + 1, phase, views, results, pixels, values, copied, timer, sent)
 
     def _mean_gradient(self, views: list[int], phase: Phase) -> tuple[Tensor, list[SosResult], int]:
         """Return the mean of dE/dsh_dc [n, 3] over some views, the results of this group's own views, and a cost.

@@ -26,7 +26,7 @@ IMAGE = "docker.io/library/sgsst:cpu"
 PROJECT = "sgsst-test"
 #: Time limit of waits in seconds.
 PATIENCE = 900.0
-OPTIONS = {"steps_coarse": 0, "backbone": "vgg16", "rebalance": False, "seed": 1}
+OPTIONS = {"steps_coarse": 0, "backbone": "vgg16", "seed": 1}
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def expected(files: tuple[Path, Path, Path], steps: int, cache: Path, out: Path)
     """Return the result of `sgsst stylize` on this machine."""
     ply, cameras, style = files
     command = [sys.executable, "-m", "api.cli", "stylize", ply, "--cameras", cameras, "--style", style, "--out", out]
-    command += ["--steps-sos", str(steps), "--steps-coarse", "0", "--backbone", "vgg16", "--no-rebalance"]
+    command += ["--steps-sos", str(steps), "--steps-coarse", "0", "--backbone", "vgg16"]
     command += ["--seed", "1"]
     # with as many threads as in the container: another number would add in another order
     own = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
@@ -162,7 +162,7 @@ def test_submit_to_container_equals_stylize(
     out = tmp_path / "stylized.ply"
     command = [sys.executable, "-m", "api.cli", "submit", ply, "--cameras", cameras, "--style", style, "--out", out]
     command += ["--url", composed.url, "--key", composed.key]
-    command += ["--steps-sos", "6", "--steps-coarse", "0", "--backbone", "vgg16", "--no-rebalance", "--seed", "1"]
+    command += ["--steps-sos", "6", "--steps-coarse", "0", "--backbone", "vgg16", "--seed", "1"]
     ended = subprocess.run(list(map(str, command)), cwd=COMPOSE.parents[1], capture_output=True, text=True)
     assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}\n{composed.said()}"
     assert out.read_bytes() == expected(files, 6, tiny_cache, tmp_path / "expected.ply")

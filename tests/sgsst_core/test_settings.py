@@ -40,7 +40,8 @@ def test_fewer_steps_follow_the_learning_rate_of_the_preset(preset: PresetName, 
     settings = make_settings(preset, steps_coarse=coarse, steps_sos=sos)
     if part >= 1:
         assert settings.learning_rate_end == whole.learning_rate_end
-    fraction = min(coarse + sos, whole.steps_coarse + whole.steps_sos) / (whole.steps_coarse + whole.steps_sos)
+    every = whole.steps_coarse + whole.steps_sos
+    fraction = max(min(coarse + sos, every) - 1, 0) / (every - 1)  # of the steps between the first and the last
     assert settings.learning_rate_at(1) == pytest.approx(whole.learning_rate_at(fraction))
     assert make_settings(preset, steps_sos=sos, learning_rate_end=0.01).learning_rate_end == 0.01
 

@@ -105,12 +105,12 @@ def point_cloud(columns):
 
 expected = addon.splat_columns(source.data)
 points = point_cloud(expected)
-got = addon.splat_columns(points.data)
-answer["points"] = got.keys() == expected.keys() and all(
-    np.allclose(got[name], expected[name], rtol=1e-4, atol=1e-4) for name in got
+read = addon.splat_columns(points.data)
+answer["points"] = read.keys() == expected.keys() and all(
+    np.allclose(read[name], expected[name], rtol=1e-4, atol=1e-4) for name in read
 )
 answer["points can be stylized"] = bpy.ops.sgsst.stylize.poll()
-red = {**got, "f_dc_0": got["f_dc_0"] + 1}
+red = {**read, "f_dc_0": read["f_dc_0"] + 1}
 addon.write_splat(Path("red.ply"), red)
 shown = addon.splat_columns(addon.show_result(points, Path("red.ply"), "OBJECT").data)
 answer["points shown"] = all(np.allclose(shown[name], red[name], rtol=1e-4, atol=1e-4) for name in red)

@@ -107,7 +107,6 @@ def fill_the_screen(watched: Watched) -> None:
     ("stage", "views", "text"),
     [
         ("planning", {"step": 9, "total": 9, "fraction": 1.0, "eta_s": 0.0}, "Analyzing views · view 9 of 9"),
-        ("probing", {"step": 1, "total": 4, "fraction": 0.25, "eta_s": None}, "Measuring the speed · view 1 of 4"),
         ("measuring", {"step": 60, "total": 60, "fraction": 1.0, "eta_s": 0.0}, "Checking quality · view 3 of 8"),
     ],
 )
@@ -132,7 +131,7 @@ def test_stages_beside_steps_count_their_own_views(
     page.goto(f"{watched.url}/#/jobs/{finished}")
     page.get_by_text(text, exact=True).wait_for()
     assert page.locator(".state .left").inner_text() == ("almost done" if stage == "measuring" else "")
-    bar = {"planning": "1", "probing": "0.25", "measuring": "0.375"}[stage]
+    bar = {"planning": "1", "measuring": "0.375"}[stage]
     assert page.locator(".state progress").get_attribute("value") == bar
     page.get_by_role("heading", name="How it will run").wait_for()
     page.goto(f"{watched.url}/#/jobs")

@@ -86,7 +86,7 @@ def at_step(service: Service, job_id: str, step: int, attempt: int) -> None:
     def there() -> bool:
         job = look(service, job_id)
         progress = job["progress"] or {}
-        stepping = progress.get("stage") not in ("planning", "probing", "starting")
+        stepping = progress.get("stage") not in ("planning", "starting")
         there = stepping and progress.get("attempt", 0) >= attempt and progress.get("step", 0) >= step
         return job["status"] == "succeeded" or there
 

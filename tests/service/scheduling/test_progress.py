@@ -30,7 +30,6 @@ def reports(channel: io.StringIO) -> list[Report]:
 def test_dispatcher_gets_progress_unchanged(channel: io.StringIO) -> None:
     sent = [
         Progress(stage="planning", step=0, total=8),
-        Progress(stage="probing"),
         Progress(stage="sos", step=6, total=12, loss=0.5, scales=[None, 0.5], seconds=20.0, eta_s=10.0),
         Progress(stage="measuring", step=60, total=60, loss=0.5, views_checked=3, views_to_check=8),
     ]

@@ -111,7 +111,7 @@ def test_files_are_fetched_once_for_all_ranks_of_a_machine(s3: FaultyS3, job: St
 def test_temporary_folder_of_others_is_refused(
     kind: str, job: StoreWorkplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it contains is neither used nor deleted."""
+    """Its content is neither used nor deleted."""
     monkeypatch.delenv("SGSST_DATA")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     other, folder = tmp_path / "other", tmp_path / f"sgsst-{os.getuid()}"

@@ -10,13 +10,12 @@ import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.context import equip
+from sgsst_core.planning.facts import equip
 from sgsst_core.quality.float32_reference import Float32Reference, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job
-from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToTf32
@@ -37,6 +36,14 @@ def make(weights: BackboneWeights, scene: object = None, **values: Any) -> Styli
     return Stylizer.planned(scene or ball(500), cameras(2), style(), settings, weights=weights)  # type: ignore[arg-type]
 
 
+def in_bfloat16(weights: BackboneWeights) -> Stylizer:
+    """Return a job whose plan is constructed by hand, so that the precision does not depend on the processor."""
+    scene, settings = ball(500), make_settings(steps_sos=12, training_background="background", warm_start=False)
+    plan = plan_job(scene, cameras(2), Style.of(style()), settings, weights=weights).plan
+    plan = replace(plan, precision="bfloat16")
+    return Stylizer(prepare_job(plan, scene, cameras(2), Style.of(style()), settings, weights=weights))
+
+
 def test_float32_job_agrees_with_its_reference(tiny_weights: BackboneWeights) -> None:
     stylizer = make(tiny_weights, wall(sh_degree=2))
     stylizer.run_step()
@@ -49,19 +56,9 @@ def test_float32_job_agrees_with_its_reference(tiny_weights: BackboneWeights) ->
     assert mean_loss(reference.evaluate([0, 1], stylizer.stylized())) == pytest.approx(expected, rel=1e-5)
 
 
-def test_half_precision_weights_have_a_small_error(tiny_weights: BackboneWeights) -> None:
-    stylizer = make(tiny_weights, cached_weights="half", steps_sos=8)
-    run(stylizer)
-    assert approximations(stylizer) == ["half-precision blend weights"]
-    error = Float32Reference(stylizer).gradient_error()
-    assert 1e-6 < error.relative_error < 0.05
-    assert error.seconds > 0
-    assert error.seconds_exact > 0
-
-
 def test_initial_error_can_be_measured_later(tiny_weights: BackboneWeights) -> None:
     """The error has the same value as if it was measured before the first step, and colors are not affected."""
-    stylizer = make(tiny_weights, cached_weights="half")
+    stylizer = in_bfloat16(tiny_weights)
     reference = Float32Reference(stylizer)
     first = reference.gradient_error()
     for _ in range(3):
@@ -85,9 +82,9 @@ def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) ->
     plan = replace(
         plan_job(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights).plan, precision="tf32"
     )
-    rounded = RoundedToTf32(tiny_weights, context.network.layers)
+    rounded = RoundedToTf32(tiny_weights, context.network().layers)
     errors = []
-    for shop in (None, replace(context, network=rounded)):
+    for shop in (None, replace(context, networks={"tf32": rounded})):
         stylizer = Stylizer(
             prepare_job(
                 plan, scene, cameras(2), Style.of(style()), settings, weights=tiny_weights, planning_context=shop
@@ -101,11 +98,7 @@ def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) ->
 
 
 def test_bfloat16_error_is_plausible(tiny_weights: BackboneWeights) -> None:
-    """The plan is constructed by hand, so that the precision does not depend on the processor."""
-    scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12)
-    plan = plan_job(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights).plan
-    plan = replace(plan, precision="bfloat16")
-    stylizer = Stylizer(prepare_job(plan, scene, cameras(2), Style.of(style()), settings, weights=tiny_weights))
+    stylizer = in_bfloat16(tiny_weights)
     assert approximations(stylizer) == ["bfloat16 features"]
     error = Float32Reference(stylizer).gradient_error()
     assert 1e-3 < error.relative_error < 0.8

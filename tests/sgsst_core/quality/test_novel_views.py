@@ -23,7 +23,6 @@ from sgsst_core.files.scene_file import read_scene
 from sgsst_core.loss.scale_weights import scale_count
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.statistics_terms import GRAM_WEIGHT
-from sgsst_core.planning.measurement_choice import LEVELS
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.novel_cameras import neighbors
@@ -174,20 +173,6 @@ def test_unordered_cameras_are_sorted(seed: int):
         assert angle_between(*parents) < math.radians(3.5 * 360 / 40)
     following = [angle_between(*pair) for pair in itertools.pairwise(novel)]
     assert sum(angle < math.radians(2.5 * 360 / 40) for angle in following) >= 36
-
-
-@pytest.mark.parametrize(
-    ("total", "expected"),
-    [
-        (20_000, [0, 2500, 5000, 10_000, 20_000]),
-        (150, [0, 18, 37, 75, 150]),
-        (3, [0, 1, 3]),
-        (1, [0, 1]),
-        (0, [0]),
-    ],
-)
-def test_moments_are_geometric_and_include_both_ends(total: int, expected: list[int]):
-    assert LEVELS[0].moments(total) == expected
 
 
 @pytest.fixture(scope="module")

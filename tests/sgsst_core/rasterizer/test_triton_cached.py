@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.context import equip, weight_cost
+from sgsst_core.planning.facts import count_weights
+from sgsst_core.quality.float32_reference import approximations
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Precision
 from sgsst_core.rasterizer.cached import CachedRasterizer
@@ -220,29 +220,30 @@ VIEWS = cameras(2, 32, 24)
 
 
 @pytest.mark.slow
-def test_plan_predicts_the_bytes_of_cached_weights(tiny_weights: BackboneWeights) -> None:
+def test_bytes_of_cached_weights_are_counted() -> None:
     scene = ball(60)
-    planning_context = equip(scene, VIEWS, make_settings(), tiny_weights, ALONE, "triton")
-    cost = weight_cost(planning_context.rasterizer, VIEWS, make_settings(), 1 << 30)
-    planned: dict[Precision, int | None] = {"float32": cost.bytes, "half": cost.half_bytes}
-    for precision, size in planned.items():
-        cached = CachedRasterizer(scene, precision=precision, uncached=planning_context.rasterizer)  # type: ignore[arg-type]
+    uncached = on_device(scene)
+    counted = count_weights(uncached, VIEWS)
+    assert counted is not None
+    for precision, size in zip(ERRORS, counted, strict=True):
+        cached = CachedRasterizer(scene, precision=precision, uncached=uncached)
         for view in VIEWS:
             cached.coverage(view)
         assert cached.cached_bytes == size
-    assert min(cost.saving.without, cost.saving.seconds, cost.saving.once) > 0
+    assert count_weights(make_rasterizer("cpu", scene), VIEWS) is None
 
 
 @pytest.mark.slow
 def test_job_uses_the_requested_rasterizer(tiny_weights: BackboneWeights) -> None:
     scene, losses = ball(60), {}
-    settings = make_settings("preview", steps_coarse=0, steps_sos=1, cached_weights="half")
-    for name in ("cpu", "triton"):
+    settings = make_settings("preview", steps_coarse=0, steps_sos=1, cached_weights="half", precision="float32")
+    for name, used_name in (("cpu", "cpu"), ("triton", "cached")):
         inputs = (scene, VIEWS[:1], Style.of(style()), settings)
         job = plan_job(*inputs, weights=tiny_weights, rasterizer=name)
         used, resumed = Stylizer(job), Stylizer(prepare_job(job.plan, *inputs, weights=tiny_weights))
-        rasterizers: list[Any] = [stylizer.job.views.rasterizer for stylizer in (used, resumed)]
-        for each in rasterizers:
-            assert (each.name, each.precision, each.uncached.name) == ("cached", "half", name)
+        for stylizer in (used, resumed):
+            rasterizer = stylizer.job.views.rasterizer
+            assert (rasterizer.name, rasterizer.uncached.name) == (used_name, name)
+            assert approximations(stylizer) == ["half-precision blend weights"] * (name == "triton")
         losses[name] = used.run_step().loss
     assert losses["triton"] == pytest.approx(losses["cpu"], rel=1e-3)

@@ -112,10 +112,9 @@ def _record(step: int, stage: str, scales: int) -> dict[str, Any]:
 
 
 def _decision(index: int) -> dict[str, Any]:
-    """Return a decision, with or without seconds and bytes."""
-    saved = {"seconds": 0.25 * index or None, "bytes": 4_000_000 * index or None}
+    """Return a decision, with or without bytes."""
     texts = {name: f"{name} number {index}" for name in ("item", "decision", "reason", "error")}
-    return {**texts, **saved}
+    return {**texts, "bytes": 4_000_000 * index or None}
 
 
 def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:

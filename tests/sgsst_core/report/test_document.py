@@ -16,7 +16,6 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import write_json
 from sgsst_core.loss.scale_weights import EVEN
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.plan import Prediction
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
 from sgsst_core.report.history import history_of, running_mean
@@ -42,7 +41,7 @@ def finished(tiny_weights: BackboneWeights) -> tuple[Stylizer, Evaluation, Evalu
         "training_background": "background",
         "warm_start": False,
     }  # makes the losses of steps comparable with the start's
-    settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3, **plain)
+    settings = make_settings(steps_coarse=3, steps_sos=7, learning_rate=0.3, measure=1.0, **plain)
     stylizer = Stylizer.planned(ball(), views, style(), settings, weights=tiny_weights)
     before = stylizer.evaluate(stylizer.job.evaluation_views)
     run(stylizer)
@@ -57,7 +56,7 @@ def sources(tiny_weights: BackboneWeights) -> Sources:
 def test_evaluation_views_are_spread_over_covered_views(
     finished: tuple[Stylizer, Evaluation, Evaluation],
 ) -> None:
-    assert finished[0].job.evaluation_views == [0, 1, 4, 5]
+    assert finished[0].job.evaluation_views == [0, 2, 5]
 
 
 def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:
@@ -82,26 +81,15 @@ def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluati
     assert 0.2 * report["seconds"] < parts <= report["seconds"] + 0.01
 
 
-def test_first_and_later_visits_are_distinguished(
+def test_typical_step_is_the_median_of_those_with_as_many_scales(
     finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Steps take 9, 5, 2, 4 and 2 s; the first one includes the style.
-
-    With several views per step, first visits cannot be distinguished.
-    """
     stylizer, before, after = finished
-    visits = [(1, 9.0), (4, 14.0), (1, 16.0), (0, 20.0), (4, 22.0)]
-    history = [
-        replace(record, view=view, seconds=seconds, parts={"prepare": 0.25, "render": 1.5})
-        for record, (view, seconds) in zip(stylizer.history, visits, strict=False)
-    ]
+    at = (9.0, 14.0, 16.0, 20.0, 22.0)  # steps take 9, 5, 2, 4 and 2 s; the first one includes the style
+    history = [replace(record, seconds=seconds) for record, seconds in zip(stylizer.history, at, strict=False)]
     monkeypatch.setattr(stylizer, "history", history)
     measured = build_report(stylizer, sources, "finished", before, after)["plan"]["measured"]
-    assert (measured["seconds"], measured["first_visit"]) == (2.0, 2.5)
-    assert measured["seconds_coarse"] is measured["first_visit_coarse"] is None
-    monkeypatch.setattr(stylizer, "job", replace(stylizer.job, settings=make_settings(views_per_step=2)))
-    measured = build_report(stylizer, sources, "finished", before, after)["plan"]["measured"]
-    assert (measured["seconds"], measured["first_visit"]) == (1.5, None)
+    assert (measured["seconds"], measured["seconds_coarse"]) == (4.0, None)
 
 
 def test_report_has_measurements_and_their_fraction_of_time(
@@ -110,21 +98,15 @@ def test_report_has_measurements_and_their_fraction_of_time(
     stylizer, before, after = finished
     monkeypatch.setattr(stylizer, "seconds", 200.0)
     monkeypatch.setitem(stylizer.seconds_by_part, "measuring", 30.0)
-    entries = [
-        {"step": 0, "novel_views": None, "approximation": None, "novel_view_names": ["a", "b"], "seconds": 9.0},
-        {"step": 7, "novel_views": None, "approximation": None},  # from a version that did not record this
-    ]
+    nothing: dict[str, Any] = {"novel_views": None, "approximation": None}
+    entries = [{"step": 0, **nothing, "novel_view_names": ["a", "b"]}, {"step": 7, **nothing}]
     monkeypatch.setattr(stylizer, "measured", entries)
-    plan = replace(stylizer.job.plan, prediction=Prediction(1, 1, 1, job=450, measuring=50))
-    monkeypatch.setattr(stylizer, "job", replace(stylizer.job, plan=plan))
     assert build_report(stylizer, sources, "finished", before, after)["measuring"] == {
-        "fraction": 0.1,
-        "allowed": 40.0,
+        "fraction": 1.0,
         "seconds": 30.0,
         "of_steps": 0.15,
-        "loss_views": 4,
+        "loss_views": 3,
         "novel_view_count": 2,
-        "moments": [{"step": 0, "seconds": 9.0}, {"step": 7, "seconds": None}],
     }
 
 
@@ -146,7 +128,7 @@ def test_report_has_the_losses_of_the_steps(
         assert entry["device_memory_bytes"] is None
     assert report["loss"]["relative"] == pytest.approx(mean_loss(after) / mean_loss(before))
     assert report["loss"]["relative"] < 1
-    assert report["loss"]["views"] == ["view_0", "view_1", "view_0", "view_1"]
+    assert report["loss"]["views"] == ["view_0", "view_2", "view_1"]
 
 
 def test_loss_after_is_the_mean_of_the_last_round_everywhere(

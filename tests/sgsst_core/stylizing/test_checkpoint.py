@@ -14,7 +14,7 @@ from sgsst_core.decision import Decision
 from sgsst_core.errors import CheckpointError, OutputError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.terms import TERMS, LossTerms
-from sgsst_core.planning.plan import Plan, Prediction
+from sgsst_core.planning.plan import Plan, Work
 from sgsst_core.planning.survey import Survey
 from sgsst_core.refine.split import Refinement
 from sgsst_core.settings import make_settings
@@ -72,8 +72,8 @@ def full_checkpoint(state: StylizerState) -> Checkpoint:
         cached_weights="half",
         measured=True,
         ranks=2,
-        decisions=(Decision("item", "decision", "reason", seconds=0.1, bytes=3),),
-        prediction=Prediction(0.1, 0.2, 3),
+        decisions=(Decision("item", "decision", "reason", bytes=3),),
+        work=Work(0.1, 0.2, 3.0),
     )
     return Checkpoint(state, plan, 3, "run", versions())
 
@@ -101,9 +101,7 @@ def test_checkpoint_round_trips_exactly(full_checkpoint: Checkpoint, tmp_path: P
 
 def test_gpu_memory_round_trips(full_checkpoint: Checkpoint, tmp_path: Path) -> None:
     history = [replace(record, device_memory=10**11) for record in full_checkpoint.state.history]
-    plan = replace(
-        full_checkpoint.plan, device="cuda", precision="tf32", prediction=Prediction(0.1, 0.2, 3, device_bytes=10**12)
-    )
+    plan = replace(full_checkpoint.plan, device="cuda", precision="tf32", device_bytes=10**12)
     full_checkpoint = replace(full_checkpoint, state=replace(full_checkpoint.state, history=history), plan=plan)
     Checkpoints(tmp_path / "c").save(full_checkpoint, "job")
     assert_same(full_checkpoint, load_checkpoint(tmp_path / "c", "job"))
@@ -136,7 +134,7 @@ def test_storage_format_of_losses_is_stable(full_checkpoint: Checkpoint, tmp_pat
     assert history[1] == {
         **{"step": 2, "stage": "sos", "view": 3, "seconds": 0.3, "loss": 4.0},
         **{"parts": {"render": 0.2, "loss": 1 / 3}, "memory": 10**9, "sent": {"image": 7}, "device_memory": None},
-        **{"evaluated": []},
+        **{"evaluated": [], "pixels": 0},
     }
 
 

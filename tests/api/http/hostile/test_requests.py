@@ -516,7 +516,10 @@ def test_ranges_follow_rfc_9110(client: httpx2.Client, files: Files, done: str, 
 
 def test_results_have_safe_headers(client: httpx2.Client, done: str) -> None:
     answer = client.get(f"/v1/jobs/{done}/artifacts/report.html")
-    assert re.fullmatch(r'inline; filename="[A-Za-z0-9._-]+"', answer.headers["content-disposition"])
+    assert re.fullmatch(
+        r"""inline; filename="[A-Za-z0-9._-]+"; filename\*=UTF-8''[A-Za-z0-9._%-]+""",
+        answer.headers["content-disposition"],
+    )
     assert "set-cookie" not in answer.headers
     assert answer.headers["x-content-type-options"] == "nosniff"
     policy = answer.headers["content-security-policy"]
