@@ -69,9 +69,7 @@ def test_host_synchronizations_are_counted(counts: Counts, asked: Callable[[Tens
 def test_doctor_describes_the_gpu(counts: Counts) -> None:
     assert doctor._gpu().text.startswith("1 x pretend, compute capability 9.0, CUDA ")
     assert doctor._memory(torch.device("cuda", 0)).text == "jobs plan with 105.2 GB of the GPU's memory"
-    text = doctor._precision(torch.device("cuda", 0)).text
-    assert text.startswith("TF32 convolutions are ")
-    assert "bfloat16 convolutions are " in text
+    assert doctor._precision().text == "jobs use float16; possible: float32, float16, bfloat16, tf32"
 
 
 def test_doctor_explains_why_a_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.sample_facts import CPU, GPU, facts
 
 #: Steps enough for anything that pays off after several visits.
-LONG = {"steps_coarse": 0, "steps_sos": 400}
+LONG: dict[str, Any] = {"steps_coarse": 0, "steps_sos": 400}
 
 
 def decision(plan: Plan, item: str) -> tuple[str, str]:

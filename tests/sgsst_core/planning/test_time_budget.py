@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ def test_given_options_stay() -> None:
     [({}, 480), ({"learning_rate": 0.1}, 480), ({"learning_rate_end": 0.01}, None), ({"steps_sos": 240}, None)],
 )
 def test_pace_decides_the_steps_unless_they_or_a_falling_learning_rate_are_given(
-    values: dict[str, float], most: int | None
+    values: dict[str, Any], most: int | None
 ) -> None:
     assert chosen(20, make_settings(within=20, **values)).most_steps == most
 
