@@ -25,7 +25,7 @@ STEPS = 4
 
 def run_steps(collectives: Collectives) -> tuple[Tensor, list[float], list[int], str]:
     """Run a few steps of one view at two scales; return colors, losses, synchronizations, and device and rasterizer."""
-    settings = make_settings(steps_coarse=0, steps_sos=STEPS, coarsest_side=16)
+    settings = make_settings(steps_coarse=0, steps_sos=STEPS, coarsest_side=16, precision="float32")
     stylizer = Stylizer.planned(
         ball(60), cameras(1, 48, 32), style(), settings, weights=tiny_weights(), collectives=collectives
     )
