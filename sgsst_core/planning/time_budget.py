@@ -32,11 +32,13 @@ _COARSE = 0.5
 _RASTER_PASSES = 2.0
 #: Fraction of the time of a pass of the rasterizer that is in proportion to the pixels; the rest is for the Gaussians.
 _OF_PIXELS = 0.5
-#: Factor of the longer budget whose choice is shown, and of the steps of a job that is faster than expected.
-_MORE, _MOST = 4, 2
+#: Factor of the longer budget whose choice is shown.
+_MORE = 4
+#: Factor by which a choice may exceed the budget: the pace of the job then leaves out steps, but adds none.
+_OPTIMISM = 1.15
 #: Time from the last step to the last file written: constant seconds for images and report, and seconds per Gaussian
 #: for the neighbor search and for writing (measured with 4 million Gaussians on two cores; an estimate elsewhere).
-_ENDING_SECONDS, _ENDING_SECONDS_PER_GAUSSIAN = 1.5, 4e-6
+_ENDING_SECONDS, _ENDING_SECONDS_PER_GAUSSIAN = 3.0, 4e-6
 
 
 def ending_seconds(gaussians: int) -> float:
@@ -141,9 +143,12 @@ def choose(cameras: Sequence[Camera], settings: Settings, pace: Pace, left: floa
     longer = estimate.best(left + (_MORE - 1) * (settings.within or 0.0))
     steps = longer.steps_sos + longer.steps_coarse * estimate.has_two_phases(longer.resolution)
     falls = settings.learning_rate_end != settings.learning_rate and "learning_rate_end" in settings.fixed
-    most = None if falls or "steps_sos" in settings.fixed else _MOST * settings.steps_sos
+    most = None if falls or "steps_sos" in settings.fixed else settings.steps_sos
+    limit = left if most is None else _OPTIMISM * left
+    best = estimate.best(limit)
     return replace(
-        estimate.best(left),
+        best,
+        seconds=min(best.seconds, left) if best.seconds <= limit else best.seconds,
         longer_resolution=longer.resolution,
         longer_steps=steps,
         all_steps=settings.steps_sos,

@@ -213,12 +213,8 @@ def repeating_options(stylizer: Stylizer) -> str | None:
     choice, coarse = stylizer.job.plan.time_choice, stylizer.job.plan.steps_coarse
     if choice is None:
         return None
-    steps = min(coarse, stylizer.step), max(stylizer.step - coarse, 0)
-    settings = stylizer.job.settings.model_copy(update={"steps_coarse": coarse}).with_steps(*steps)
-    return (
-        f"--resolution {settings.max_resolution} --views {len(choice.views)} --steps-coarse {steps[0]} "
-        f"--steps-sos {steps[1]} --learning-rate-end {settings.learning_rate_end!r}"
-    )
+    steps = f"--steps-coarse {min(coarse, stylizer.step)} --steps-sos {max(stylizer.step - coarse, 0)}"
+    return f"--resolution {stylizer.job.settings.max_resolution} --views {len(choice.views)} {steps}"
 
 
 def _measured(stylizer: Stylizer) -> dict[str, float | None]:

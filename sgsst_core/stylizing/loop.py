@@ -180,9 +180,8 @@ def _steer(stylizer: Stylizer, callbacks: Callbacks, pace: _Pace, *, at_once: bo
         more = math.floor(usable / pace.step_seconds(least=_FIRST_STEERED))
         return min(max(done + more, done), choice.most_steps or done)
 
-    settings = job.settings.model_copy(update={"steps_coarse": job.plan.steps_coarse})
-    settings = settings.with_steps(job.plan.steps_coarse, job.collectives.broadcast(total))
-    stylizer.job = replace(job, settings=settings)
+    steps = job.collectives.broadcast(total)
+    stylizer.job = replace(job, settings=job.settings.with_steps(job.plan.steps_coarse, steps))
 
 
 def _end_requested(stylizer: Stylizer, callbacks: Callbacks, first: int, pace: _Pace) -> Stopped | None:

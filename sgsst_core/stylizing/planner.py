@@ -123,6 +123,8 @@ def plan_job(
             facts = collectives.broadcast(lambda: _facts(context, survey, regions))
             plan = choices.make_plan(facts, settings, groups=groups, measured=measured, about=about)
             plan = replace(plan, refinement=refinement, time_choice=chosen)
+    if chosen and not plan.steps_coarse:  # so that the learning rate falls alike for any number of steps
+        settings = settings.with_steps(0, settings.steps_sos)
     with timer("preparing"):
         job = prepare_job(
             plan, scene, cameras, style, choices.with_groups(settings, plan.groups), weights=weights, photos=photos,
