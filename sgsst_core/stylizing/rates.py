@@ -117,6 +117,9 @@ def _read(path: Path) -> dict[str, dict[str, float]]:
     """Return the remembered rates; none if there is no file or it cannot be used."""
     try:
         stored = json.loads(path.read_text("utf-8"))
-        return {key: {size: float(rate) for size, rate in own.items()} for key, own in stored.items()}
+        return {
+            key: {str(int(size)): float(rate) for size, rate in own.items() if 0 < float(rate) < math.inf}
+            for key, own in stored.items()
+        }
     except (OSError, ValueError, AttributeError, TypeError):
         return {}

@@ -50,7 +50,7 @@ def test_rate_of_the_nearest_size_is_remembered_and_merged(cache: Path, network:
     assert len(json.loads(cache.read_text())) == 2
 
 
-@pytest.mark.parametrize("content", [None, "", "[1]", '{"a": 1}', '{"a": {"b": "c"}}', "\x00\xff"])
+@pytest.mark.parametrize("content", [None, "", "[1]", '{"a": 1}', '{"a": {"b": "c"}}', '{"a": {"b": 1}}', "\x00\xff"])
 def test_unknown_rate_is_tried_on_a_small_image(cache: Path, network: FeatureNetwork, content: str | None) -> None:
     if content is not None:
         cache.parent.mkdir()
@@ -103,3 +103,12 @@ def test_budget_limits_the_shown_time_and_its_end_leaves_a_rate_behind(
     assert [progress.eta_s for progress in seen] == [100.0, 0.0]
     (remembered,) = json.loads(cache.read_text()).values()
     assert all(rate > 2 for rate in remembered.values())
+
+
+@pytest.mark.parametrize("stored", ["0", "-1", "NaN", "Infinity"])
+def test_stored_rate_that_no_machine_has_is_ignored(cache: Path, network: FeatureNetwork, stored: str) -> None:
+    rates(network).remember(1000, 3.0)
+    cache.write_text(cache.read_text().replace("3.0", stored))
+    assert 0 < rates(network).rate(1000) < math.inf
+    rates(network).remember(1000, 4.0)
+    assert rates(network).rate(1000) == pytest.approx(4.0)
