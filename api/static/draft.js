@@ -1,6 +1,6 @@
 // @ts-check
 /** Draft of a new job: the content of its form, restored after another view or a reload. */
-import { paintingsOf } from "./regions.js";
+import { paintingsOf } from "./names.js";
 import { allInputs, StoredFile } from "./stored.js";
 import { strengthName } from "./strength.js";
 

@@ -1,6 +1,5 @@
 // @ts-check
 /** Names of jobs, and labels that tell jobs apart. */
-import { paintingsOf } from "./regions.js";
 import { sceneSuffix } from "./scene_formats.js";
 import { time, words } from "./words.js";
 
@@ -18,6 +17,9 @@ export function defaultName(scene, styles) {
   const suffix = sceneSuffix(scene), plain = suffix ? scene.slice(0, -suffix.length) : stem(scene);
   return styles.length ? `${plain} · ${styles.map(stem).join(" + ")}` : plain;
 }
+
+/** Return the names of the paintings of a region. @param {any} region @returns {string[]} */
+export const paintingsOf = ({ style }) => [style ?? []].flat().map((/** @type {string} */ text) => text.replace(/:[\d.e+-]+$/, ""));
 
 /** Return the names of a job's style images, and those of its regions: "night; sky: wave". @param {any} job @returns {string} */
 export function stylesOf(job) {

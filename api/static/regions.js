@@ -1,6 +1,7 @@
 // @ts-check
 /** Regions of a scene, each with its own style or frozen. */
 import { h, icon, newId, put } from "./dom.js";
+import { paintingsOf } from "./names.js";
 import { showWrong } from "./options.js";
 import { contentOf } from "./stored.js";
 import { strengthName } from "./strength.js";
@@ -14,9 +15,6 @@ const REST = "rest";
 /** @typedef {import("./stored.js").Chosen} Chosen */
 /** @typedef {Mask & {file: Chosen}} StoredMask mask with its file, which stays the same while the mask does */
 /** @typedef {{element: HTMLElement, value: () => any, mask: () => StoredMask | null, setMask: (mask: Mask | null) => void, set: (region: any) => void, setStyles: () => void, wrong: (text: string, field?: string) => void}} Row */
-
-/** Return the names of the paintings of a region. @param {any} region @returns {string[]} */
-export const paintingsOf = ({ style }) => [style ?? []].flat().map((/** @type {string} */ text) => text.replace(/:[\d.e+-]+$/, ""));
 
 export class RegionList {
   /**

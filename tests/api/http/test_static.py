@@ -13,7 +13,7 @@ import httpx2
 import pytest
 
 from api.http.static import DOCS_POLICY, POLICY, ExampleScene, StaticFiles, static_files
-from api.static_files import FOLDER
+from api.static_files import FOLDER, exported_viewer
 from service.deadlines import Deadline
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import DOWNLOADS, FORMATS
@@ -58,6 +58,12 @@ def test_policies_forbid_inline_scripts() -> None:
         assert "media-src 'self';" in policy
         assert "http" not in policy
         assert policy.startswith("default-src 'none'; script-src 'self';")
+
+
+@pytest.mark.parametrize("script", ["page", "worker"])
+def test_exported_scripts_need_no_modules(script: str) -> None:
+    code = exported_viewer()[script]
+    assert not re.search(r"^(import|export) |import\.meta", code, re.MULTILINE)
 
 
 def test_example_is_built_at_the_first_request(client: httpx2.Client, files: StaticFiles, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 #: WebGL is computed by the CPU, for the same pixels on every machine.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
 #: Timeout of tests in milliseconds.
-PATIENCE = 600_000
+PATIENCE = 240_000
 #: Script that runs before the page's own, and counts violations of the page's content security policy.
 _COUNT_VIOLATIONS = """
 window.violations = [];
