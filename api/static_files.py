@@ -11,7 +11,7 @@ from pathlib import Path
 from service.optional import installed_extras
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import DOWNLOADS, FORMATS, RESULT_FORMATS
-from sgsst_core.options import STRENGTHS
+from sgsst_core.settings import STRENGTHS
 
 FOLDER = Path(__file__).with_name("static")
 _IMPORT = re.compile(r'^import \{ (.*) \} from "(.*)";$', re.MULTILINE)

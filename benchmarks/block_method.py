@@ -16,10 +16,8 @@ from torch import Tensor
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.statistics import layer_statistics, merge
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.content import ContentDifference, content_factor
-from sgsst_core.loss.scale_weights import scale_count
-from sgsst_core.loss.statistics_terms import style_loss
-from sgsst_core.loss.targets import StyleTarget, StyleTargets
+from sgsst_core.loss.terms import ContentDifference, StyleTarget, StyleTargets, content_factor, style_loss
+from sgsst_core.scales import scale_count
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 
 BLOCK = 512

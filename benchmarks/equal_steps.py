@@ -40,7 +40,6 @@ from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.loss.feature_scale import with_scales
-from sgsst_core.loss.scale_weights import EVEN
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
@@ -48,6 +47,7 @@ from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.scales import EVEN
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from tests.rounding import RoundedToFloat16, RoundedToTf32

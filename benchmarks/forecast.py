@@ -30,10 +30,9 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import PartitionTile
 from sgsst_core.features.statistics import TILE, span_positions
 from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss.scale_weights import EVEN, scale_count
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.tiling import Tiling
-from sgsst_core.parallel.division import Size
+from sgsst_core.parallel.division import Size, Tiling
+from sgsst_core.scales import EVEN, scale_count
 from sgsst_core.scene.pyramid import add_upscaled_, downscale
 from sgsst_core.scene.spherical_harmonics import view_colors, view_colors_gradient
 from sgsst_core.settings import make_settings

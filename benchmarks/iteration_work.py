@@ -7,9 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from sgsst_core.features.partition import cached_tiles, choose_tile_size, computed_twice, partition
-from sgsst_core.parallel.collectives import TRAFFIC, Traffic
-from sgsst_core.parallel.division import ImageExchange, Piece, Shares, divide, rounds
-from sgsst_core.parallel.visible_gaussians import gaussians_sent
+from sgsst_core.parallel.collectives import TRAFFIC, ImageExchange, Traffic, gaussians_sent
+from sgsst_core.parallel.division import Piece, Shares, divide, rounds
 
 #: Channels of the style layers. Ranks exchange their statistics in float64: first the pixel count and the mean, then
 #: one half of the symmetric covariance.

@@ -27,6 +27,7 @@ from benchmarks.machine import write_result
 from benchmarks.rasterizer import DATA, timed
 from sgsst_core.bench.synthetic import surface_scene, texture
 from sgsst_core.budget import peak_memory
+from sgsst_core.devices import Timer
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene, write_scene
@@ -41,9 +42,7 @@ from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.planner import plan_job
-from sgsst_core.stylizing.result_colors import NEIGHBORS, neighbors_change
-from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.timing import Timer
+from sgsst_core.stylizing.stylizer import NEIGHBORS, Stylizer, neighbors_change
 
 PARTS = ("reading", "harmonics", "survey", "first step", "unseen")
 _PLUSH = DATA / "snowmiku_plush"

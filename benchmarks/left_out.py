@@ -31,8 +31,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.loss.tiling import Divider, Division, Tiling
-from sgsst_core.parallel.division import Size
+from sgsst_core.parallel.division import Divider, Division, Size, Tiling
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings

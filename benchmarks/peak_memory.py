@@ -10,11 +10,11 @@ import argparse
 from benchmarks.machine import write_result
 from benchmarks.pictures import grainy_photo
 from sgsst_core.budget import device_peak, forget_device_peak, peak_memory
+from sgsst_core.devices import Timer
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.vgg import FeatureNetwork, use_whole_float32
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.style import Style
-from sgsst_core.timing import Timer
 
 
 def main() -> None:

@@ -20,8 +20,8 @@ from benchmarks.iteration_work import IterationWork, Link, loads, proportional
 from benchmarks.machine import write_result
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO
-from sgsst_core.loss.scale_weights import scale_count
 from sgsst_core.parallel.division import Piece, divide
+from sgsst_core.scales import scale_count
 
 RANKS = (1, 2, 4, 8, 16, 32, 64)
 #: Links between two ranks: 80 % of the data sheet's bandwidth in one direction, and latency in seconds.

@@ -23,7 +23,7 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.spherical_harmonics import harmonics_energy, scene_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.style import Style, color_moments, style_moments
-from sgsst_core.stylizing.warm_start import warm_start
+from sgsst_core.stylizing.color_transfer import warm_start
 
 
 def main() -> None:

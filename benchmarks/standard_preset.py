@@ -23,7 +23,7 @@ from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.files.stylized_ply import write_stylized
-from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.steps import mean_loss
 
 #: Fractions of each phase after which all views are evaluated.
 MARKS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)

@@ -28,7 +28,7 @@ from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.evaluation import mean_loss
+from sgsst_core.stylizing.steps import mean_loss
 
 WAYS = ("background", "background+warm", "random", "random+warm", "palette", "palette+warm")
 #: Number of judged views.

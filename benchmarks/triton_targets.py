@@ -37,10 +37,9 @@ from sgsst_core.features.statistics import (
     block_of_channels,
     block_of_entries,
 )
-from sgsst_core.loss import content_kernels, statistics_terms
-from sgsst_core.loss import statistics_terms_kernels as loss_kernels
-from sgsst_core.loss.content import POSITIONS as CONTENT_POSITIONS
-from sgsst_core.loss.statistics_terms import GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
+from sgsst_core.loss import terms
+from sgsst_core.loss import triton_kernels as loss_kernels
+from sgsst_core.loss.terms import CONTENT_POSITIONS, GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
 from sgsst_core.rasterizer import triton_cached_kernels as cached_kernels
 from sgsst_core.rasterizer import triton_kernels as kernels
 from sgsst_core.scene import spherical_harmonics_triton_kernels as harmonics_kernels
@@ -110,9 +109,9 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
     features, tile = {"float32": "*fp32", "bfloat16": "*bf16"}[form], block_of_channels(channels, TILE)
     matrix: dict[str, Any] = {"CHANNELS": channels, "TILE": tile, "WEIGHTED": True}
     dtype = _DTYPES[form]
-    block, step = POSITIONS[dtype.itemsize], statistics_terms.STEPS[dtype.itemsize]
+    block, step = POSITIONS[dtype.itemsize], terms.STEPS[dtype.itemsize]
     moments = {**matrix, "P": block, "PARTS": FLUSH[dtype.itemsize] // block}
-    gradient = {**matrix, "K": block_of_channels(channels, step), "P": statistics_terms.POSITIONS}
+    gradient = {**matrix, "K": block_of_channels(channels, step), "P": terms.POSITIONS}
     gradient |= {"RELU": True, "UNIT": 1.0}
     types = {"features": features, "gradient": features}
     if dtype == torch.bfloat16:
@@ -196,11 +195,11 @@ KERNELS: dict[str, Target] = {
         f"{kernel.__name__}_{form}": Target(
             kernel,
             {"CHANNELS": _WIDEST, "BLOCK": _WIDEST, "P": CONTENT_POSITIONS, "WEIGHTED": True}
-            | ({"RELU": True} if kernel is content_kernels.add_content_gradient else {}),
+            | ({"RELU": True} if kernel is loss_kernels.add_content_gradient else {}),
             4,
             dict.fromkeys(("features", "content", "gradient"), types) | {"sums": "*fp32", "factor": "*fp64"},
         )
-        for kernel in (content_kernels.content_sums, content_kernels.add_content_gradient)
+        for kernel in (loss_kernels.content_sums, loss_kernels.add_content_gradient)
         for form, types in (("float32", "*fp32"), ("bfloat16", "*bf16"))
     },
     **{

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Option
-from sgsst_core.settings import checked
+from sgsst_core.settings import Option, checked
 from worker.options import GROUPS, StylizeOptions
 from worker.region_requests import MOST_REGIONS, NO_CONTROLS, RegionOptions, RegionRequest, region_requests
 from worker.styles import MOST_STYLE_IMAGES

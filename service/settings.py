@@ -13,7 +13,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.outgoing import parse_origins
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import reason
+from sgsst_core.settings import reason
 
 GB = 1_000_000_000
 #: Maximum number of characters of a path at which a proxy offers the service.

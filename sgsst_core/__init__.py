@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sgsst_core.style import Style as Style
     from sgsst_core.stylizing.loop import Callbacks as Callbacks
     from sgsst_core.stylizing.loop import run as run
-    from sgsst_core.stylizing.stylize import stylize as stylize
+    from sgsst_core.stylizing.loop import stylize as stylize
     from sgsst_core.stylizing.stylizer import Stylizer as Stylizer
 
 # PyTorch reads this variable once, before it allocates its first tensor. Allocations of 2 MB and more then use huge
@@ -51,7 +51,7 @@ _MODULES = {
     "make_settings": "settings",
     "run": "stylizing.loop",
     "save": "files.library",
-    "stylize": "stylizing.stylize",
+    "stylize": "stylizing.loop",
 }
 __all__ = [*_MODULES]
 

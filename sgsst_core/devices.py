@@ -1,8 +1,12 @@
-"""Current device of a thread, on which Triton launches kernels."""
+"""Devices: the current one of a thread, waiting for it, and a profiler that uses its stream events, or the clock."""
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
+from typing import Any
 
 import torch
 
@@ -13,3 +17,113 @@ def on_device(device: torch.device) -> AbstractContextManager[None]:
     Triton launches kernels on the current device, wherever their arguments are. Every thread starts with device 0.
     """
     return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
+
+
+class Timer:
+    """Profiler that accumulates seconds by block name.
+
+    Time in nested blocks counts only for the innermost block, so all names together add up to the total. Inside a
+    `whole` block, the time of nested blocks counts for the outer name.
+
+    A GPU works asynchronously: a block is timed from when the GPU starts its work to when it finishes, not by when the
+    program queues the work. The device is not synchronized before `read`.
+
+    Args:
+        device: Device whose time is measured.
+        event: Function that creates an event in the device's stream, as `torch.cuda.Event`; None for these events on a
+            GPU and the clock on a CPU.
+
+    Attributes:
+        seconds: Accumulated seconds by name; on a GPU, only for blocks that ended before the last call of `read`.
+    """
+
+    def __init__(self, device: torch.device | str = "cpu", event: Callable[[], Any] | None = None) -> None:
+        self.seconds: dict[str, float] = {}
+        if event is None and torch.device(device).type == "cuda":
+            event = partial(torch.cuda.Event, enable_timing=True)
+        self._event = event
+        self._open: list[str] = []
+        self._whole: str | None = None
+        self._since: Any = None
+        self._since_clock = 0.0
+        #: Name, start and end of blocks that have not been read yet.
+        self._marked: list[tuple[str, Any, Any]] = []
+
+    @contextmanager
+    def __call__(self, name: str, *, whole: bool = False) -> Iterator[None]:
+        """Measure a `with` block. With `whole`, the time of nested blocks counts for this name too."""
+        self._switch()
+        outer = self._whole
+        self._open.append(outer or name)
+        if whole:
+            self._whole = self._open[-1]
+        try:
+            yield
+        finally:
+            self._switch()
+            self._open.pop()
+            self._whole = outer
+
+    def clear(self) -> None:
+        """Discard all measurements; open blocks are measured from now on."""
+        self.seconds.clear()
+        self._marked.clear()
+        if self._open:
+            self._start()
+
+    def lap(self) -> Timer:
+        """Return a timer that has all measurements so far, to be read later, and continue with none."""
+        earlier = Timer(event=self._event)
+        earlier.seconds, earlier._marked = self.seconds, self._marked
+        self.seconds, self._marked = {}, []
+        return earlier
+
+    def read(self) -> dict[str, float]:
+        """Update and return `seconds`. On a GPU, waits for the end of the last block."""
+        if self._marked and not self._marked[-1][2].query():
+            self._marked[-1][2].synchronize()
+        for name, start, end in self._marked:
+            self._add(name, start.elapsed_time(end) / 1000)
+        self._marked.clear()
+        return self.seconds
+
+    def _switch(self) -> None:
+        """Attribute the time since the last switch to the innermost open block."""
+        start, start_clock = self._since, self._since_clock
+        self._start()
+        if not self._open:
+            return
+        if self._since is None:
+            self._add(self._open[-1], self._since_clock - start_clock)
+        elif start is not None:
+            self._marked.append((self._open[-1], start, self._since))
+
+    def _start(self) -> None:
+        if self._event is None:
+            self._since_clock = time.perf_counter()
+        else:
+            self._since = self._event()
+            self._since.record()
+
+    def _add(self, name: str, seconds: float) -> None:
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
+
+def seconds_left(within: float | None, started: float | None = None) -> Callable[[], float] | None:
+    """Return a function that returns the seconds left of a time budget; None without a budget.
+
+    Args:
+        within: Time budget in seconds.
+        started: Start of the budget, in seconds since the epoch; None for now.
+    """
+    if within is None:
+        return None
+    # The system's clock may be set while the job runs.
+    end = time.monotonic() + within - (0.0 if started is None else time.time() - started)
+    return lambda: end - time.monotonic()
+
+
+def wait_for(device: torch.device) -> None:
+    """Wait until a device has finished its queued work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

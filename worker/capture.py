@@ -9,7 +9,6 @@ from pathlib import Path
 
 from torch import Tensor
 
-from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError, SceneError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
@@ -19,8 +18,8 @@ from sgsst_core.files.photos import MAX_MISSING, Photo, PhotoFolder, check_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
 from sgsst_core.orbit.subject import find_subject, find_up
-from sgsst_core.planning.capture_checks import compare_photos, frame_warnings, implausible
-from sgsst_core.planning.shown import shown_by
+from sgsst_core.planning.survey import compare_photos, frame_warnings, implausible, shown_by
+from sgsst_core.progress import Decision
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread, undistorted
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
-from sgsst_core.decision import Decision
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.blending import blend_scenes, encode_blend
@@ -24,6 +23,7 @@ from sgsst_core.files.library import load_scene
 from sgsst_core.files.scene_file import encode_scene, losses, read_scene, write_levels, write_sog_folder
 from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
 from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
+from sgsst_core.progress import Decision
 from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene

@@ -24,9 +24,9 @@ from sgsst_core.quality.scene_difference import CompressionLoss, measure_compres
 from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, seconds_json, sent_json
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
-from sgsst_core.stylizing.rates import estimate
+from sgsst_core.stylizing.planner import estimate
+from sgsst_core.stylizing.steps import Evaluation, mean_loss, on_scales_of, round_evaluation, show_nothing
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.job import CONTINUABLE, Result
 from worker.options import RunOptions

@@ -18,7 +18,6 @@ from typing import Protocol, TypeVar
 
 from torch import Tensor
 
-from sgsst_core.decision import Decision
 from sgsst_core.errors import CameraError, MaskError, SettingsError, SgsstError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.formats import read_scene_header
@@ -27,12 +26,12 @@ from sgsst_core.files.images import WHITE, Color, image_size, load_image
 from sgsst_core.files.photos import Photo, check_names, load_photo
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.files.stylized_ply import check_sh_attenuation
-from sgsst_core.loss.scale_weights import check_scales, check_stroke_depth
 from sgsst_core.orbit.choice import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.shown import nothing_seen
-from sgsst_core.planning.survey import sees_something
+from sgsst_core.planning.facts import check_scales
+from sgsst_core.planning.survey import nothing_seen, sees_something
 from sgsst_core.planning.time_budget import TimeChoice
+from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
@@ -40,7 +39,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, normalized
 from sgsst_core.stylizing.checkpoint import fingerprint
-from sgsst_core.stylizing.job_styles import check_style_size
+from sgsst_core.stylizing.job import check_style_size
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.ranks.shared_scene import read_shared_scene
@@ -145,7 +144,6 @@ def read_inputs(request: JobSpec, collectives: Collectives = ALONE, limits: Inpu
         if limits:
             limits.check_cameras(cameras)
         together(collectives, lambda: check_scales(settings.scales, cameras, settings.coarsest_side))
-        together(collectives, lambda: check_stroke_depth(settings, cameras, regions=bool(request.regions)))
         if limits:
             check_something_in_view(scene_file.scene, cameras, source.near)
     with errors_of("style"):

@@ -14,17 +14,20 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from sgsst_core.constants import NEAR
 from sgsst_core.files.formats.spz import SpzAxes
-from sgsst_core.options import COLOR_SYNTAX, Option, declared, parse_color
 from sgsst_core.scene.rendering import MAX_EPS2D, RenderMode
 from sgsst_core.settings import (
     BY_PRESET,
+    COLOR_SYNTAX,
     Color,
     Near,
+    Option,
     PresetName,
     Resolution,
     Settings,
+    declared,
     default_text,
     make_settings,
+    parse_color,
     preset_texts,
 )
 

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 from sgsst_core import container
+from sgsst_core.devices import Timer
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile
@@ -37,7 +38,6 @@ from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.planner import choose_within, plan_job
 from sgsst_core.stylizing.refining import refine, refined
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.timing import Timer
 from worker.inputs import Inputs, fingerprint_of, read_inputs, same_weights, together
 from worker.job import JobSpec, Resume
 from worker.outputs import Outputs, check_request

@@ -12,12 +12,11 @@ from torch import Tensor
 from sgsst_core.files.images import save_jpg
 from sgsst_core.files.scene_file import write_scene
 from sgsst_core.files.stylized_ply import write_colors
-from sgsst_core.planning.choices import LOSS_VIEWS
+from sgsst_core.planning.plan import LOSS_VIEWS
 from sgsst_core.scene.camera import resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
-from sgsst_core.stylizing.result_colors import render_first_view, transferred_colors
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Stylizer, render_first_view, transferred_colors
 from worker.inputs import Inputs
 
 #: Minimum time between two previews, as a fraction of the job's elapsed time. It limits the number of previews.

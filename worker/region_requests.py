@@ -12,8 +12,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import parse_strength
-from sgsst_core.settings import OR_STRENGTH, checked
+from sgsst_core.settings import OR_STRENGTH, checked, parse_strength
 from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style
 
 #: Selections that need no file, for help texts. Those with a file are `mask=` and `masks=`.

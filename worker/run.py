@@ -131,8 +131,8 @@ def run_rank(
     import torch
 
     from sgsst_core import container
+    from sgsst_core.devices import seconds_left
     from sgsst_core.parallel.collectives import ALONE
-    from sgsst_core.timing import seconds_left
     from worker.execute import execute
     from worker.prepare import describe, prepare
     from worker.previews import Previews

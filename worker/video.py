@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sgsst_core.decision import warnings_of
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.images import Color
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit.cameras import ELEVATION, turntable
 from sgsst_core.orbit.choice import find_upright_subject
+from sgsst_core.progress import warnings_of
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.video import Layer, write_frames
 from sgsst_core.scene.camera import Camera

@@ -23,7 +23,7 @@ from api.client.inputs import camera_files, different_names
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import SUFFIXES, scene_path
-from sgsst_core.options import declared
+from sgsst_core.settings import declared
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 from worker.outputs import check_is_not_input
 

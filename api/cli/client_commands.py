@@ -41,8 +41,7 @@ from sgsst_core.files.formats import (
     listed,
     result_name,
 )
-from sgsst_core.number_format import duration
-from sgsst_core.progress import Progress
+from sgsst_core.progress import Progress, duration
 from sgsst_core.stylizing.progress_bar import live_bar, set_total
 from worker.options import ESSENTIALS
 from worker.outputs import check_file, check_folder, check_is_not_input

@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
-from sgsst_core.loss.convergence import ratio
+from sgsst_core.scales import ratio
 
 #: Exit codes: an unusable input or option, and any other failure.
 BAD_INPUT, FAILURE = 2, 1

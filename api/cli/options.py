@@ -12,8 +12,7 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Declared, declared, merged, reason
-from sgsst_core.settings import BY_PRESET
+from sgsst_core.settings import BY_PRESET, Declared, declared, merged, reason
 from worker.options import GROUPS
 
 Command = Callable[..., None]

@@ -8,7 +8,7 @@ from typing import Literal, get_args, get_origin
 
 from api.cli.options import flags, is_switch, kind_of, metavar
 from service.parameters import JobParameters
-from sgsst_core.options import Declared, declared
+from sgsst_core.settings import Declared, declared
 from worker.options import GROUPS, RunOptions
 
 _BEGINNING = """\

@@ -27,7 +27,7 @@ from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
-from sgsst_core.number_format import clock, duration
+from sgsst_core.progress import clock, duration
 from sgsst_core.stylizing.progress_bar import job_bar, live_bar
 from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 

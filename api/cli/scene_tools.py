@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from api.cli.arguments import local_path
-from sgsst_core.decision import Decision, warnings_of
+from sgsst_core.devices import seconds_left
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.atomic import ensure_writable_folder, write_json
 from sgsst_core.files.blending import normalized
 from sgsst_core.files.images import load_image, save_png
 from sgsst_core.planning.survey import ShowPlanning
+from sgsst_core.progress import Decision, warnings_of
 from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from sgsst_core.timing import seconds_left
 from worker.derive import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice

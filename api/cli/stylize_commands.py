@@ -30,7 +30,7 @@ from api.cli.machine_commands import fetch
 from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
-from sgsst_core.number_format import clock
+from sgsst_core.progress import clock
 from sgsst_core.stylizing.progress_bar import job_bar
 from worker.options import ESSENTIALS, RunOptions, StylizeOptions
 from worker.processes import STOP_SIGNALS

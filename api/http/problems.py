@@ -20,7 +20,7 @@ from service.errors import ServiceError
 from service.files.cache import is_full
 from service.parameters import JobParameters
 from sgsst_core.errors import InvalidInputError
-from sgsst_core.options import merged, reason, unknown_text
+from sgsst_core.settings import merged, reason, unknown_text
 from worker.region_requests import RegionOptions
 
 MEDIA_TYPE = "application/problem+json"

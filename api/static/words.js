@@ -152,7 +152,7 @@ export const words = {
     titles: /** @type {Record<string, string>} */ ({
       content_weight: "Content weight", resolution: "Resolution", views: "Views to use", within: "Time",
       style_scale: "Stroke size", style_rotation: "Rotate the painting", preserve_colors: "Keep the scene's colors", background: "Background", style_background: "Behind transparent paintings",
-      refine: "Finer strokes", sh_attenuation: "Soften reflections", stroke_depth: "Strokes by depth", unseen: "Parts that no view shows",
+      refine: "Finer strokes", sh_attenuation: "Soften reflections", unseen: "Parts that no view shows",
       up: "Up direction", elevation: "Height of the orbit", radius: "Distance of the orbit",
       near: "Near plane", drop_invalid: "Skip broken Gaussians", spz_axes: "Axes of an SPZ file", render_mode: "Antialiasing", eps2d: "Pixel blur", steps_coarse: "Steps for rough colors", steps_sos: "Steps for detail", learning_rate: "Learning rate",
       feature_scale: "Layer weighting", style_loss: "Style comparison", position_weights: "Ignore empty background", precision: "Precision", training_background: "Background while painting",
@@ -167,7 +167,7 @@ export const words = {
       preserve_colors: "match: the painting takes on the scene's colors. luminance: only brightness changes.", background: "black, white, or R,G,B from 0 to 255, such as 40,40,48.",
       style_background: "black, white, or R,G,B from 0 to 255.", refine: "Splits large Gaussians, up to this many times as many in total. 1 is off; auto splits those too large for strokes.",
       orbit: "auto: as many as the scene needs.", up: "auto: estimated from the scene.", elevation: "One ring at this height. Otherwise, as many rings as the scene needs.", radius: "From the scene's center.",
-      sh_attenuation: "0 keeps highlights that move with the view, 1 removes them.", stroke_depth: "Strokes of the same size in the scene: larger ones nearby.", unseen: "neighbors: painted like what is around them. freeze: left as they are.",
+      sh_attenuation: "0 keeps highlights that move with the view, 1 removes them.", unseen: "neighbors: painted like what is around them. freeze: left as they are.",
     }),
     units: /** @type {Record<string, string>} */ ({ content_weight: "", resolution: "", views: "", within: "minutes", style_scale: "×", refine: "×", sh_attenuation: "" }),
     /** Units of the service for one of `units`. */

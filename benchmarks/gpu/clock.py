@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import torch
 
-from sgsst_core.timing import wait_for
+from sgsst_core.devices import wait_for
 
 
 def seconds(action: Callable[[], object], device: torch.device, repeats: int) -> float:

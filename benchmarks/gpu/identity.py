@@ -13,8 +13,8 @@ import torch
 from benchmarks.gpu.part import Findings, Sizes
 from benchmarks.gpu.part import device as chosen_device
 from sgsst_core.bench.doctor import nvidia_smi, output_of, package_version
+from sgsst_core.devices import wait_for
 from sgsst_core.features.vgg import has_bfloat16, has_tf32
-from sgsst_core.timing import wait_for
 
 #: Fields of `nvidia-smi --query-gpu`, by their names in results.
 _QUERIED = {

@@ -13,7 +13,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PlannedPrecision, make_settings
 from sgsst_core.stylizing.loop import Callbacks
 from sgsst_core.stylizing.loop import run as run_steps
-from sgsst_core.stylizing.rates import estimate
+from sgsst_core.stylizing.planner import estimate
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Warm-up steps, in which views are prepared and libraries choose their algorithms.

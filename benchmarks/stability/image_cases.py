@@ -14,8 +14,7 @@ from benchmarks.stability.sos_reference import style_loss_reference
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.statistics_terms import style_loss
-from sgsst_core.loss.targets import LayerTarget
+from sgsst_core.loss.terms import LayerTarget, style_loss
 from sgsst_core.style import Style
 
 _LOSS = "loss and pixel gradient, relative to float64"

@@ -20,8 +20,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.optimizer import ADAM_EPS
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import ADAM_EPS, Stylizer
 
 _END = "loss and gradient of the last picture, relative to float64"
 _SIDE = 16

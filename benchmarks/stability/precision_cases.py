@@ -19,8 +19,7 @@ from sgsst_core.features.statistics import (
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.statistics_terms import style_loss
-from sgsst_core.loss.targets import LayerTarget
+from sgsst_core.loss.terms import LayerTarget, style_loss
 from sgsst_core.style import Style
 
 #: Relative error bound of a loss that is computed in partition tiles, for any number of tiles.

@@ -22,15 +22,14 @@ from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, Activations, FeatureNetwork
 from sgsst_core.loss.feature_scale import even_scales, with_scales
-from sgsst_core.loss.nearest import nearest_weight
 from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.loss.terms import nearest_weight
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.optimizer import constrained
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.steps import mean_loss
+from sgsst_core.stylizing.stylizer import Stylizer, constrained
 
 #: Relative error bound of loss and pixel gradient of the last image against float64.
 REFERENCE_BOUND = 1e-4

@@ -12,10 +12,16 @@ from torch import Tensor
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXEL_UNIT, PIXELS, layer_stride
-from sgsst_core.loss.nearest import nearest_layers, nearest_weight
-from sgsst_core.loss.scale_weights import scale_count
-from sgsst_core.loss.statistics_terms import PAPERS_WEIGHTS, TermWeights, statistics_layers, term_weights
-from sgsst_core.loss.targets import LayerTarget
+from sgsst_core.loss.terms import (
+    PAPERS_WEIGHTS,
+    LayerTarget,
+    TermWeights,
+    nearest_layers,
+    nearest_weight,
+    statistics_layers,
+    term_weights,
+)
+from sgsst_core.scales import scale_count
 from sgsst_core.scene.colors import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.settings import StyleLossName
 
@@ -67,7 +73,7 @@ def style_loss_reference(
     *,
     weights: TermWeights = PAPERS_WEIGHTS,
 ) -> Tensor:
-    """Compute the style loss of one layer from its definition; reference of `statistics_terms.style_loss`.
+    """Compute the style loss of one layer from its definition; reference of `terms.style_loss`.
 
     The computation is in float64 and differentiable.
 
@@ -91,7 +97,7 @@ def _statistics(features: Tensor, position_weights: Tensor | None = None) -> Lay
     gram = (a[:, None] * flat).T @ flat / a.sum()
     variance = (a[:, None] * (flat - mean) ** 2).sum(0) / a.sum()
     # The derivative of the square root is infinite at 0 (a dead channel) and huge at the rounding error of a constant
-    # channel. Such channels are excluded, as in `statistics_terms.style_loss`.
+    # channel. Such channels are excluded, as in `terms.style_loss`.
     alive = variance > (1e-12 * mean).square()
     return LayerTarget(gram, mean, torch.where(alive, variance, 1.0).sqrt() * alive)
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from service.scheduling.machine import Machine
 from service.store.tables import JobRow
 from sgsst_core.errors import SettingsError
-from sgsst_core.loss.scale_weights import ScaleWeights, scale_count
+from sgsst_core.scales import ScaleWeights, scale_count
 from sgsst_core.settings import Settings, make_settings
 from worker.ranks.memory import GAUSSIAN_BYTES, memory_beside_gpus, scene_bytes
 

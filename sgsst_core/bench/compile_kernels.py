@@ -10,7 +10,7 @@ import torch
 
 from sgsst_core.bench.synthetic import random_weights, surface_scene, texture, views
 from sgsst_core.features import winograd
-from sgsst_core.stylizing.stylize import stylize
+from sgsst_core.stylizing.loop import stylize
 
 
 def compile_kernels() -> None:

@@ -14,7 +14,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, use_whole_float32
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.targets import StyleTargets
+from sgsst_core.loss.terms import StyleTargets
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera

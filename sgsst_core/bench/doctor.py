@@ -253,8 +253,8 @@ def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:
 def _precision() -> Diagnosis:
     """Return the precision that jobs choose, and those that can be requested."""
     from sgsst_core.parallel.collectives import ALONE
-    from sgsst_core.planning.choices import choose_precision
     from sgsst_core.planning.facts import describe_machine
+    from sgsst_core.planning.plan import choose_precision
     from sgsst_core.settings import make_settings
 
     machine, settings = describe_machine(make_settings(), ALONE), make_settings(precision="auto")

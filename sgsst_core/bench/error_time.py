@@ -23,8 +23,7 @@ from torch import Tensor
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.convergence import ratio
-from sgsst_core.planning.choices import LOSS_VIEWS
+from sgsst_core.planning.plan import LOSS_VIEWS
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.judge import Judgment
 from sgsst_core.quality.lpips import load_lpips_or_none
@@ -40,10 +39,11 @@ from sgsst_core.report.charts import (
 )
 from sgsst_core.report.history import X_MARGIN, Floats, column, joined, log_limits
 from sgsst_core.report.palette import INK, color_of
+from sgsst_core.scales import ratio
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, Settings, make_settings
-from sgsst_core.stylizing.evaluation import relative_loss
+from sgsst_core.stylizing.steps import relative_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 
 if TYPE_CHECKING:

@@ -31,8 +31,8 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.color_transfer import warm_start
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.warm_start import warm_start
 
 #: Names of the outcomes that are judged for comparison with the variants.
 UNSTYLIZED, TRANSFER = "unstylized", "transfer"

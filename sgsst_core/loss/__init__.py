@@ -1,1 +1,1 @@
-"""SOS loss and its gradient, the float64 reference, and the test for convergence."""
+"""SOS loss of a view: its terms, their targets, and its gradient."""

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from sgsst_core.constants import NEAR
-from sgsst_core.decision import Decision
 from sgsst_core.orbit.cameras import ELEVATION, middle_of, orbit
 from sgsst_core.orbit.subject import Subject, Up, find_subject, find_up
+from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene, sampled, sampled_rows

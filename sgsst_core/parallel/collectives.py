@@ -1,25 +1,54 @@
-"""Collective operations between the ranks of a job; those of several ranks are in `worker.ranks.process_group`.
+"""Collective operations between the ranks of a job, and the groups and the Gaussians that they share.
 
-Every rank calls the same methods in the same order. Results that are "identical on all ranks" are bit-identical, so all
-ranks reach the same decisions based on such results without further messages.
+`worker.ranks.process_group` has the operations of several ranks. Every rank calls the same methods in the same order.
+Results that are "identical on all ranks" are bit-identical, so all ranks reach the same decisions based on such results
+without further messages.
 """
 
 from __future__ import annotations
 
+import math
+import zlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar, get_args
 
+import numpy as np
+import torch
 from torch import Tensor
 
+from sgsst_core.errors import RanksDriftedError
+from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics
-from sgsst_core.parallel.division import ImageExchange
+from sgsst_core.settings import Settings
 
 T = TypeVar("T")
 
 #: Purposes for which tensors are sent.
 Traffic = Literal["image", "statistics", "gradient"]
 TRAFFIC: tuple[Traffic, ...] = get_args(Traffic)
+
+
+@dataclass(frozen=True)
+class ImageExchange:
+    """Rectangles of an image that ranks have and need.
+
+    Attributes:
+        parts: Rectangle of each rank's part; they are disjoint.
+        windows: Rectangle that each rank needs; may be empty.
+    """
+
+    parts: Sequence[Rectangle]
+    windows: Sequence[Rectangle]
+
+    def in_part(self, part: Tensor, rank: int, other: int) -> Tensor:
+        """Return the pixels [h, w, ...] of a rank's part that are in another rank's window."""
+        return part[self.parts[rank].intersection(self.windows[other]).within(self.parts[rank]).slices]
+
+    def in_window(self, window: Tensor, rank: int, other: int) -> Tensor:
+        """Return the pixels [h, w, ...] of a rank's window that are in another rank's part."""
+        return window[self.windows[rank].intersection(self.parts[other]).within(self.windows[rank]).slices]
 
 
 class Collectives:
@@ -117,3 +146,100 @@ ALONE = Collectives()
 def same_on_all(collectives: Collectives, value: Any) -> bool:
     """Return whether all ranks have equal values; the result is identical on all ranks."""
     return all(other == value for other in collectives.all_gather(value))
+
+
+#: If a view shows more than this fraction of all Gaussians, the whole gradient is sent: gathering and scattering values
+#: would take more time than sending fewer values saves.
+DENSE_FRACTION = 0.7
+
+
+def gaussians_sent(shown: float, gaussians: int) -> float:
+    """Return the number of Gaussians whose gradients are sent for a view that shows `shown` of them."""
+    return shown if shown <= DENSE_FRACTION * gaussians else gaussians
+
+
+class ShownGaussians:
+    """Set of Gaussians, one bit each.
+
+    Each view's set is stored for the whole job: 4 million Gaussians take 0.5 MB, while their indices would take up to
+    32 MB.
+
+    Args:
+        mask: [N] bool, on any device; the bits are stored on the same device.
+    """
+
+    def __init__(self, mask: Tensor) -> None:
+        self.total = len(mask)
+        self.count = int(mask.sum())
+        whole = torch.nn.functional.pad(mask.to(torch.uint8), (0, -self.total % 8))
+        self._bits = (whole.view(-1, 8) << _bit_positions(mask.device)).sum(dim=1, dtype=torch.uint8)
+
+    @staticmethod
+    def nbytes(gaussians: int) -> int:
+        """Return the size in bytes of a set, for a scene with this many Gaussians."""
+        return -(-gaussians // 8)
+
+    @property
+    def sparse(self) -> bool:
+        """Whether only the gradients of Gaussians in the set are sent, instead of all gradients."""
+        return gaussians_sent(self.count, self.total) < self.total
+
+    def indices(self) -> Tensor:
+        """Return the indices [count] int64 in ascending order."""
+        if self._bits.device.type == "cpu":  # on a CPU, NumPy is an order of magnitude faster
+            mask = np.unpackbits(self._bits.numpy(), count=self.total, bitorder="little")
+            return torch.from_numpy(np.flatnonzero(mask))
+        return self._device_indices()
+
+    def _device_indices(self) -> Tensor:
+        """Compute `indices` on any device without synchronizing with it."""
+        mask = (self._bits[:, None] >> _bit_positions(self._bits.device)).bitwise_and_(1).view(-1)[: self.total]
+        return torch.nonzero_static(mask, size=self.count)[:, 0]
+
+
+def _bit_positions(device: torch.device) -> Tensor:
+    """Return the positions of the bits in a byte."""
+    return torch.arange(8, dtype=torch.uint8, device=device)
+
+
+#: Steps between two checks that all ranks have the same colors.
+DRIFT_STEPS = 50
+
+
+class Team:
+    """Ranks of a job, and the position of this rank among them.
+
+    Attributes:
+        groups: Number of groups that these ranks form; each group processes its own views.
+        group: Ranks that process the same views as this one.
+    """
+
+    def __init__(self, settings: Settings, collectives: Collectives) -> None:
+        self.everybody = collectives
+        self.groups = math.gcd(settings.views_per_step, collectives.size)
+        self.group = collectives.split_group(self.groups)
+
+    def expect(self, seconds: float) -> None:
+        """Set the timeouts of the ranks for steps that take so many seconds."""
+        for ranks in (self.everybody, self.group):
+            ranks.set_timeout_for(seconds)
+
+    @property
+    def own_group(self) -> int:
+        """Index of this rank's group."""
+        return self.everybody.rank // self.group.size
+
+    def check_drift(self, step: int, colors: Tensor) -> None:
+        """Check every `DRIFT_STEPS` steps that all ranks have the same colors [n, 3].
+
+        Raises:
+            RanksDriftedError: If they differ.
+        """
+        if self.everybody.size == 1 or step % DRIFT_STEPS:
+            return
+        checksum = zlib.crc32(colors.detach().cpu().numpy().tobytes())
+        if not same_on_all(self.everybody, checksum):
+            raise RanksDriftedError(
+                f"Step {step}: the ranks' colors are no longer the same. They compute differently: run on "
+                "machines of one kind, with the same versions of this program and of PyTorch."
+            )

@@ -1,4 +1,4 @@
-"""Division of work among ranks: the pixels of a view at all of its scales, by estimated cost.
+"""Division of views into partition tiles and among ranks, and each rank's pixels of a view at its scales.
 
 Every rank computes the whole division from the same numbers, so no messages are needed. The division affects only the
 rounding of results, because partition tiles give exact gradients for any division.
@@ -7,15 +7,33 @@ rounding of results, because partition tiles give exact gradients for any divisi
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
-from sgsst_core.features.partition import PartitionTile, Rectangle, partition
-from sgsst_core.features.vgg import ALIGNMENT
+from sgsst_core.devices import Timer
+from sgsst_core.features.partition import (
+    PartitionTile,
+    Rectangle,
+    cached_tiles,
+    choose_tile_size,
+    covered_region,
+    partition,
+    scaled_region,
+)
+from sgsst_core.features.vgg import ALIGNMENT, layer_stride
+from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange
+from sgsst_core.scales import EVEN, ScaleWeights, scale_count
+from sgsst_core.scene.pyramid import add_upscaled_, downscale
 
 Size = tuple[int, int]  # height, width in pixels
+
+
+#: Position weights [H >> k, W >> k] for each power of two 2^k; None for equal weights.
+PositionWeights = Sequence[Tensor] | None
 
 
 @dataclass(frozen=True)
@@ -41,27 +59,6 @@ class Piece:
     def tile(self, halo: int) -> PartitionTile:
         """Return the piece as one partition tile."""
         return partition(*self.size, None, halo, self.region)[0]
-
-
-@dataclass(frozen=True)
-class ImageExchange:
-    """Rectangles of an image that ranks have and need.
-
-    Attributes:
-        parts: Rectangle of each rank's part; they are disjoint.
-        windows: Rectangle that each rank needs; may be empty.
-    """
-
-    parts: Sequence[Rectangle]
-    windows: Sequence[Rectangle]
-
-    def in_part(self, part: Tensor, rank: int, other: int) -> Tensor:
-        """Return the pixels [h, w, ...] of a rank's part that are in another rank's window."""
-        return part[self.parts[rank].intersection(self.windows[other]).within(self.parts[rank]).slices]
-
-    def in_window(self, window: Tensor, rank: int, other: int) -> Tensor:
-        """Return the pixels [h, w, ...] of a rank's window that are in another rank's part."""
-        return window[self.windows[rank].intersection(self.parts[other]).within(self.windows[rank]).slices]
 
 
 @dataclass(frozen=True)
@@ -231,3 +228,323 @@ def rounds(scales: Sequence[int], ranks: int) -> list[list[int]]:
     would wait for each other.
     """
     return [[scale] for scale in scales] if ranks == 1 else [list(scales)]
+
+
+#: Cost of rendering a pixel and its gradient, relative to that of a pixel in the network, by device. It is a constant,
+#: so that the division of work, and with it the rounding, does not depend on timings. On a CPU it was measured as 0.004
+#: with cached weights at 1280x720; on GPUs, for which meta tensors stand in a forecast, it is an estimate.
+RENDERING = {"cpu": 0.0, "cuda": 0.125, "meta": 0.125}
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """Rules for partitioning views.
+
+    Attributes:
+        halo: Width in pixels of the halo around a partition tile.
+        held: Number of pixels whose activations fit in memory.
+        working: Additional memory that a tile needs during a pass, as a fraction of the memory of its activations.
+        coarsest: Maximum shorter side of the coarsest scale in pixels.
+        tile_size: Side of partition tiles, a multiple of 16; None to choose it from the memory budget.
+        largest: Maximum pixels of a partition tile whose size is chosen; None for no limit.
+        rendering: Cost of rendering a pixel, relative to that of a pixel in the network (`RENDERING`).
+    """
+
+    halo: int
+    held: float
+    working: float
+    coarsest: int
+    tile_size: int | None = None
+    weights: ScaleWeights = EVEN
+    largest: int | None = None
+    rendering: float = 0.0
+
+    def scale_count(self, size: Size) -> int:
+        """Return n_s for views of a size (height, width)."""
+        return scale_count(*size, self.coarsest)
+
+    def scales(self, size: Size) -> list[int]:
+        """Return the scales with a positive weight for views of a size (height, width), finest first."""
+        return self.weights.chosen(self.scale_count(size))
+
+    def tiles(self, size: Size, region: Rectangle | None = None) -> list[PartitionTile]:
+        """Return the tiles of a region of a scaled view of size (height, width).
+
+        Tiles are as large as the memory budget allows.
+        """
+        tile_size = self.tile_size
+        if tile_size is None:
+            tile_size = choose_tile_size(
+                *size, self.halo, held=self.held, working=self.working, region=region, largest=self.largest
+            )
+        return partition(*size, tile_size, self.halo, region)
+
+    def cached(self, areas: Sequence[int]) -> list[bool]:
+        """Return which of the tiles with these pixel counts cache their activations.
+
+        The memory budget applies to the sum over all given tiles.
+        """
+        return cached_tiles(areas, self.held, self.working)
+
+
+@dataclass(frozen=True)
+class Division:
+    """Division of the work on some scales of a view among ranks.
+
+    Attributes:
+        pieces: For each scale, the pieces of every rank; identical on all ranks.
+        tiles: Partition tiles of this rank by scale.
+        shares: Rectangles that the ranks render; None if every rank has the whole image.
+        halo: Width in pixels of the halo around a tile; only used with `shares`.
+    """
+
+    pieces: dict[int, tuple[tuple[Piece, ...], ...]]
+    tiles: dict[int, list[PartitionTile]]
+    shares: Shares | None = None
+    halo: int = 0
+
+    def cost(self, rank: int, halo: int) -> int:
+        """Return the number of pixels that a rank passes through the network."""
+        return sum(piece.cost(halo) for every in self.pieces.values() for piece in every[rank])
+
+
+class Divider:
+    """Divider of the work on views among ranks.
+
+    Args:
+        collectives: Collectives of the ranks that evaluate each view together.
+    """
+
+    def __init__(self, tiling: Tiling, collectives: Collectives = ALONE) -> None:
+        self.tiling = tiling
+        self.collectives = collectives
+
+    def divide(
+        self, sizes: Mapping[int, Size], coverage: Sequence[Tensor] | None = None, region: Rectangle | None = None
+    ) -> Division:
+        """Divide the work on some scales of a view.
+
+        Args:
+            coverage: Position weights in the format of `ViewTarget.coverage`; None for equal weights.
+            region: Rectangle of the full-size view that contains every covered pixel. If it is given, `coverage` is not
+                read, which avoids synchronizing with the device. The pieces of coarser scales may then be a few cells
+                larger.
+        """
+        read = coverage if region is None else None
+        weights = {scale: read[scale] if read else None for scale in sizes}
+        if region is None:
+            pieces = tuple(self._piece(scale, size, weights[scale]) for scale, size in sizes.items())
+        else:
+            pieces = tuple(Piece(scale, size, scaled_region(region, scale, size)) for scale, size in sizes.items())
+        return self._division(divide(pieces, self.tiling.halo, self.collectives.size), sizes, weights)
+
+    def divide_view(
+        self, size: Size, scales: Sequence[int], coverage: Sequence[Tensor] | None, region: Rectangle | None
+    ) -> Division:
+        """Divide the work on some scales of a view if each rank renders only a part of it.
+
+        The parts do not depend on the scales. If the finest computed scale is among them, each rank's piece of it is
+        the part that the rank renders.
+
+        Args:
+            coverage: Position weights in the format of `ViewTarget.coverage`; None for equal weights.
+            region: Rectangle of the view that contains every covered pixel; None for the whole view.
+        """
+        by_rank = self._divided(size, self.tiling.scales(size), region)
+        shares = Shares.of(size, by_rank, self.tiling.halo)
+        if shares.scale not in scales:
+            by_rank = self._divided(size, scales, region, rendered=False)
+        sizes = {scale: (size[0] >> scale, size[1] >> scale) for scale in scales}
+        weights = {scale: coverage[scale] if coverage else None for scale in scales}
+        return replace(self._division(by_rank, sizes, weights), shares=shares, halo=self.tiling.halo)
+
+    def shares(self, size: Size, region: Rectangle | None) -> Shares:
+        """Return the rectangles that the ranks render of a view; see `divide_view`."""
+        return Shares.of(size, self._divided(size, self.tiling.scales(size), region), self.tiling.halo)
+
+    def _divided(
+        self, size: Size, scales: Sequence[int], region: Rectangle | None, *, rendered: bool = True
+    ) -> tuple[tuple[Piece, ...], ...]:
+        whole = Rectangle(0, 0, *size) if region is None else region
+        sizes = [(size[0] >> scale, size[1] >> scale) for scale in scales]
+        pieces = [
+            Piece(scale, each, scaled_region(whole, scale, each)) for scale, each in zip(scales, sizes, strict=True)
+        ]
+        rendering = self.tiling.rendering if rendered else 0.0
+        return divide(tuple(pieces), self.tiling.halo, self.collectives.size, rendering)
+
+    def _division(
+        self,
+        by_rank: Sequence[Sequence[Piece]],
+        sizes: Mapping[int, Size],
+        weights: Mapping[int, Tensor | None],
+    ) -> Division:
+        own = by_rank[self.collectives.rank]
+        return Division(
+            {scale: tuple(tuple(p for p in each if p.scale == scale) for each in by_rank) for scale in sizes},
+            {
+                scale: [tile for p in own if p.scale == scale for tile in self._partition(p, weights[scale])]
+                for scale in sizes
+            },
+        )
+
+    def tiles(self, size: Size, coverage: Tensor | None = None) -> list[PartitionTile]:
+        """Return the partition tiles of a scaled view of size (height, width).
+
+        If `coverage` [h, w] is given, pixels with coverage 0 may not belong to any tile.
+        """
+        return self._partition(self._piece(0, size, coverage), coverage)
+
+    def _piece(self, scale: int, size: Size, coverage: Tensor | None) -> Piece:
+        """Return the piece of one scale that contains all pixels that the network has to process."""
+        if coverage is None:
+            return Piece(scale, size, Rectangle(0, 0, *size))
+        return Piece(scale, size, covered_region(coverage))
+
+    def _partition(self, piece: Piece, coverage: Tensor | None) -> list[PartitionTile]:
+        """Return the covered partition tiles of a piece, as large as the memory budget allows."""
+        tiles = self.tiling.tiles(piece.size, piece.region)
+        if coverage is None:
+            return tiles
+        return [tile for tile in tiles if coverage[tile.inner.slices].any()]
+
+
+@dataclass(frozen=True)
+class ScaledView:
+    """One scale of a view, or the pixels of it that a rank needs.
+
+    Attributes:
+        image: [h, w, 3], pixels of `area` on the network's device.
+        size: (height, width) of the whole scaled view.
+        area: Rectangle of the scaled view; empty if the rank needs no pixels.
+    """
+
+    image: Tensor
+    scale: int
+    size: Size
+    area: Rectangle
+
+    @staticmethod
+    def of(image: Tensor, scale: int) -> ScaledView:
+        """Return the whole of a scaled view [h, w, 3]."""
+        size = (image.shape[0], image.shape[1])
+        return ScaledView(image, scale, size, Rectangle(0, 0, *size))
+
+    def pixels(self, rectangle: Rectangle) -> Tensor:
+        """Return the pixels of a rectangle of the scaled view."""
+        return self.image[rectangle.within(self.area).slices]
+
+    def weights(self, layer: str, cells: Rectangle, pyramid: PositionWeights) -> Tensor | None:
+        """Return the weights [h, w] of a block of cells of a layer, as box averages; None for equal weights."""
+        if pyramid is None:
+            return None
+        return pyramid[self.scale + layer_stride(layer).bit_length() - 1][cells.slices]
+
+    def count(self, layer: str, pyramid: PositionWeights) -> Tensor:
+        """Return the sum of the weights of all cells of a layer, float64 scalar; their number for equal weights."""
+        stride = layer_stride(layer)
+        cells = Rectangle(0, 0, self.size[0] // stride, self.size[1] // stride)
+        weights = self.weights(layer, cells, pyramid)
+        if weights is not None:
+            return weights.sum(dtype=torch.float64)
+        return torch.full((), cells.pixels, dtype=torch.float64, device=self.image.device)
+
+
+class ViewImages:
+    """Image of a view at several scales.
+
+    All ranks must create it and call `gradient` together.
+
+    Args:
+        image: [h, w, 3], image of the view, or of this rank's window of `division.shares`.
+        background: Color of the pixels that no rank renders.
+    """
+
+    def __init__(
+        self,
+        image: Tensor,
+        division: Division,
+        background: tuple[float, float, float],
+        collectives: Collectives,
+        timer: Timer,
+    ) -> None:
+        self._collectives, self._timer = collectives, timer
+        shares = division.shares
+        whole = Rectangle(0, 0, image.shape[0], image.shape[1])
+        self._own = _Pixels(image, 0, whole if shares is None else shares.windows[collectives.rank])
+        self._size = whole.shape if shares is None else shares.size
+        self._shares = shares
+        #: Rectangles of each image that ranks exchange, by scale, and the pixels of it that this rank needs.
+        self._exchanges: dict[int, ImageExchange] = {}
+        self._coarse: dict[int, _Pixels] = {}
+        if shares is not None and any(scale != shares.scale for scale in division.pieces):
+            by_rank = [list(itertools.chain(*own)) for own in zip(*division.pieces.values(), strict=True)]
+            self._exchanges = shares.exchanges(by_rank, division.halo)
+            #: This rank's part of the view, relative to its window.
+            self._part = shares.parts[collectives.rank].within(self._own.area)
+            self._gather(background)
+
+    def _gather(self, background: tuple[float, float, float]) -> None:
+        """Exchange the coarser images between ranks."""
+        own = [downscale(self._own.image[self._part.slices], scale) for scale in self._exchanges]
+        for scale, exchange in self._exchanges.items():
+            area = exchange.windows[self._collectives.rank]
+            image = self._own.image.new_empty((*area.shape, 3))
+            for channel, color in zip(image.unbind(-1), background, strict=True):
+                channel.fill_(color)  # scalars are kernel arguments, so the host does not wait for a copy to the device
+            self._coarse[scale] = _Pixels(image, scale, area)
+        with self._timer("communication"):
+            windows = [pixels.image for pixels in self._coarse.values()]
+            self._collectives.gather_parts([*self._exchanges.values()], own, windows)
+
+    def scaled(self, scale: int) -> ScaledView:
+        """Return the pixels of a scale that this rank needs."""
+        return self._source(scale).scaled(scale, (self._size[0] >> scale, self._size[1] >> scale))
+
+    def add_gradient(self, scale: int, gradient: Tensor, factor: float) -> None:
+        """Add the gradient with respect to the pixels of `scaled(scale)`, times a factor."""
+        self._source(scale).add_gradient(scale, gradient, factor)
+
+    def gradient(self) -> Tensor:
+        """Return this rank's summand of the gradient with respect to the image, [h, w, 3]."""
+        if self._exchanges:
+            gradients = [image.gradient for image in self._coarse.values() if image.gradient is not None]
+            with self._timer("communication"):
+                own = self._collectives.reduce_parts([*self._exchanges.values()], gradients)
+            for scale, gradient in zip(self._exchanges, own, strict=True):
+                self._own.add_gradient(scale, gradient, area=self._part)
+        assert self._own.gradient is not None
+        return self._own.gradient
+
+    def _source(self, scale: int) -> _Pixels:
+        """Return the pixels from which those of a scale are computed."""
+        if self._shares is None or scale == self._shares.scale:
+            return self._own
+        return self._coarse[self._shares.exchanged_scale(scale)]
+
+
+@dataclass
+class _Pixels:
+    """Rectangle of a scaled view, and the gradient with respect to it.
+
+    Attributes:
+        area: Rectangle of the scaled view.
+        gradient: [h, w, 3]; None before the first `add_gradient`.
+    """
+
+    image: Tensor
+    scale: int
+    area: Rectangle
+    gradient: Tensor | None = None
+
+    def scaled(self, scale: int, size: tuple[int, int]) -> ScaledView:
+        """Return these pixels at a scale of the view of size (height, width)."""
+        further = scale - self.scale
+        return ScaledView(downscale(self.image, further), scale, size, self.area.at_scale(further))
+
+    def add_gradient(self, scale: int, gradient: Tensor, factor: float = 1.0, area: Rectangle | None = None) -> None:
+        """Add the gradient with respect to these pixels at a scale, or to an area of them, times a factor."""
+        if self.gradient is None:
+            self.gradient = gradient.new_zeros(self.image.shape)
+        target = self.gradient if area is None else self.gradient[area.slices]
+        add_upscaled_(target, gradient, scale - self.scale, factor)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.budget import default_memory_limit, memory_for
+from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import computed_twice, scaled_region
 from sgsst_core.features.vgg import (
@@ -21,14 +22,13 @@ from sgsst_core.features.vgg import (
     use_whole_float32,
 )
 from sgsst_core.loss.graphs import can_use_graphs
-from sgsst_core.loss.scale_weights import ScaleWeights, scale_count
 from sgsst_core.loss.terms import layers_of
-from sgsst_core.loss.tiling import Tiling
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.parallel.division import Size
+from sgsst_core.parallel.division import Size, Tiling
 from sgsst_core.planning.survey import Survey
 from sgsst_core.rasterizer import Rasterizer, drawing_problem, gpu_rasterizers, make_rasterizer, rasterizer_for
 from sgsst_core.rasterizer.base import Precision as WeightPrecision
+from sgsst_core.scales import ScaleWeights, scale_count
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PlannedPrecision, Settings
@@ -305,3 +305,33 @@ def evaluated_pixels(cameras: Sequence[Camera], settings: Settings) -> tuple[flo
         pixels += camera.width * camera.height * evaluated
         most = max(most, scales)
     return pixels / len(cameras), most
+
+
+def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: int) -> None:
+    """Check that every scale with a positive weight exists, and that every view has at least one such scale.
+
+    Args:
+        weights: Weights from the finest scale to coarser ones, at least one of them positive; empty for equal weights.
+        coarsest: Maximum shorter side of the coarsest scale in pixels.
+
+    Raises:
+        SettingsError: If a scale with a positive weight exists in no view, or a view has no scale with a positive
+            weight.
+    """
+    requested = ScaleWeights(tuple(weights))
+    if not requested.values:
+        return
+    counts = {camera.name: scale_count(camera.height, camera.width, coarsest) for camera in cameras}
+    most, last = max(counts.values()), max(scale for scale, weight in enumerate(weights) if weight > 0)
+    if last >= most:
+        have = "one scale, 0" if most == 1 else f"{most} scales, 0 to {most - 1}"
+        raise SettingsError(
+            f"--scales gives scale {last} a weight, but the views have {have} (full size): leave it out, or give "
+            "larger views or a smaller --coarsest-side."
+        )
+    for name, count in counts.items():
+        if not requested.chosen(count):
+            raise SettingsError(
+                f"--scales gives no weight to the {count} of {most} scales that view {name!r} has. Give one of them a "
+                "weight, or use views of one size."
+            )

@@ -1,17 +1,29 @@
-"""Plan of a job: what was decided before the first iteration, for users and for the stylizer that follows it."""
+"""Plan of a job: what it leaves out or does differently for its scene, with the reason of each choice.
+
+`make_plan` is a pure function of the facts and the settings. Thresholds were measured once; what they rest on stands
+beside them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
+import numpy as np
 from torch import Tensor
 
-from sgsst_core.decision import Decision
-from sgsst_core.planning.facts import Device
+from sgsst_core.budget import measuring_memory, memory_for
+from sgsst_core.errors import SettingsError
+from sgsst_core.loss.terms import MAX_VECTORS, NEAREST_WEIGHTS, has_statistics
+from sgsst_core.planning.facts import Device, Facts, Machine, NetworkPixels
 from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import TimeChoice
+from sgsst_core.progress import ANOTHER_LOSS, VIEWS, Decision
+from sgsst_core.rasterizer import RASTERIZERS
 from sgsst_core.refine.split import Refinement
-from sgsst_core.settings import WHOLE_FLOAT32, CachedWeights, PlannedBackground, PlannedPrecision
+from sgsst_core.scales import MIN_FALL, ScaleWeights, scale_count, window_length
+from sgsst_core.settings import WHOLE_FLOAT32, CachedWeights, PlannedBackground, PlannedPrecision, Settings
 
 
 @dataclass(frozen=True)
@@ -94,3 +106,500 @@ class Plan:
     def is_approximated(self) -> bool:
         """Whether measurements compare the gradient of a step with the float32 reference."""
         return self.precision not in WHOLE_FLOAT32 or self.cached_weights == "half"
+
+
+#: Fraction of uncovered pixels above which statistics are weighted by coverage, unless the settings say otherwise.
+_UNCOVERED = 0.01
+#: Above this fraction of uncovered pixels, views are assumed to show an object without background. (Views of a room
+#: that was captured from only some places have holes of a few percent.)
+_SCAN = 0.2
+#: Fraction of the color energy that depends on the view direction, from which on attenuating it is recommended: it
+#: then shows beside the style (benchmarks/results/README.md).
+_VIEW_DEPENDENT = 0.05
+#: Default training background for such an object (docs/quality.md).
+_SCAN_BACKGROUND: PlannedBackground = "palette"
+#: Precision with "auto" by device: the first one that all ranks compute without emulation. The loss after a job is the
+#: same in all of them (benchmarks/results/README.md). float16 continues in bfloat16 if it overflows.
+_PREFERRED: dict[str, tuple[PlannedPrecision, ...]] = {
+    "cpu": ("bfloat16", "winograd"),
+    "cuda": ("float16", "bfloat16", "tf32"),
+}
+#: What a requested precision needs.
+_GPU = "an NVIDIA GPU of compute capability 8.0 or higher"
+_NEEDED: dict[PlannedPrecision, str] = {
+    "winograd": "a CPU",
+    "bfloat16": f"a CPU with matrix units (AMX), an AMD GPU, or {_GPU}",
+    "float16": _GPU,
+    "tf32": _GPU,
+}
+#: Error of the pixel gradient in each precision, relative to float32's, at ordinary contrast.
+_ERRORS: dict[PlannedPrecision, str] = {
+    "winograd": "3e-3",
+    "tf32": "1e-2",
+    "float16": "3e-2",
+    "bfloat16": "0.2; up to 0.9 where contrast is low",
+}
+#: Minimum visits of each view size for which CUDA graphs of the loss pay off, and maximum pixels of a view: a step of
+#: 980x545 takes 19 ms without and 8 ms with a graph, because the GPU waits for 15 ms of launches, which larger views
+#: hide (99 ms at 5187x3361, H200 and H100).
+_GRAPH_VISITS, _GRAPH_PIXELS = 20, 2_600_000
+#: Minimum visits of a view for which caching its blend weights pays off on a GPU: storing them takes 14 to 26 ms, and
+#: each visit saves 2.2 (a million Gaussians) to 10 ms (6 million, H200).
+_CACHED_VISITS = 8
+#: Network pixels of a rank in a step on all scales below which each rank gets a view of its own: two CPU ranks are 1.72
+#: times as fast as one on divided views of 1280x720, and worth 1.9 with views of their own. GPUs gain nothing by
+#: dividing 980x545, and 8 of them are 6.2 times as fast as one at 5187x3361.
+_OWN_VIEW_PIXELS = {"cpu": 500_000, "cuda": 2_000_000}
+#: Number of steps with one view that a step with several is worth, by the loss left (benchmarks/results/README.md).
+#: More views were not measured.
+_WORTH = {1: 1.0, 2: 1.9, 4: 2.6, 8: 3.4}
+#: Maximum numbers of views on which the loss is evaluated before the steps, and of novel views.
+LOSS_VIEWS, NOVEL_VIEWS = 4, 4
+#: Forward passes of a novel view: for the Gram distance before and after the steps, each beside its renders.
+_NOVEL_PASSES = 2
+#: Bytes per optimized Gaussian: color, gradient and two moments, float32.
+OPTIMIZER_BYTES = 4 * 3 * 4
+#: Bytes of a process before it reads a scene: libraries, compiled kernels and the network (peak_memory.json).
+_PROCESS_BYTES = 900_000_000
+#: Bytes per Gaussian beside its stored values: the file's, those of the rendered scene, and the neighbor search.
+_GAUSSIAN_BYTES = 400
+#: Bytes per pixel and scale of a view's targets: content features (relu4_2), coverage, and its image.
+_TARGET_BYTES = 32
+
+
+# --- choices -------------------------------------------------------------------------------------------------------
+
+
+def make_plan(
+    facts: Facts,
+    settings: Settings,
+    *,
+    groups: int | None = None,
+    measured: bool = False,
+    about: Sequence[Decision] = (),
+) -> Plan:
+    """Decide everything about a job.
+
+    Args:
+        groups: `Plan.groups` of an earlier plan of the same job; None to choose them.
+        measured: Whether quality is measured and a report is written, as in `sgsst stylize`.
+        about: Decisions about the inputs, which come first.
+    """
+    survey, machine = facts.survey, facts.machine
+    weighted = is_weighted(survey, settings)
+    scan = weighted and survey.uncovered_fraction > _SCAN
+    background, warm = settings.training_background, settings.warm_start
+    seen = survey.total_blend_weights > 0
+    pixels = NetworkPixels.of(facts, settings, weighted=weighted)
+    plan = Plan(
+        survey=survey,
+        optimized=seen if facts.frozen is None else seen & ~facts.frozen,
+        seen=seen,
+        covered=tuple(survey.covered),
+        weighted=weighted,
+        # Optimization changes the overall color of a scene only slowly (docs/quality.md). If only luminance is
+        # stylized, a warm start pays off only for scans, because nothing around the object determines its brightness.
+        warm_start=scan or settings.preserve_colors != "luminance" if warm is None else warm,
+        training_background=(_SCAN_BACKGROUND if scan else "background") if background == "auto" else background,
+        steps_coarse=0 if _has_one_phase(facts, settings) else settings.steps_coarse,
+        memory_limit=machine.memory_limit,
+        device=machine.device,
+        rasterizer=facts.rasterizer,
+        uncached=facts.rasterizer,
+        precision=facts.precision,
+        measured=measured,
+        ranks=machine.ranks,
+        loss_views=min(LOSS_VIEWS, len(survey.covered)),
+    )
+    plan = replace(plan, groups=groups or _groups(plan, facts, settings, pixels))
+    settings = with_groups(settings, plan.groups)
+    plan = replace(plan, steps_coarse=min(plan.steps_coarse, settings.steps_coarse))
+    cached, about_weights = _blend_weights(plan, facts, settings)
+    if cached != "none":
+        plan = replace(plan, rasterizer="cached", cached_weights=cached)
+    graphs, novel = _why_no_graphs(plan, facts, settings) is None, _novel_views(plan, settings)
+    plan = replace(plan, graphs=graphs, novel_views=novel)
+    plan = _with_memory(plan, facts, pixels)
+    per_rank = settings.views_per_step / plan.ranks
+    passes = (plan.loss_views + _NOVEL_PASSES * plan.novel_views) / 3 if measured else 0.0
+    work = Work(per_rank * pixels.sampled, per_rank * pixels.coarse, passes * pixels.all / plan.ranks)
+    lines = (
+        *about,
+        *_about_gaussians(plan, facts, settings),
+        *_about_coverage(plan, facts, settings, pixels),
+        *_about_network(facts, settings, pixels),
+        *_about_rasterizer(plan, facts, settings),
+        about_weights,
+        *_about_schedule(plan, facts, settings),
+        *_about_ranks(plan, facts, settings),
+        *_about_precision(plan, settings),
+        *_about_measuring(plan, settings),
+    )
+    return replace(plan, work=work, decisions=lines)
+
+
+def is_weighted(survey: Survey, settings: Settings) -> bool:
+    """Return whether statistics are weighted by coverage."""
+    requested = settings.position_weights
+    return requested == "on" or (requested == "auto" and survey.uncovered_fraction > _UNCOVERED)
+
+
+def choose_precision(settings: Settings, machine: Machine) -> PlannedPrecision:
+    """Return the requested precision of the network; with "auto", the fastest that the processors have.
+
+    Raises:
+        SettingsError: If the requested precision cannot be computed here.
+    """
+    wanted = settings.precision
+    if wanted == "auto":
+        return next((name for name in _PREFERRED[machine.device] if name in machine.precisions), "float32")
+    if wanted != "float32" and wanted not in machine.precisions:
+        where = "this GPU" if machine.device == "cuda" else "this CPU"
+        raise SettingsError(
+            f"--precision {wanted} needs {_NEEDED[wanted]}, which {where} is not. Give another one, or none for the "
+            "fastest one here."
+        )
+    return wanted
+
+
+def _has_one_phase(facts: Facts, settings: Settings) -> bool:
+    """Return whether phase 1 is skipped, because every view has a single scale with a weight."""
+    weights = ScaleWeights(settings.scales)
+    counts = [len(weights.chosen(scale_count(*size, settings.coarsest_side))) for size in facts.sizes]
+    return max(counts) <= 1 and settings.preset != "paper"
+
+
+def ends_with_transfer(settings: Settings, *, warm: bool) -> bool:
+    """Return whether a job with a warm start transfers the style's colors once more after the last step.
+
+    A loss without statistics lets colors drift from the style's during the steps; ARF (Zhang et al. 2022) transfers
+    them twice too. With statistics, a second transfer would undo what the steps have achieved.
+    """
+    return warm and not has_statistics(settings.style_loss)
+
+
+def worth(views: int) -> float:
+    """Return how many steps with one view leave as little of the loss as a step with several views."""
+    return float(np.interp(math.log2(views), [math.log2(known) for known in _WORTH], list(_WORTH.values())))
+
+
+def _groups(plan: Plan, facts: Facts, settings: Settings, pixels: NetworkPixels) -> int:
+    """Choose the number of groups of ranks, each with a view of its own in every step; 1 leaves it to the settings.
+
+    Steps that were given, and those of the published schedule, remain as they are.
+    """
+    ranks = plan.ranks
+    given = {"views_per_step", "steps_coarse", "steps_sos"} & {*settings.fixed}
+    if ranks == 1 or settings.preset == "paper" or given or settings.within or len(plan.covered) < 2 * ranks:
+        return 1
+    return ranks if pixels.all / ranks < _OWN_VIEW_PIXELS[facts.machine.device] else 1
+
+
+def with_groups(settings: Settings, groups: int) -> Settings:
+    """Return the settings of a job whose plan has formed groups of ranks: one view for each in fewer steps."""
+    if groups == 1:
+        return settings
+    steps = {name: math.ceil(getattr(settings, name) / worth(groups)) for name in ("steps_coarse", "steps_sos")}
+    return settings.model_copy(update={**steps, "views_per_step": groups})
+
+
+def _visits(plan: Plan, settings: Settings) -> int:
+    return (plan.steps_coarse + settings.steps_sos) * settings.views_per_step
+
+
+def _visits_of_a_size(plan: Plan, facts: Facts, settings: Settings) -> int:
+    """Return the passes of images of one size through the network in the whole schedule.
+
+    With weighted statistics, every view has its own size, because it is cropped to its covered pixels.
+    """
+    different = len(plan.covered) if plan.weighted else len({facts.sizes[index] for index in plan.covered})
+    return _visits(plan, settings) // different
+
+
+def _divides_views(plan: Plan, settings: Settings) -> bool:
+    """Return whether several ranks work on the same view."""
+    return plan.ranks > math.gcd(settings.views_per_step, plan.ranks)
+
+
+def _blend_weights(plan: Plan, facts: Facts, settings: Settings) -> tuple[CachedWeights, Decision]:
+    """Choose the format of cached blend weights: float32 or half precision, as fits; none if it saves no time."""
+    item, why_not = "blend weights", _why_not_cached(plan, facts, settings)
+    whole, halved = facts.weight_bytes or (0, 0)
+    if why_not is not None:
+        return "none", Decision(item, "recomputed in every step", why_not, bytes=whole or None)
+    budget, cached = memory_for("rasterizer", facts.machine.memory), settings.cached_weights
+    if cached == "auto":
+        cached = "float32" if whole <= budget or settings.preset == "paper" else "half"
+    name, size, error = "float32", whole, "none"
+    if cached == "half":
+        name, size = "half precision", halved
+        error = "each weight is off by at most 1/2048 of its value: 0.12 of 255 levels per pixel"
+    of_a_view = size / len(plan.covered)
+    portion = "all" if size <= budget else f"{budget // of_a_view * of_a_view / size:.0%} of the views'"
+    reason = f"they take {size / 1e9:.2f} GB for all views; {budget / 1e9:.1f} GB are available for blend weights"
+    return cached, Decision(item, f"{portion} cached in {name}", reason, error=error)
+
+
+def _why_not_cached(plan: Plan, facts: Facts, settings: Settings) -> str | None:
+    """Return the reason why blend weights are not cached; None if they are."""
+    visits = _visits(plan, settings) / len(plan.covered)
+    if settings.cached_weights == "none":
+        return "requested"
+    if facts.weight_bytes is None:
+        return f"{RASTERIZERS[facts.rasterizer].title} does not cache them"
+    if settings.cached_weights != "auto":
+        return None
+    if facts.weight_bytes[1] / len(plan.covered) > memory_for("rasterizer", facts.machine.memory):
+        return "the weights of one view do not fit"
+    return f"a view is visited only {visits:.1f} times" if visits < _CACHED_VISITS else None
+
+
+def _why_no_graphs(plan: Plan, facts: Facts, settings: Settings) -> str | None:
+    """Return the reason why the loss of a view is not captured as a CUDA graph; None if it is."""
+    visits = _visits_of_a_size(plan, facts, settings)
+    if not facts.machine.graphs:
+        return "CUDA graphs need an NVIDIA GPU and PyTorch 2.13 or later"
+    if _divides_views(plan, settings):
+        return "a graph cannot contain communication between workers"
+    if visits < _GRAPH_VISITS:
+        return f"views of one size are visited only {visits:,} times"
+    if max(height * width for height, width in facts.sizes) > _GRAPH_PIXELS:
+        return "views are so large that the GPU does not wait for launches"
+    return None
+
+
+def _novel_views(plan: Plan, settings: Settings) -> int:
+    """Choose how many novel views are measured: passes outside of the steps are at most a fraction of those in them."""
+    passes = int(settings.measure * _visits(plan, settings)) - plan.loss_views
+    return max(min(NOVEL_VIEWS, passes // _NOVEL_PASSES), 0) if plan.measured else 0
+
+
+def _with_memory(plan: Plan, facts: Facts, pixels: NetworkPixels) -> Plan:
+    """Add to a plan the bound on its memory, and what a single rank on a GPU can spare of that for activations."""
+    memory, budget = facts.machine.memory, memory_for("activations", facts.machine.memory)
+    needed = activations = min(int(pixels.held * facts.pixel_bytes), budget)
+    if plan.measured and plan.is_approximated:  # features of the float32 reference are larger
+        size = 2 if plan.precision in ("bfloat16", "float16") else 1
+        needed = min(size * activations, budget)
+    # A CUDA graph does not share its memory: evaluating the loss without the graph needs the same amount again.
+    needed += activations * plan.graphs
+    spare = max(budget - needed, 0) if plan.device == "cuda" and facts.machine.ranks == 1 else 0
+    areas = sum(facts.sizes[index][0] * facts.sizes[index][1] for index in plan.covered)
+    of_views = int(4 / 3 * _TARGET_BYTES * areas) + 12 * facts.gaussians * len(plan.covered) * bool(facts.used_degree)
+    cached = 0 if plan.cached_weights == "none" else (facts.weight_bytes or (0, 0))[plan.cached_weights == "half"]
+    used = needed + min(of_views, memory_for("views", memory) + spare // 2)
+    used += min(facts.intersection_bytes + cached, memory_for("rasterizer", memory) + spare // 2)
+    used += min(measuring_memory(memory), 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered))
+    of_scene = facts.gaussians * (_GAUSSIAN_BYTES + 24 * (facts.sh_degree + 1) ** 2)
+    process, device = _PROCESS_BYTES + of_scene + (used if plan.device == "cpu" else 0), None
+    if plan.device == "cuda":
+        device = used + of_scene
+    return replace(plan, spare=spare, peak_bytes=process, device_bytes=device)
+
+
+# --- plan lines ----------------------------------------------------------------------------------------------------
+
+
+def _about_gaussians(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
+    """Yield the decisions about Gaussians that are not rendered, and about spherical harmonics."""
+    unseen, count = int((~plan.seen).sum()), facts.gaussians
+    if unseen:
+        frozen = settings.unseen == "freeze"
+        change = "keep their colors" if frozen else "follow their neighbors' color change at the end"
+        unused = f"{unseen:,} of {count:,} are neither rendered nor optimized; they {change}"
+        reason = "no pixel of any view shows them"
+        yield Decision("unseen Gaussians", unused, reason, bytes=unseen * OPTIMIZER_BYTES)
+    item, attenuation = "spherical harmonics", settings.sh_attenuation
+    degree, used = facts.sh_degree, facts.used_degree
+    saved = count * 3 * ((degree + 1) ** 2 - (used + 1) ** 2) * 4
+    if not degree:
+        nothing = ": there is nothing to attenuate" if attenuation else ""
+        yield Decision(item, "no view directions are computed", f"the scene has degree 0{nothing}")
+    elif attenuation == 1:
+        without = f"degrees 1 to {degree} are attenuated to 0, in the result too; no view directions are computed"
+        error = "colors no longer depend on the view direction"
+        yield Decision(item, without, "requested", bytes=saved, error=error)
+    elif attenuation:
+        less = (
+            f"coefficients of degrees 1 to {degree} are multiplied by {1 - attenuation:.3g}, in the result too; "
+            f"evaluated up to degree {used}"
+        )
+        yield Decision(item, less, "requested", error="colors depend less on the view direction")
+    else:
+        if facts.harmonics_energy >= _VIEW_DEPENDENT:
+            advice = "unchanged, so highlights keep their tint; --sh-attenuation 1 removes it"
+            reason = f"{facts.harmonics_energy:.0%} of the color variance depends on the view direction"
+            yield Decision("view-dependent color", advice, reason)
+        if used < degree:
+            zeros = f"all coefficients of degrees {used + 1} to {degree} are 0"
+            yield Decision(item, f"evaluated up to degree {used}", zeros, bytes=saved)
+
+
+def _about_coverage(plan: Plan, facts: Facts, settings: Settings, pixels: NetworkPixels) -> Iterator[Decision]:
+    """Yield the decisions about empty views, uncovered pixels, backgrounds, and the colors at the start."""
+    uncovered = f"{plan.survey.uncovered_fraction:.1%} of the views' pixels are uncovered"
+    total, blind = len(facts.sizes), len(facts.sizes) - len(plan.covered)
+    if blind:
+        yield Decision(VIEWS, f"{blind} of {total} are skipped", "they see no Gaussian")
+    if pixels.all < pixels.without_region:
+        skipped = f"{1 - pixels.all / pixels.without_region:.0%} of the pixels skip the network"
+        yield Decision("uncovered pixels", skipped, uncovered)
+    if plan.weighted:
+        yield Decision("position weights", "statistics are weighted by coverage", uncovered, error=ANOTHER_LOSS)
+    if plan.training_background != "background":
+        random = plan.training_background == "random"
+        color = "a random color" if random else "the color of a random pixel of the style"
+        requested = settings.training_background != "auto"
+        reason = "requested" if requested else f"{uncovered}: colors would be fitted to a fixed background"
+        if settings.content_weight:
+            reason += "; content features are recomputed with it in every step"
+        yield Decision("training background", f"{color} each time", reason, error=ANOTHER_LOSS)
+    by_luminance = settings.preserve_colors == "luminance"
+    if plan.warm_start:
+        start = "colors start with the style's distribution"
+        if by_luminance:
+            start = "luminance starts with the style's mean and standard deviation"
+        if ends_with_transfer(settings, warm=True):
+            start += f"; they are reset to it after the last step, because {settings.style_loss} lets them drift"
+        reason = "steps change the overall color only slowly"
+        if settings.warm_start is not None:
+            reason = "requested"
+        elif plan.weighted and plan.survey.uncovered_fraction > _SCAN:
+            reason = f"{uncovered}: nothing around the object determines how bright it should be"
+        yield Decision("start", start, reason, error="differs from the paper's start")
+    if by_luminance:
+        line = "only luminance is compared and optimized; each Gaussian keeps its chroma"
+        yield Decision("colors", line, "requested", error=ANOTHER_LOSS)
+
+
+def _about_network(facts: Facts, settings: Settings, pixels: NetworkPixels) -> Iterator[Decision]:
+    """Yield the decisions about layers, style loss, content, partition and forward passes."""
+    layers = f"up to {facts.deepest}, the deepest one used"
+    yield Decision("network layers", layers, "the loss reads no deeper layer")
+    if settings.style_loss != "sos":
+        weight = NEAREST_WEIGHTS[settings.style_loss]
+        what = "replaces the statistics" if settings.style_loss == "nnfm" else "is added to the statistics"
+        distance = (
+            f"the distance of relu3 features to the nearest of at most {MAX_VECTORS:,} style features {what}, with "
+            f"weight {weight:.3g}"
+        )
+        yield Decision("style loss", distance, f"{settings.style_loss} was requested", error=ANOTHER_LOSS)
+    if not settings.content_weight:
+        yield Decision("content", "no content features are computed or cached", "its weight is 0")
+    memory = f"the {memory_for('activations', facts.machine.memory) / 1e9:.1f} GB for activations"
+    if pixels.tiles <= 1:
+        yield Decision("partition", "none: the network takes each view as a whole", f"it fits in {memory}")
+    else:
+        tiles = f"up to {pixels.tiles} tiles per view"
+        yield Decision("partition", tiles, f"larger tiles would not fit in {memory}")
+    if pixels.again:
+        again = pixels.again / pixels.all
+        reason = f"activations of {1 - again:.0%} of the pixels fit in {memory}"
+        yield Decision("second forward", f"for {again:.0%} of the pixels", reason)
+    else:
+        none = "none: activations are cached between statistics and gradient"
+        yield Decision("second forward", none, f"they fit in {memory}")
+
+
+def _about_rasterizer(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
+    """Yield the decisions about the rasterizer and kernel launches on a GPU; on the CPU there is no choice."""
+    if plan.device != "cuda":
+        return
+    used = RASTERIZERS[facts.rasterizer]
+    how = f"{used.title} on the GPU" if used.on_gpu else "on the CPU"
+    if plan.cached_weights != "none":
+        how += ", with cached blend weights"
+    problems = facts.machine.problems.items()
+    reasons = [f"{RASTERIZERS[name].title} cannot be used: {problem}" for name, problem in problems]
+    if used.on_gpu:
+        reasons.append(f"{used.title} works here")
+    yield Decision("rasterizer", how, "; ".join(reasons) or "requested")
+    if reason := _why_no_graphs(plan, facts, settings):
+        yield Decision("launches", "kernel by kernel", reason)
+    else:
+        visited = f"views of one size are visited {_visits_of_a_size(plan, facts, settings):,} times"
+        yield Decision("launches", "the loss of a view is captured as a CUDA graph", visited)
+
+
+def _about_schedule(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
+    """Yield the decisions about scales and their weights, phases, and stopping early."""
+    counts = [scale_count(*facts.sizes[index], settings.coarsest_side) for index in plan.covered]
+    scales = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{counts[0]}"
+    reason = f"the shorter side is halved until it is at most {settings.coarsest_side} pixels"
+    yield Decision("scales", scales, reason)
+    if settings.scales:
+        weights, most = ScaleWeights(settings.scales), max(counts)
+        chosen = weights.chosen(most)
+        text = ", ".join(f"scale {scale} {weights.of(scale):g}" for scale in chosen)
+        if len(chosen) < most:
+            text += f"; {most - len(chosen)} of {most} scales are not computed"
+        yield Decision("weights of scales", text, "requested", error=ANOTHER_LOSS)
+    if settings.scale_sampling > 1 and not _has_one_phase(facts, settings):
+        saved = 1 - ScaleWeights(settings.scales).sampled_cost(max(counts), settings.scale_sampling)
+        text = f"of {settings.scale_sampling} visits of a view, drawn at random, one evaluates the next finer scale too"
+        reason = f"gradients are the same on average, and finer scales cost {saved:.0%} less"
+        yield Decision("scale sampling", text, reason, error="more noise in single gradients")
+    if plan.steps_coarse < settings.steps_coarse:
+        reason = f"{'only one scale has a weight' if settings.scales else 'there is only one scale'}, so it would be "
+        skipped, error = (
+            f"its {settings.steps_coarse} steps are skipped",
+            "these steps, which would reduce the same loss",
+        )
+        yield Decision("phase 1", skipped, f"{reason}the same as phase 2", error=error)
+    if settings.early_stop and plan.training_background != "background":
+        reason = "losses on different backgrounds cannot be compared"
+        yield Decision("early stop", "none: all steps are run", reason)
+    elif settings.early_stop:
+        when = (
+            f"when the mean loss of {window_length(len(plan.covered))} steps is less than {MIN_FALL:.1%} below that of "
+            "the same number of steps before"
+        )
+        yield Decision("early stop", when, "later steps would gain little", error="the remaining decrease of the loss")
+
+
+def _about_ranks(plan: Plan, facts: Facts, settings: Settings) -> Iterator[Decision]:
+    """Yield the decisions about ranks that share a GPU, and about views that ranks divide or have for themselves."""
+    if plan.device != "cpu" and facts.machine.sharing > 1:
+        reason = f"{facts.machine.sharing} of them share a GPU, which NCCL does not support; give each a GPU of its own"
+        yield Decision("communication", "ranks exchange data over the CPU (gloo)", reason)
+    if plan.ranks == 1:
+        return
+    if plan.groups > 1:
+        each = f"all {plan.ranks} take part, each with a view of its own in fewer steps"
+        error = "steps average the gradients of several views"
+        yield Decision("ranks", each, "views are too small to divide among so many", error=error)
+        return
+    groups = math.gcd(settings.views_per_step, plan.ranks)
+    how = f"{plan.ranks // groups} divide each view" if groups < plan.ranks else "each has a view of its own"
+    yield Decision("ranks", f"all {plan.ranks} take part", how)
+
+
+def _about_precision(plan: Plan, settings: Settings) -> Iterator[Decision]:
+    """Yield the decision about the network's precision; none if float32 was requested."""
+    name, requested = plan.precision, settings.precision
+    if requested == "float32":
+        return
+    if name == "float32":
+        yield Decision("precision", "features in float32", "exact; this device has no faster precision")
+        return
+    how = {"winograd": "by Winograd's algorithm", "tf32": "in TF32"}.get(name, f"in {name}")
+    what = f"{'convolutions' if name in ('tf32', 'winograd') else 'features'} {how}"
+    reason = "requested" if requested != "auto" else "the fastest that the processor computes"
+    yield Decision("precision", what, reason, error=f"a relative error of the pixel gradient of about {_ERRORS[name]}")
+
+
+def _about_measuring(plan: Plan, settings: Settings) -> Iterator[Decision]:
+    """Yield the decision about measurements outside of the steps."""
+    if not plan.measured:
+        return
+    what = f"the loss before the steps on {_count(plan.loss_views, 'view')}"
+    if plan.novel_views:
+        what += f", and {_count(plan.novel_views, 'novel view')} before and after"
+    visits = _visits(plan, settings)
+    reason = f"at most {settings.measure:.0%} of the {visits:,} passes in the steps"
+    reason += "" if plan.novel_views else ", too few for novel views"
+    yield Decision("measuring", what, reason)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

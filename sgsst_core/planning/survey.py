@@ -1,24 +1,29 @@
-"""Survey of all views before the job: blend weights per Gaussian, and covered pixels per view.
+"""Survey of all views before the job, and checks whether scene, cameras and photos belong together.
 
-It takes one pass of the rasterizer per view (`Rasterizer.survey`) and does not use the feature network. Views are
-distributed among ranks.
+The survey takes one pass of the rasterizer per view (`Rasterizer.survey`) and does not use the feature network. Views
+are distributed among ranks. The thresholds of the checks separate real captures from rotated, scaled and cropped ones
+(`benchmarks/results/README.md`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import mean, median
 
 import torch
 from torch import Tensor
 
+from sgsst_core.errors import CameraError
 from sgsst_core.features.partition import Rectangle, covered_region
+from sgsst_core.files.photos import Photo, load_photo
 from sgsst_core.parallel.collectives import ALONE, Collectives
-from sgsst_core.planning.shown import nothing_seen
-from sgsst_core.progress import Progress
-from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.scene.camera import Camera
+from sgsst_core.progress import Decision, Progress
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 
 #: Below this coverage, the color of a pixel is invisible in 8 bits.
 SEEN_COVERAGE = 1 / 255
@@ -102,3 +107,270 @@ def survey_views(
         sum(views[index][1] for index in covered) / sum(pixels[index] for index in covered),
         [views[index][1] / pixels[index] if views[index][2] else 1.0 for index in range(len(cameras))],
     )
+
+
+#: Gaussians and cameras that are looked at.
+_GAUSSIANS, _CAMERAS = 20_000, 200
+#: Least fraction of the Gaussians in a frame, and of all, that the near plane hides if it is reported. Captures in
+#: meters have nearly none.
+_MUCH_OF_FRAMES, _MUCH_OF_SCENE = 0.1, 0.01
+#: Fraction of the Gaussians in the frames that may lie nearer than a suggested near plane, and its margin.
+_NEAREST, _MARGIN = 0.01, 0.5
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Fractions of a scene's Gaussians whose centers are in the frames of cameras.
+
+    Attributes:
+        typical: Fraction in one frame, median over the cameras.
+        together: Fraction in at least one frame.
+        nearer: Fraction in at least one frame, but nearer than the near plane in all of these.
+        near: Distance of a near plane that hides nearly none of them; None if `nearer` is not remarkable.
+    """
+
+    typical: float
+    together: float
+    nearer: float = 0.0
+    near: float | None = None
+
+
+def shown_by(means: Tensor, cameras: Sequence[Camera], near: float) -> Shown:
+    """Return how much of a scene cameras show, from samples of both.
+
+    Args:
+        means: Centers of the Gaussians, [N, 3].
+        cameras: At least one camera.
+        near: Distance of the near plane in world units.
+    """
+    points = means[:: max(1, len(means) // _GAUSSIANS)].double()
+    together, nearer = torch.zeros(2, len(points), dtype=torch.bool)
+    fractions, depths = [], []
+    for camera in spread(cameras, _CAMERAS):
+        x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
+        across, down = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (z > 0) & (across >= 0) & (across < camera.width) & (down >= 0) & (down < camera.height)
+        depths.append(z[inside])
+        nearer |= inside & (z <= near)
+        inside &= z > near
+        together |= inside
+        fractions.append(float(inside.double().mean()))
+    nearer &= ~together
+    hidden, in_frames = float(nearer.double().mean()), float((nearer | together).double().mean())
+    remarkable = hidden >= max(_MUCH_OF_SCENE, _MUCH_OF_FRAMES * in_frames)
+    suggested = _suggested(torch.cat(depths)) if remarkable else None
+    return Shown(median(fractions), float(together.double().mean()), hidden, suggested)
+
+
+def _suggested(depths: Tensor) -> float:
+    """Return a near plane with one digit, given the depths of Gaussians in frames."""
+    near = _MARGIN * float(depths.sort().values[int(_NEAREST * len(depths))])
+    digit = 10.0 ** math.floor(math.log10(max(near, 1e-30)))
+    return float(f"{math.floor(near / digit) * digit:.0e}") or near
+
+
+def hidden_text(shown: Shown, gaussians: int, near: float) -> str:
+    """Return how many of a scene's Gaussians the near plane hides."""
+    count = round(shown.nearer * gaussians)
+    return f"{count:,} of {gaussians:,} Gaussians are in their frames, but nearer than the near plane at {near:g}"
+
+
+def nothing_seen(means: Tensor, cameras: Sequence[Camera], near: float) -> CameraError:
+    """Return the error for cameras that see no Gaussian, which names the near plane if that is the cause.
+
+    The arguments are those of `shown_by`.
+    """
+    shown = shown_by(means, cameras, near)
+    none = f"None of the {len(cameras)} cameras sees a Gaussian"
+    if shown.near is not None:
+        return CameraError(
+            f"{none}: {hidden_text(shown, len(means), near)}. Add --near {shown.near:g}, which suits the scene's units."
+        )
+    return CameraError(
+        f"{none}. Check that cameras and scene belong together (same training run, same world), or let an orbit make "
+        "the cameras."
+    )
+
+
+#: A typical view of a capture shows more of the Gaussians than this, or few uncovered pixels.
+_LITTLE_SHOWN, _MUCH_UNCOVERED = 0.25, 0.1
+#: Cameras that together see less than half of the scene are refused if a typical view is nearly empty.
+_NEARLY_NOTHING, _MOSTLY_UNCOVERED, _HALF = 0.01, 0.4, 0.5
+#: Start of the warning about cameras that show little of the scene.
+OTHER_FRAME = "warning: they may be in another coordinate frame"
+#: What no real capture has: a text, the value of a camera, the scene's center [3] and extent, and its bounds. Telephoto
+#: lenses have 30 times the width of their sensors, anamorphic ones a ratio of 2.
+_BOUNDS: tuple[tuple[str, Callable[[Camera, Tensor, float], float], float, float], ...] = (
+    ("a focal length, relative to the image's side,", lambda camera, *_: camera.fx / camera.width, 0.1, 30.0),
+    ("a ratio of both focal lengths", lambda camera, *_: camera.fx / camera.fy, 0.45, 2.2),
+    ("a principal point, relative to the image's width,", lambda camera, *_: camera.cx / camera.width, 0.0, 1.0),
+    ("a principal point, relative to the image's height,", lambda camera, *_: camera.cy / camera.height, 0.0, 1.0),
+    (
+        "a distance from the scene, relative to its extent,",
+        lambda camera, center, extent: float((camera.center - center).norm()) / extent,
+        0.0,
+        1000.0,
+    ),
+)
+#: Gaussians from which center and extent are estimated, and the part of them that lies within.
+_SAMPLE, _WITHIN = 20_000, 0.9
+#: PSNR in dB below which photos are reported. Right photos have 26 to 31; cropped by 10 %, 20.
+_UNLIKE_PSNR = 22.0
+#: Rendered views that are looked at.
+_VIEWS = 4
+#: Longer side in pixels of rendered views, and of those that are compared. Comparing averages of pixels matters: small
+#: Gaussians are wider and brighter in small renders.
+_SIDE, _COMPARED_SIDE = 256, 128
+#: Coverage of pixels that are compared, and least fraction of them in a view. A scan has no background, its photos do.
+_COVERED, _LEAST_COMPARED = 0.98, 0.02
+#: Added to squared errors, so that equal images have a finite PSNR.
+_TINY = 1e-12
+
+
+def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Decision]:
+    """Return a warning if the near plane hides much, or cameras seem to be in another coordinate frame than the scene.
+
+    Views are rendered only if they show few Gaussians.
+
+    Raises:
+        CameraError: If the cameras show almost nothing of the scene.
+    """
+    shown = shown_by(scene.means, cameras, near)
+    hidden = []
+    if shown.near is not None:
+        warning = f"warning: {hidden_text(shown, len(scene), near)}"
+        hidden = [Decision("cameras", warning, f"they are not drawn; add --near {shown.near:g} to draw them")]
+    if shown.typical >= _LITTLE_SHOWN or (hidden and shown.together):
+        return hidden
+    rasterizer = make_rasterizer("cpu", scene, near=near)
+    views = [resized(camera, _SIDE) for camera in spread(cameras, _VIEWS)]
+    uncovered = mean(float(1 - rasterizer.coverage(view).mean(dtype=torch.float64)) for view in views)
+    if uncovered == 1:
+        raise nothing_seen(scene.means, cameras, near)
+    if uncovered <= _MUCH_UNCOVERED or hidden:
+        return hidden
+    text = (
+        f"a typical view has {shown.typical:.1%} of the Gaussians in its frame and shows nothing in {uncovered:.0%} of "
+        "its pixels"
+    )
+    advice = (
+        "use the cameras of the scene's own training run and world. With nerfstudio, put the run's "
+        "dataparser_transforms.json beside transforms.json; for a scene trained on COLMAP's model, give that model"
+    )
+    if shown.typical < _NEARLY_NOTHING and shown.together < _HALF and uncovered > _MOSTLY_UNCOVERED:
+        raise CameraError(
+            f"Cameras and scene have different coordinate frames: {text}, and all {len(cameras)} views together reach "
+            f"{shown.together:.1%}. Instead, {advice}."
+        )
+    return [Decision("cameras", f"{OTHER_FRAME}: {text}", advice)]
+
+
+def implausible(means: Tensor, cameras: Sequence[Camera]) -> list[Decision]:
+    """Return warnings about values of cameras that no real capture has.
+
+    Args:
+        means: Positions of the scene, [N, 3].
+    """
+    points = means[:: max(1, len(means) // _SAMPLE)].double()
+    center = points.median(dim=0).values
+    extent = max(float((points - center).norm(dim=1).quantile(_WITHIN)), _TINY)
+    lines = []
+    for text, value_of, low, high in _BOUNDS:
+        values = [(value_of(camera, center, extent), camera.name) for camera in cameras]
+        wrong = [(value, name) for value, name in values if not low <= value <= high]
+        if wrong:
+            warning = f"warning: {len(wrong)} of {len(cameras)} have {text} that no real capture has"
+            reason = f"{wrong[0][1]} has {wrong[0][0]:.3g}; expected {low:g} to {high:g}. Export the cameras again"
+            lines.append(
+                Decision("cameras", warning, f"{reason}, with the sizes of their images and the scene's units")
+            )
+    return lines
+
+
+def compare_photos(
+    scene: Scene, cameras: Sequence[Camera], photos: Sequence[Photo], near: float
+) -> tuple[list[Photo], list[Decision]]:
+    """Compare some photos with renders of the scene, without differences of exposure and white balance.
+
+    Returns:
+        Photos, those that fit in both orientations in the better one; and the decisions about them.
+
+    Raises:
+        ImageError: If a photo cannot be read.
+    """
+    likeness = _Likeness(scene, near)
+    photos, decisions = list(photos), []
+    doubtful = [index for index, photo in enumerate(photos) if photo.ambiguous]
+    if doubtful:
+        some = spread(doubtful, _VIEWS)
+        stored = mean(likeness.psnr(photos[index], cameras[index]) or 0.0 for index in some)
+        oriented = mean(likeness.psnr(replace(photos[index], oriented=True), cameras[index]) or 0.0 for index in some)
+        if oriented > stored:
+            photos = [replace(photo, oriented=True) if photo.ambiguous else photo for photo in photos]
+        used = f"the EXIF orientation of {len(doubtful)} photos is {'applied' if oriented > stored else 'ignored'}"
+        reason = (
+            f"PSNR against renders is {max(stored, oriented):.1f} dB so, and {min(stored, oriented):.1f} dB otherwise"
+        )
+        decisions.append(Decision("photos", used, reason))
+    pairs = spread(list(zip(photos, cameras, strict=True)), _VIEWS)
+    values = [likeness.psnr(photo, camera) for photo, camera in pairs]
+    psnr = median([value for value in values if value is not None] or [math.inf])
+    if psnr < _UNLIKE_PSNR:
+        decisions.append(
+            Decision(
+                "photos",
+                f"warning: they differ from the scene's renders ({psnr:.1f} dB PSNR; at least {_UNLIKE_PSNR:.0f} are "
+                "expected)",
+                "they may be cropped, belong to other cameras, or the scene is in another coordinate frame; compare "
+                "them with the images of `sgsst render`",
+            )
+        )
+    return photos, decisions
+
+
+class _Likeness:
+    """Comparison of photos with small renders of a scene."""
+
+    def __init__(self, scene: Scene, near: float) -> None:
+        self._scene, self._rasterizer = scene, make_rasterizer("cpu", scene, near=near)
+        self._renders: dict[bytes, tuple[Tensor, Tensor]] = {}
+
+    def psnr(self, photo: Photo, camera: Camera) -> float | None:
+        """Return the PSNR in dB of a photo against its view's render; None if the scene covers too little of it."""
+        view = resized(camera, min(camera.side, _SIDE))
+        key = view.world_to_camera.numpy().tobytes()  # names may repeat
+        if key not in self._renders:
+            colors = view_colors(self._scene.sh_dc, rest_colors(self._scene.sh_rest, self._scene.means, view))
+            coverage = self._rasterizer.coverage(view)[..., None]
+            self._renders[key] = _averaged(self._rasterizer.render(colors, view)), _averaged(coverage)[..., 0]
+        render, coverage = self._renders[key]
+        compared = coverage > _COVERED
+        if float(compared.double().mean()) < _LEAST_COMPARED:
+            return None
+        return fitted_psnr(_averaged(load_photo(photo, view)), render, compared)
+
+
+def _averaged(image: Tensor) -> Tensor:
+    """Return an image [H, W, C] reduced to about `_COMPARED_SIDE` pixels, by averages of squares of pixels."""
+    factor = max(1, max(image.shape[:2]) // _COMPARED_SIDE)
+    if factor == 1 or min(image.shape[:2]) < factor:
+        return image
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0)
+
+
+def fitted_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:
+    """Return the PSNR in dB of a photo after the affine map of each channel that brings it closest to the render.
+
+    Args:
+        photo: Image [H, W, 3].
+        render: Image of the same size.
+        weight: Weight of each pixel, [H, W].
+    """
+    w = weight.double().flatten()[:, None]
+    x, y = photo.double().flatten(0, 1), render.double().flatten(0, 1)
+    total = w.sum().clamp_min(_TINY)
+    x, y = x - (w * x).sum(0) / total, y - (w * y).sum(0) / total
+    variance, covariance = (w * x * x).sum(0), (w * x * y).sum(0)
+    slope = (covariance / variance.clamp_min(_TINY)).clamp_min(0)  # an inverted photo is none of the scene
+    error = float((w * (y - slope * x) ** 2).sum() / (3 * total))
+    return -10 * math.log10(error + _TINY)

@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from sgsst_core.decision import Decision
-from sgsst_core.number_format import duration
 from sgsst_core.planning.facts import evaluated_pixels
+from sgsst_core.progress import Decision, duration
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.settings import Settings
 

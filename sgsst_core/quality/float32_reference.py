@@ -20,11 +20,10 @@ from sgsst_core.loss.terms import layers_of
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import WHOLE_FLOAT32, StyleLossName
-from sgsst_core.stylizing.evaluation import Evaluation, ShowViews, evaluate, show_nothing
 from sgsst_core.stylizing.job import StyleTargetCache
+from sgsst_core.stylizing.steps import Evaluation, ShowViews, evaluate, show_nothing
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.view_targets import ViewTargets
-from sgsst_core.stylizing.views import Views
+from sgsst_core.stylizing.views import Views, ViewTargets
 
 
 def approximations(stylizer: Stylizer) -> list[str]:

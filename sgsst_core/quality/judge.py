@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from statistics import fmean
 
@@ -29,7 +29,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Moments, Style, color_moments, square_root, style_moments
-from sgsst_core.stylizing.job_styles import JobStyles
+from sgsst_core.stylizing.job import JobStyles
 
 #: Maximum longer side of judged views in pixels. The limit keeps results at different resolutions comparable, and
 #: bounds the cost of large views.
@@ -107,7 +107,7 @@ class Judge:
         self._lpips, self._rasterizer = lpips, rasterizer
         styles = style if isinstance(style, JobStyles) else JobStyles(Style.of(style))
         self._judges = [_StyleJudge(lpips, each) for each in styles.each or (styles.own,)]
-        self._maps = replace(styles, bands=0).maps(rasterizer)
+        self._maps = styles.maps(rasterizer)
         self._background = torch.tensor(background, dtype=rasterizer.dtype, device=rasterizer.device)
         self._sh_rest, self._means = scene.sh_rest.to(rasterizer.device), scene.means.to(rasterizer.device)
         self.cameras = []

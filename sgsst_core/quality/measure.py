@@ -7,7 +7,7 @@ from functools import cached_property, partial
 from typing import Any
 
 from sgsst_core.budget import measuring_memory
-from sgsst_core.loss.statistics_terms import has_statistics
+from sgsst_core.loss.terms import has_statistics
 from sgsst_core.quality.float32_reference import ExactLoss, Float32Reference, approximations, rasterizer_beside
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import LPIPS_NETWORK, Lpips, load_lpips_or_none
@@ -15,8 +15,8 @@ from sgsst_core.quality.novel_views import NovelViews
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import WHOLE_FLOAT32
-from sgsst_core.stylizing.evaluation import Evaluation, ShowViews, show_nothing
 from sgsst_core.stylizing.job import StylizationJob
+from sgsst_core.stylizing.steps import Evaluation, ShowViews, show_nothing
 from sgsst_core.stylizing.stylizer import Stylizer
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sgsst_core.budget import Cache, tensor_bytes
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.targets import StyleTargets
+from sgsst_core.loss.terms import StyleTargets
 from sgsst_core.quality.consistency import (
     LONG_RANGE,
     SHORT_RANGE,
@@ -31,10 +31,10 @@ from sgsst_core.quality.consistency import (
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.novel_cameras import choose_novel_cameras
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.regions.maps import ViewMaps
+from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.stylizing.evaluation import ShowViews, show_nothing
+from sgsst_core.stylizing.steps import ShowViews, show_nothing
 from sgsst_core.stylizing.views import ViewColors
 
 #: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
@@ -111,7 +111,7 @@ class NovelViews:
         most: int = MAX_VIEWS,
         memory: int = 1 << 29,
         rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
-        maps: ViewMaps | None = None,
+        maps: RegionMaps | None = None,
     ) -> None:
         self.scene = scene
         self.rasterizer = rasterizer

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from sgsst_core.errors import InvalidInputError, SettingsError
 from sgsst_core.files.atomic import atomic_path, write_json
-from sgsst_core.options import reason
 from sgsst_core.scene.pyramid import resize_area
+from sgsst_core.settings import reason
 
 #: Number of variants that a page can compare: one for each arrow key.
 VARIANTS = range(2, 5)

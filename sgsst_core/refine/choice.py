@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sgsst_core.decision import Decision
+from sgsst_core.progress import Decision
 from sgsst_core.refine.split import MAX_PIECES, Refinement, piece_counts, pieces_to
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene

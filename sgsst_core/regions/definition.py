@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from sgsst_core.decision import ANOTHER_LOSS, Decision
 from sgsst_core.errors import SettingsError
+from sgsst_core.progress import ANOTHER_LOSS, Decision
 from sgsst_core.refine.split import Refinement, parents_of
 from sgsst_core.scene.camera import Camera
 from sgsst_core.style import Style

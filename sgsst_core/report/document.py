@@ -15,16 +15,14 @@ import torch
 from sgsst_core import container
 from sgsst_core.budget import device_peak, peak_memory
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.convergence import ratio, smoothed
-from sgsst_core.loss.scale_weights import ScaleWeights
 from sgsst_core.parallel.collectives import TRAFFIC
 from sgsst_core.quality.findings import Finding
+from sgsst_core.scales import ScaleWeights, ratio, smoothed
 from sgsst_core.stylizing.checkpoint import versions
-from sgsst_core.stylizing.evaluation import Evaluation, mean_loss, on_scales_of, relative_loss
 from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.loop import Stopped
-from sgsst_core.stylizing.rates import estimate
-from sgsst_core.stylizing.schedule import StepRecord
+from sgsst_core.stylizing.planner import estimate
+from sgsst_core.stylizing.steps import Evaluation, StepRecord, mean_loss, on_scales_of, relative_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 
 #: Version of report.json, raised whenever a field is removed or changes its meaning.

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.number_format import NOTHING, byte_count, duration, number, percent
+from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
 from sgsst_core.report.figures import draw_figures
 from sgsst_core.report.history import AGAINST, BINS, round_length
 from sgsst_core.report.palette import ON_DARK, PAGE

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sgsst_core.number_format import NOTHING, byte_count, duration, number, percent
+from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
 from sgsst_core.report.history import consistency_at, novel_view_moments
 
 

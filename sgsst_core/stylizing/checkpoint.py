@@ -21,7 +21,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save, save_file
 from torch import Tensor
 
-from sgsst_core.decision import Decision
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
@@ -30,6 +29,7 @@ from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.plan import Plan, Work
 from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import TimeChoice
+from sgsst_core.progress import Decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera
@@ -38,7 +38,7 @@ from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.schedule import StepRecord, StylizerState
+from sgsst_core.stylizing.steps import StepRecord, StylizerState
 
 #: Increased whenever the meaning of a stored value changes.
 FORMAT_VERSION = "8"

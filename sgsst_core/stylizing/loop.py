@@ -1,4 +1,4 @@
-"""Optimization loop: run all steps of a job, and decide when to stop early.
+"""Stylization of a scene in one call, and its loop: run all steps of a job, and decide when to stop early.
 
 The loop neither prints nor writes files; `Callbacks` display and save results. With several ranks, each rank runs the
 loop, and the first rank decides when it stops.
@@ -8,21 +8,33 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal, cast
 
-from sgsst_core.loss.convergence import has_converged, has_reached, window_length
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import Tensor
+
+from sgsst_core.devices import seconds_left
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.files.library import F, as_scene, stylized
+from sgsst_core.files.scene_file import SceneFile
+from sgsst_core.files.stylized_ply import check_sh_attenuation
 from sgsst_core.planning.time_budget import SecondsLeft, ending_seconds
 from sgsst_core.progress import Progress
-from sgsst_core.stylizing.evaluation import RunningRound, mean_loss
-from sgsst_core.stylizing.rates import NETWORK_PARTS, Rates, estimate
+from sgsst_core.scales import has_converged, has_reached, window_length
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.rendering import RenderMode
+from sgsst_core.settings import PresetName, make_settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.planner import NETWORK_PARTS, Rates, estimate
+from sgsst_core.stylizing.progress_bar import JobBar, job_bar
+from sgsst_core.stylizing.steps import RunningRound, mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.timing import seconds_left
-
-Stopped = Literal["finished", "within", "target-loss", "converged", "on-request", "interrupted"]
-
+from sgsst_core.stylizing.views import PhotoLoader
 
 #: Number of latest steps that the remaining time follows from, and number from which on it does.
 _LATEST, _KNOWN = 30, 10
@@ -274,3 +286,80 @@ def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:
     save(stylizer)
     parts = stylizer.seconds_by_part
     parts["checkpoint"] = parts.get("checkpoint", 0.0) + time.perf_counter() - started
+
+
+def stylize(
+    scene: F,
+    cameras: Sequence[Camera],
+    style: Tensor | NDArray[Any] | Style,
+    *,
+    preset: PresetName = "standard",
+    render_mode: RenderMode = "auto",
+    eps2d: float | None = None,
+    photos: PhotoLoader | None = None,
+    progress: bool = False,
+    callbacks: Callbacks | None = None,
+    weights: BackboneWeights | None = None,
+    **settings: Any,
+) -> F:
+    """Stylize a scene from start to finish. The given scene is not changed.
+
+    Args:
+        scene: Result of `load_scene`, a `Scene`, or a dictionary of tensors of gsplat (`scene_of_splats`).
+        style: Style image, such as from `load_image`; or a mixture of several.
+        preset: Preset of the settings: "preview", "standard" or "paper".
+        render_mode: Render mode of the scene's training, "classic" or "antialiased"; "auto" for that of its file, which
+            is classic for checkpoints and tensors.
+        eps2d: Blur of projected Gaussians in square pixels; None for that of the file or the mode.
+        photos: Function that loads the content image of a view by its index, at the size of the view; None for
+            unstylized renders.
+        progress: Whether to show a progress bar, on a terminal or in a notebook (which needs ipywidgets).
+        callbacks: Callbacks for progress, checkpoints and previews.
+        weights: Weights of the feature network; None for VGG19 if it is installed, else VGG16.
+        settings: Further fields of `Settings`, such as `steps_sos=100`.
+
+    Returns:
+        Stylized scene, of the type of the given one. `save` writes it to a file.
+
+    Raises:
+        InvalidInputError: If an input or a setting cannot be used.
+
+    Example:
+        >>> scene, cameras = load_scene("scene.ply"), load_cameras("cameras.json")
+        >>> result = stylize(scene, cameras, load_image("style.png"), preset="preview", steps_sos=2)
+        >>> save("stylized.ply", result)
+        >>> torch.equal(load_scene("stylized.ply").scene.sh_dc, result.scene.sh_dc)
+        True
+    """
+    chosen = make_settings(preset, **settings)
+    left = seconds_left(chosen.within)
+    if isinstance(scene, SceneFile):
+        check_sh_attenuation(scene, chosen.sh_attenuation)
+    with job_bar(Console(highlight=False, markup=False, emoji=False)) if progress else nullcontext() as bar:
+        show = bar.show if bar else None
+        given = as_scene(scene)
+        given = replace(given, rendering=given.rendering.requested(render_mode, eps2d))
+        stylizer = Stylizer.planned(given, cameras, style, chosen, weights=weights, photos=photos, show=show, left=left)
+        job = stylizer.job
+        if isinstance(scene, SceneFile):
+            scene.refined(job.plan.refinement)  # raises before the steps if the file cannot hold the result
+        callbacks = callbacks or Callbacks()
+        run(stylizer, _shown(bar, replace(callbacks, left=callbacks.left or left)))
+    result = replace(job.scene, sh_dc=stylizer.stylized())
+    return cast(F, stylized(scene, result, job.plan.refinement, chosen.sh_attenuation))
+
+
+def _shown(bar: JobBar | None, callbacks: Callbacks) -> Callbacks:
+    """Return callbacks that update a progress bar, if there is one, and call the given ones."""
+    if bar is None:
+        return callbacks
+
+    def show(progress: Progress) -> None:
+        bar.show(progress)
+        if callbacks.progress:
+            callbacks.progress(progress)
+
+    return replace(callbacks, progress=show)
+
+
+Stopped = Literal["finished", "within", "target-loss", "converged", "on-request", "interrupted"]

@@ -23,7 +23,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.gradient_error import psnr
 from sgsst_core.loss.sos import make_loss
-from sgsst_core.loss.targets import StyleTargets, ViewTarget
+from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.facts import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
@@ -37,8 +37,8 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job_styles import prepared_style
-from sgsst_core.stylizing.warm_start import with_moments
+from sgsst_core.stylizing.color_transfer import with_moments
+from sgsst_core.stylizing.job import prepared_style
 
 #: Number of evenly spread views whose gradient is computed; each costs an iteration.
 GRADIENT_VIEWS = 24

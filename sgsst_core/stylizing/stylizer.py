@@ -16,9 +16,12 @@ import numpy as np
 import psutil
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.optim.adam import adam
 
 from sgsst_core.budget import device_peak
+from sgsst_core.devices import Timer, seconds_left
 from sgsst_core.errors import DivergedError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.images import Color
@@ -26,38 +29,311 @@ from sgsst_core.loss.sos import SosResult
 from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Regions
 from sgsst_core.scene.camera import Camera, checked_cameras
+from sgsst_core.scene.colors import ColorSubspace, on_screen, on_screen_by_luminance, with_chroma_of
 from sgsst_core.scene.gaussians import Scene, checked_scene
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, image_of
-from sgsst_core.stylizing.evaluation import (
-    Evaluation,
-    ShowViews,
-    completed,
-    evaluate,
-    mean_evaluation,
-    mean_loss,
-    show_nothing,
-)
-from sgsst_core.stylizing.job import StylizationJob, in_bfloat16, with_second_attempt
-from sgsst_core.stylizing.optimizer import ColorOptimizer, is_too_large
-from sgsst_core.stylizing.photo_prefetch import PhotoLoader
+from sgsst_core.stylizing.job import JobStyles, StylizationJob, in_bfloat16, with_second_attempt
 from sgsst_core.stylizing.planner import choose_within, plan_job
 from sgsst_core.stylizing.refining import refine, refined
-from sgsst_core.stylizing.result_colors import result_colors, transferred_colors
-from sgsst_core.stylizing.schedule import (
+from sgsst_core.stylizing.steps import (
     BEFORE_STEPS,
+    Evaluation,
     Phase,
+    ShowViews,
     StepRecord,
     StylizerState,
     ViewOrder,
+    completed,
     drawn_scales,
     drawn_views,
+    evaluate,
+    mean_evaluation,
+    mean_loss,
     phase_at,
+    show_nothing,
 )
-from sgsst_core.stylizing.training_background import drawn_color
-from sgsst_core.timing import Timer, seconds_left
+from sgsst_core.stylizing.views import PhotoLoader, drawn_color
+
+#: Adam's epsilon: practically zero, so that Gaussians of any blend weight move at the learning rate (SGSST).
+ADAM_EPS = 1e-15
+#: Decay rates of the first and second moment, the usual ones.
+_BETA1, _BETA2 = 0.9, 0.999
+#: Adam squares gradients in float32. Beyond this limit the square is infinite, and the value would silently stop
+#: moving.
+LARGEST_GRADIENT = 1e19
+
+
+class ColorOptimizer:
+    """Adam (Kingma and Ba 2015) for a single tensor of colors.
+
+    On a GPU, a step is one kernel that checks by itself whether the gradient is usable, so the host need not
+    synchronize.
+
+    Steps use PyTorch's function `adam`. Its class `Adam` gives the same steps but imports PyTorch's compiler, which
+    takes two seconds per process although nothing is compiled here.
+
+    Args:
+        colors: [n, 3] float32, updated in place.
+        unit: Unit of the features behind the gradients (`FeatureNetwork.unit`). Adam's steps do not depend on it, but
+            gradients grow with its square and would overflow earlier.
+        chroma_of: [n, 3], colors whose chroma is preserved: the optimized quantity is then each color's difference from
+            them in luminance. None to let colors change freely.
+        subspace: Color subspace that colors stay in; None to let them change freely.
+        bounded: Whether to project colors to 0..1 after each step (`on_screen`).
+        frozen: [n, 1] bool, frozen colors, whose gradients are 0; None if there are none.
+    """
+
+    def __init__(
+        self,
+        colors: Tensor,
+        unit: float = 1.0,
+        chroma_of: Tensor | None = None,
+        subspace: ColorSubspace | None = None,
+        *,
+        bounded: bool = False,
+        frozen: Tensor | None = None,
+    ) -> None:
+        self._chroma_of, self._subspace = chroma_of, subspace
+        self._bounded, self._frozen = bounded, frozen
+        self._colors = colors.requires_grad_()
+        self._unit = unit
+        self._fused = colors.is_cuda
+        self._first, self._second = (torch.zeros_like(colors, requires_grad=False) for _ in range(2))
+        self._steps = torch.zeros((), dtype=torch.float32, device=colors.device if self._fused else None)
+
+    def update(self, gradient: Tensor, learning_rate: float) -> Tensor:
+        """Make one step, or skip it if the gradient [n, 3] is not finite or exceeds `LARGEST_GRADIENT`.
+
+        Returns:
+            Largest magnitude in the gradient, in units of a 0-255 input: a scalar on the colors' device. The caller
+                checks whether it was too large when it next synchronizes with the device.
+        """
+        if self._unit != 1:
+            gradient = gradient / self._unit**2
+        if self._chroma_of is not None:
+            # The derivative with respect to a value added to all three channels. Adam's steps are then the same in each
+            # channel.
+            gradient = gradient.sum(dim=1, keepdim=True).expand(-1, 3).contiguous()
+        if self._subspace is not None:
+            # Adam scales each channel separately. Without the projection, its steps could ascend within the subspace.
+            gradient = self._subspace.along(gradient)
+        largest = gradient.abs().amax()
+        self._colors.grad = gradient.to(self._colors.dtype)
+        if self._fused:
+            # PyTorch's flag for an unusable gradient in a fused step, intended for scaled half precision.
+            self._step(learning_rate, torch.logical_not(largest <= LARGEST_GRADIENT).float())
+        elif not is_too_large(float(largest)):
+            self._step(learning_rate)
+        else:
+            return largest
+        if self._bounded or self._chroma_of is not None or self._subspace is not None:
+            with torch.no_grad():
+                projected = constrained(self._colors, self._chroma_of, self._subspace, bounded=self._bounded)
+                unchanged = ~(largest <= LARGEST_GRADIENT)  # the step was skipped
+                if self._frozen is not None:
+                    unchanged = unchanged | self._frozen
+                self._colors.copy_(torch.where(unchanged, self._colors, projected))
+        return largest
+
+    @torch.no_grad()
+    def _step(self, learning_rate: float, found_inf: Tensor | None = None) -> None:
+        """Make a step, unless `found_inf` is non-zero."""
+        assert self._colors.grad is not None
+        adam(
+            [self._colors],
+            [self._colors.grad],
+            [self._first],
+            [self._second],
+            [],
+            [self._steps],
+            fused=self._fused,
+            found_inf=found_inf,
+            amsgrad=False,
+            beta1=_BETA1,
+            beta2=_BETA2,
+            lr=learning_rate,
+            weight_decay=0.0,
+            eps=ADAM_EPS,
+            maximize=False,
+        )
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Return the first and second moment [n, 3] on the CPU; zeros before the first step."""
+        return self._first.cpu().clone(), self._second.cpu().clone()
+
+    def load_moments(self, step: int, first: Tensor, second: Tensor) -> None:
+        """Restore the moments [n, 3] after a number of steps, at least one."""
+        self._steps.fill_(step)
+        self._first.copy_(first)
+        self._second.copy_(second)
+
+
+def constrained(
+    colors: Tensor, chroma_of: Tensor | None, subspace: ColorSubspace | None = None, *, bounded: bool
+) -> Tensor:
+    """Project DC coefficients [n, 3] to their constraints, without accumulating rounding errors in their chroma.
+
+    Args:
+        colors: [n, 3].
+        chroma_of: [n, 3], colors whose chroma is preserved; None if chroma may change.
+        subspace: Color subspace that colors are projected to; they leave it where it leaves the range. None for any
+            color.
+        bounded: Whether colors must be in 0..1.
+    """
+    colors = colors if subspace is None else subspace.projected(colors)
+    if chroma_of is None:
+        return on_screen(colors) if bounded else colors
+    return with_chroma_of(on_screen_by_luminance(colors) if bounded else colors, chroma_of)
+
+
+def is_too_large(largest: float) -> bool:
+    """Return whether a gradient with this largest magnitude (possibly NaN) is unusable."""
+    return not largest <= LARGEST_GRADIENT
+
+
+#: Number of seen neighbors that determine the color change of an unseen Gaussian.
+NEIGHBORS = 8
+#: Number of unseen Gaussians processed at a time; their neighbors' changes and weights take some tens of megabytes.
+_CHUNK = 1 << 16
+#: Cells along each axis of the grid that orders the searches.
+_CELLS = 128
+
+
+def transferred_colors(job: StylizationJob, colors: Tensor | None = None) -> Tensor:
+    """Transfer the style's colors to the rendered Gaussians; see `warm_start`.
+
+    Args:
+        colors: [n, 3] on the CPU, colors before the transfer; None for the scene's, as before the first step.
+
+    Returns:
+        [n, 3] on the CPU.
+    """
+    seen = job.plan.seen
+    colors = job.scene.sh_dc[seen] if colors is None else colors
+    weights = job.plan.survey.total_blend_weights[seen]
+    transferred = job.styles.transferred(colors, weights, seen, preserve_chroma=job.preserves_chroma)
+    # `result_colors` derives colors that no view determines from those of their neighbors.
+    return torch.where(job.plan.optimized[seen][:, None], transferred, colors)
+
+
+def result_colors(job: StylizationJob, optimized: Tensor, *, transfer: bool) -> Tensor:
+    """Return the colors of the whole scene, in which unseen Gaussians follow their neighbors if the settings say so.
+
+    Args:
+        optimized: [n, 3] on the CPU, colors of the rendered Gaussians.
+        transfer: Whether to transfer the style's colors to `optimized`.
+
+    Returns:
+        [N, 3] float32 on the CPU.
+    """
+    colors, subspace = job.scene.sh_dc.clone(), job.styles.color_subspace(job.settings)
+    colors[job.plan.seen] = optimized
+    if transfer:
+        colors[job.plan.seen] = transferred = transferred_colors(job, optimized)
+        if job.preserves_chroma or subspace is not None:
+            chroma_of = job.scene.sh_dc[job.plan.seen] if job.preserves_chroma else None
+            bounded = constrained(transferred, chroma_of, subspace, bounded=job.settings.bounded)
+            # Frozen colors remain bit-identical.
+            colors[job.plan.seen] = torch.where(transferred != optimized, bounded, optimized)
+    if job.settings.unseen != "neighbors":
+        return colors
+    weights = torch.where(job.plan.optimized, job.plan.survey.total_blend_weights, 0.0)
+    change, regions = colors - job.scene.sh_dc, job.regions
+    unseen = weights <= 0 if regions is None else (weights <= 0) & ~regions.frozen
+    if regions is None:
+        change = neighbors_change(job.scene.means, change, weights)
+    else:
+        change = neighbors_change_by_region(job.scene.means, change, weights, regions)[unseen]
+    change = change.mean(dim=1, keepdim=True) if job.preserves_chroma else change
+    original = job.scene.sh_dc[unseen]
+    chroma_of = original if job.preserves_chroma else None
+    colors[unseen] = constrained(original + change, chroma_of, subspace, bounded=job.settings.bounded)
+    return colors
+
+
+def neighbors_change(means: Tensor, change: Tensor, weights: Tensor) -> Tensor:
+    """Return color changes for the Gaussians that no view sees.
+
+    Each takes the mean change of its nearest seen neighbors, weighted by their total blend weights: the change of a
+    hardly visible Gaussian is determined by only a few pixels.
+
+    Args:
+        means: [N, 3].
+        change: [N, 3], change by the optimization; rows of unseen Gaussians are ignored.
+        weights: [N] float64, total blend weights: 0 for the U unseen Gaussians, positive for at least one other.
+
+    Returns:
+        [U, 3] float32.
+    """
+    seen = weights > 0
+    if bool(seen.all()):
+        return torch.zeros((0, 3))
+    count = min(NEIGHBORS, int(seen.sum()))
+    tree = cKDTree(means[seen].double().numpy())
+    weights, change, positions = weights[seen], change[seen], means[~seen].double()
+    votes = torch.empty((len(positions), 3))
+    # Ordered by the cells of a coarse grid: consecutive searches then read the same part of the tree.
+    lowest = positions.amin(dim=0)
+    size = (positions.amax(dim=0) - lowest).clamp_min(1e-300)
+    x, y, z = ((positions - lowest) / size * (_CELLS - 1)).long().unbind(1)
+    for part in torch.argsort((x * _CELLS + y) * _CELLS + z, stable=True).split(_CHUNK):
+        _, indices = tree.query(positions[part].numpy(), k=count, workers=torch.get_num_threads())
+        nearest = torch.as_tensor(indices).reshape(-1, count)
+        own = weights[nearest]
+        fraction = own / own.amax(dim=1, keepdim=True)  # so that tiny weights do not underflow
+        sums = (change[nearest].double() * fraction[:, :, None]).sum(dim=1)
+        votes[part] = (sums / fraction.sum(dim=1, keepdim=True)).float()
+    return votes
+
+
+def neighbors_change_by_region(means: Tensor, change: Tensor, weights: Tensor, regions: Regions) -> Tensor:
+    """Return color changes for the Gaussians that are not optimized: those of their neighbors in the same region.
+
+    If a region has no optimized Gaussians, neighbors in all regions count. The change of frozen Gaussians is 0.
+
+    Arguments are as in `neighbors_change`, but all weights other than those of optimized Gaussians are 0. The result is
+    [N, 3].
+    """
+    result = torch.zeros_like(change)
+    for region in regions.labels[~regions.frozen].unique().tolist():
+        members = regions.members(region)
+        voters = torch.where(members, weights, 0.0)
+        if not bool((voters > 0).any()):
+            voters = weights
+        rows = members | (voters > 0)
+        takes = rows & (voters <= 0)
+        result[takes] = neighbors_change(means[rows], change[rows], voters[rows])
+    return result
+
+
+def render_first_view(
+    scene: Scene, camera: Camera, style: Style, settings: Settings, regions: Regions | None = None
+) -> Tensor | None:
+    """Render a view with the colors of a warm start whose weights are those of this view alone.
+
+    For a job with this one view, these are the colors of its warm start. It runs on the CPU and shares nothing with the
+    job, whose measurements it must not change.
+
+    Returns:
+        Image [H, W, 3]; None if the view shows nothing that may change.
+    """
+    scene = scene.attenuated(settings.sh_attenuation)
+    rasterizer = make_rasterizer("cpu", scene, background=settings.background, near=settings.near)
+    weights = rasterizer.survey(camera)[1].double()
+    if regions is not None:
+        weights[regions.frozen] = 0
+    rows = weights > 0
+    if not bool(rows.any()):
+        return None
+    styles = JobStyles.prepared(style, regions and regions.resolved(weights), settings, scene.sh_dc, weights)
+    colors, by_luminance = scene.sh_dc.clone(), settings.preserve_colors == "luminance"
+    colors[rows] = styles.transferred(colors[rows], weights[rows], rows, preserve_chroma=by_luminance)
+    return rasterizer.render(scene_colors(replace(scene, sh_dc=colors), camera), camera)
 
 
 @dataclass(frozen=True)

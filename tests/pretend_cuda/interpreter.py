@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sgsst_core.features import pooling, statistics
-from sgsst_core.loss import statistics_terms as terms
+from sgsst_core.loss import terms as terms
 
 
 def leave_out_kernels(patch: pytest.MonkeyPatch) -> None:

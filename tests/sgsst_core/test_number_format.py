@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sgsst_core.number_format import duration
+from sgsst_core.progress import duration
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,8 @@ from sgsst_core.errors import ImageError, SettingsError
 from sgsst_core.features.statistics import layer_statistics_reference, merge
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.files.images import load_image
-from sgsst_core.loss.nearest import MAX_VECTORS, positions_per_image
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.targets import LayerTarget
-from sgsst_core.loss.terms import layers_of
+from sgsst_core.loss.terms import MAX_VECTORS, LayerTarget, layers_of, positions_per_image
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style, image_of, mixed_moments, normalized, some_pixels

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from sgsst_core.timing import Timer
+from sgsst_core.devices import Timer
 
 
 class Stream:

@@ -11,12 +11,12 @@ import pytest
 import torch
 from PIL import Image
 
-from sgsst_core.decision import warnings_of
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.images import BLACK, WHITE
 from sgsst_core.files.photos import load_photo
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.progress import warnings_of
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
 from tests.sgsst_core.files.test_camera_files import colmap, views

@@ -10,9 +10,9 @@ from PIL import Image
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.images import save_jpg
 from sgsst_core.settings import make_settings
+from sgsst_core.stylizing.color_transfer import warm_start
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.warm_start import warm_start
 from tests.small_scenes import cameras, wall
 from worker import previews as previews_module
 from worker.previews import LiveColors, Previews

@@ -26,8 +26,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.statistics import LayerStatistics
-from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, Traffic
-from sgsst_core.parallel.division import ImageExchange
+from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, ImageExchange, Traffic
 from worker.processes import interface_towards, listen, split_address
 from worker.ranks.messages import decode, encode
 

@@ -29,7 +29,7 @@ from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes
 from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_scene, stays_in_file
 from sgsst_core.parallel.collectives import Collectives
-from sgsst_core.planning.choices import OPTIMIZER_BYTES
+from sgsst_core.planning.plan import OPTIMIZER_BYTES
 from sgsst_core.scene.gaussians import TENSORS
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from worker.processes import home

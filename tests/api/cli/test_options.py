@@ -17,8 +17,7 @@ from api.cli.options import flags, help_text
 from api.cli.options_table import reference
 from service.parameters import JobParameters
 from sgsst_core.errors import SettingsError
-from sgsst_core.options import Declared, declared, parse_seconds, parse_strength
-from sgsst_core.settings import Settings, checked, make_settings
+from sgsst_core.settings import Declared, Settings, checked, declared, make_settings, parse_seconds, parse_strength
 from worker.job import SceneRequest
 from worker.options import GROUPS, RunOptions, StylizeOptions, ViewOptions
 

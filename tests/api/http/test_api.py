@@ -31,8 +31,8 @@ from service.parameters import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.store.jobs import NewJob
-from sgsst_core.options import Declared, declared
 from sgsst_core.progress import Progress
+from sgsst_core.settings import Declared, declared
 from tests.api.conftest import KEYED, Services
 from tests.api.http.sending import MB, OFFSET_STREAM, TUS, form, refused, send
 from tests.api.service import Service, wait_for
@@ -254,10 +254,7 @@ def test_submit_sends_every_parameter(
     command = ["submit", str(ply), "--style", str(style), "--style", f"{style}:2.5", "--url", service.url, "--json"]
     command += ["--region", "left:half-space=-1,0,0,0", "--region-style", f"left={style}:0.5"]
     command += ["--region-weight", "left=2", "--region-weight", "rest=3"]
-    parameters["stroke_depth"] = None  # excludes `scales` and `regions`
     for name, option in declared(JobParameters).items():
-        if name == "stroke_depth":
-            continue
         parameters[name] = parameters.get(name) or value_of(option)
         command += [f"--{name.replace('_', '-')}"]
         command += [] if parameters[name] is True else [texts.get(name, str(parameters[name]))]

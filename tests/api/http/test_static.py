@@ -18,7 +18,7 @@ from service.deadlines import Deadline
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import DOWNLOADS, FORMATS
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.options import STRENGTHS
+from sgsst_core.settings import STRENGTHS
 from tests.api.conftest import KEYED, Services
 from tests.api.service import Service
 

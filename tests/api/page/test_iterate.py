@@ -11,7 +11,7 @@ import httpx2
 import pytest
 from PIL import Image
 
-from sgsst_core.options import STRENGTHS
+from sgsst_core.settings import STRENGTHS
 from tests.api.page.actions import LONG, REFUSED, STEPS, Visit, choose, done, set_options, started, submit
 from tests.api.page.browser import Watched
 from tests.api.page.test_viewer import base_of

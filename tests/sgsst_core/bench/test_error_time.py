@@ -28,7 +28,7 @@ from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.evaluation import Evaluation
+from sgsst_core.stylizing.steps import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, style, wall
 

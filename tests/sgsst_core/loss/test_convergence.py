@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from sgsst_core.loss.convergence import has_converged, has_reached, smoothed, window_length
+from sgsst_core.scales import has_converged, has_reached, smoothed, window_length
 
 
 def test_windows_are_whole_rounds() -> None:

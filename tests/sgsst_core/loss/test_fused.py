@@ -7,15 +7,17 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.statistics import LayerStatistics, fused_statistics, layer_statistics_reference
-from sgsst_core.loss import statistics_terms as terms
-from sgsst_core.loss.content import ContentDifference, fused_add_content_gradient, fused_content_sum
-from sgsst_core.loss.statistics_terms import (
+from sgsst_core.loss import terms as terms
+from sgsst_core.loss.terms import (
+    ContentDifference,
+    LayerTarget,
     StyleGradient,
+    fused_add_content_gradient,
     fused_add_style_gradient,
+    fused_content_sum,
     fused_style_loss,
     style_loss,
 )
-from sgsst_core.loss.targets import LayerTarget
 from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error
 
 pytest.importorskip("triton")

@@ -12,17 +12,16 @@ from torch import Tensor
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 
+from sgsst_core.devices import Timer
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.pooling import relu_backward
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, can_use_graphs
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.targets import StyleTargets, ViewTarget
-from sgsst_core.loss.terms import layers_of
-from sgsst_core.loss.tiling import Tiling
+from sgsst_core.loss.terms import StyleTargets, ViewTarget, layers_of
+from sgsst_core.parallel.division import Tiling
 from sgsst_core.settings import StyleLossName
 from sgsst_core.style import Style
-from sgsst_core.timing import Timer
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image

@@ -10,18 +10,18 @@ from benchmarks.stability.sos_reference import nearest_reference, sos_reference
 from sgsst_core.errors import ImageError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
-from sgsst_core.loss import nearest
-from sgsst_core.loss.nearest import (
+from sgsst_core.loss import terms as nearest
+from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.loss.terms import (
     MAX_VECTORS,
     NEAREST_WEIGHTS,
     Matches,
+    StyleVectors,
+    layers_of,
     nearest_layers,
     search,
 )
-from sgsst_core.loss.scale_weights import ScaleWeights
-from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.targets import StyleVectors
-from sgsst_core.loss.terms import layers_of
+from sgsst_core.scales import ScaleWeights
 from sgsst_core.settings import StyleLossName
 from sgsst_core.style import Style, chosen_positions
 from tests.networks import comparing_pixels
@@ -278,7 +278,7 @@ def test_large_styles_are_thinned_evenly() -> None:
 def test_vectors_of_thinned_styles_do_not_depend_on_the_partition(
     tiny_weights: BackboneWeights, tile_size: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sgsst_core.loss.target_builder.MAX_VECTORS", 200)
+    monkeypatch.setattr("sgsst_core.loss.sos.MAX_VECTORS", 200)
     style = synthetic_image(130, 201, seed=3)
     loss = loss_of(tiny_weights, "nnfm", tile_size=tile_size)
     vectors = loss.targets.of_style(Style.of(style), (130, 201))[0][0].vectors

@@ -12,12 +12,13 @@ from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.scale_weights import EVEN, ScaleWeights, check_scales
 from sgsst_core.loss.sos import SosLoss, SosResult
+from sgsst_core.planning.facts import check_scales
+from sgsst_core.scales import EVEN, ScaleWeights
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.schedule import drawn_scales
+from sgsst_core.stylizing.steps import drawn_scales
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import cameras
 

@@ -7,10 +7,9 @@ import torch
 
 from benchmarks.stability.sos_reference import sos_reference
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, Activations, FeatureNetwork
-from sgsst_core.loss.scale_weights import scale_count
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.targets import StyleTarget
-from sgsst_core.loss.terms import layers_of
+from sgsst_core.loss.terms import StyleTarget, layers_of
+from sgsst_core.scales import scale_count
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.style import Style
 from tests.networks import comparing_pixels

@@ -6,10 +6,16 @@ import torch
 
 from benchmarks.stability.sos_reference import style_loss_reference
 from sgsst_core.features.statistics import layer_statistics
-from sgsst_core.loss.content import ContentDifference, content_factor
-from sgsst_core.loss.statistics_terms import StyleGradient, TermWeights, style_loss
-from sgsst_core.loss.targets import LayerTarget
-from sgsst_core.loss.terms import TERMS, LossTerms
+from sgsst_core.loss.terms import (
+    TERMS,
+    ContentDifference,
+    LayerTarget,
+    LossTerms,
+    StyleGradient,
+    TermWeights,
+    content_factor,
+    style_loss,
+)
 from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error
 
 

@@ -10,12 +10,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sgsst_core.decision import Decision
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit.cameras import middle_of
 from sgsst_core.orbit.choice import Orbit, OrbitRequest, find_upright_subject, make_orbit, orbit_decisions
 from sgsst_core.orbit.subject import find_subject, find_up
 from sgsst_core.planning.survey import survey_views
+from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import resized
 from sgsst_core.scene.gaussians import Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sgsst_core.parallel.visible_gaussians import DENSE_FRACTION, ShownGaussians, gaussians_sent
+from sgsst_core.parallel.collectives import DENSE_FRACTION, ShownGaussians, gaussians_sent
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])

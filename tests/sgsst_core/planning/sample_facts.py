@@ -7,8 +7,7 @@ from typing import Any
 import torch
 
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.loss.tiling import Tiling
-from sgsst_core.parallel.division import Size
+from sgsst_core.parallel.division import Size, Tiling
 from sgsst_core.planning.facts import Facts, Machine
 from sgsst_core.planning.survey import Survey
 

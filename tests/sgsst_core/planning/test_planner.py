@@ -26,8 +26,7 @@ from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import save_plan
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.planner import plan_job
-from sgsst_core.stylizing.result_colors import neighbors_change
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Stylizer, neighbors_change
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall
 
@@ -154,7 +153,7 @@ def test_neighbors_of_unseen_gaussians_do_not_depend_on_the_chunk_size(monkeypat
     expected = (change[seen].double()[nearest[:, :8]] * own[..., None]).sum(1) / own.sum(1, keepdim=True)
     torch.testing.assert_close(actual.double(), expected, rtol=1e-6, atol=1e-6)
     for part in (1, 7, 100):
-        monkeypatch.setattr("sgsst_core.stylizing.result_colors._CHUNK", part)
+        monkeypatch.setattr("sgsst_core.stylizing.stylizer._CHUNK", part)
         assert torch.equal(neighbors_change(means, change, weights), actual)
 
 

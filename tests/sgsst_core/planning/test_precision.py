@@ -10,8 +10,8 @@ import torch
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import ALONE
-from sgsst_core.planning.choices import choose_precision
 from sgsst_core.planning.facts import Device, Machine, describe_machine
+from sgsst_core.planning.plan import choose_precision
 from sgsst_core.settings import PlannedPrecision, Precision, PresetName, make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import to_tf32

@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from sgsst_core.parallel.division import Size
-from sgsst_core.planning.choices import make_plan, with_groups
 from sgsst_core.planning.facts import Machine
-from sgsst_core.planning.plan import Plan
+from sgsst_core.planning.plan import Plan, make_plan, with_groups
 from sgsst_core.settings import make_settings
 from tests.sgsst_core.planning.sample_facts import CPU, GPU, facts
 

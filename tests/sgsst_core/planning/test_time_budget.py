@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from sgsst_core.devices import seconds_left
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.facts import evaluated_pixels
 from sgsst_core.planning.time_budget import Pace, TimeChoice, choosable, choose
@@ -19,7 +20,6 @@ from sgsst_core.scene.camera import resized, spread
 from sgsst_core.settings import PresetName, Settings, make_settings
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.timing import seconds_left
 from tests.small_scenes import cameras, style, wall
 
 #: 97 views of 1280 pixels, and a pace of 0.1 s per step at 160 pixels.

@@ -14,9 +14,9 @@ from sgsst_core.planning.facts import equip
 from sgsst_core.quality.float32_reference import Float32Reference, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.steps import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.rounding import RoundedToTf32
 from tests.small_scenes import ball, cameras, style, wall

@@ -23,7 +23,7 @@ from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job_styles import JobStyles
+from sgsst_core.stylizing.job import JobStyles
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -20,14 +20,14 @@ from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.loss.scale_weights import scale_count
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.statistics_terms import GRAM_WEIGHT
+from sgsst_core.loss.terms import GRAM_WEIGHT
 from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
 from sgsst_core.quality.lpips import Lpips
 from sgsst_core.quality.novel_cameras import neighbors
 from sgsst_core.quality.novel_views import MAX_VIEWS, NovelViews
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scales import scale_count
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread
 from sgsst_core.scene.gaussians import TENSORS, Scene, sampled
 from sgsst_core.scene.pyramid import resize_area, style_size

@@ -14,16 +14,15 @@ from PIL import Image
 from api.cli.console import loss_text
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import write_json
-from sgsst_core.loss.scale_weights import EVEN
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
 from sgsst_core.report.history import history_of, running_mean
 from sgsst_core.report.page import render_page
+from sgsst_core.scales import EVEN
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.evaluation import Evaluation, RunningRound, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.schedule import StepRecord
+from sgsst_core.stylizing.steps import Evaluation, RunningRound, StepRecord, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import ball, blind_camera, cameras, style
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from sgsst_core.loss.convergence import smoothed
 from sgsst_core.report.history import BINS, running_mean, thinned
+from sgsst_core.scales import smoothed
 
 
 def test_running_mean_is_geometric_and_over_the_last_window() -> None:

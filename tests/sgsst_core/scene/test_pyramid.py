@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sgsst_core.loss.scale_weights import scale_count
+from sgsst_core.scales import scale_count
 from sgsst_core.scene.pyramid import add_upscaled_, downscale, style_size
 
 

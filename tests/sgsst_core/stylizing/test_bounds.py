@@ -17,8 +17,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.optimizer import LARGEST_GRADIENT, ColorOptimizer
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import LARGEST_GRADIENT, ColorOptimizer, Stylizer
 from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")

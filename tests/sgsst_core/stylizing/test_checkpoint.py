@@ -10,12 +10,12 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from sgsst_core.decision import Decision
 from sgsst_core.errors import CheckpointError, OutputError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.loss.terms import TERMS, LossTerms
 from sgsst_core.planning.plan import Plan, Work
 from sgsst_core.planning.survey import Survey
+from sgsst_core.progress import Decision
 from sgsst_core.refine.split import Refinement
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
@@ -27,7 +27,7 @@ from sgsst_core.stylizing.checkpoint import (
     load_checkpoint,
     versions,
 )
-from sgsst_core.stylizing.schedule import StepRecord, StylizerState
+from sgsst_core.stylizing.steps import StepRecord, StylizerState
 from tests.small_scenes import cameras, style, wall
 
 

@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sgsst_core.stylizing import warm_start
-from sgsst_core.stylizing.warm_start import _drawn, _round_axes, _rounds, _through, _through_compiled, transported
+from sgsst_core.stylizing import color_transfer as warm_start
+from sgsst_core.stylizing.color_transfer import _drawn, _round_axes, _rounds, _through, _through_compiled, transported
 
 Array = NDArray[np.float64]
 

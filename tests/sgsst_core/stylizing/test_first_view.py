@@ -11,8 +11,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.result_colors import render_first_view
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Stylizer, render_first_view
 from tests.sgsst_core.stylizing.test_stylized_regions import halves
 from tests.small_scenes import blind_camera, cameras, style, wall
 

@@ -13,7 +13,7 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job_styles import _inside, check_style_size, prepared_style, rotated
+from sgsst_core.stylizing.job import _inside, check_style_size, prepared_style, rotated
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, wall
 

@@ -20,10 +20,10 @@ from sgsst_core.report.contact_sheet import write_contact_sheet
 from sgsst_core.scene.colors import on_screen_by_luminance
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style
+from sgsst_core.stylizing.color_transfer import warm_start
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.planner import plan_job
-from sgsst_core.stylizing.warm_start import warm_start
 from tests.small_scenes import cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")

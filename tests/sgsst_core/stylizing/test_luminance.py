@@ -19,11 +19,10 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job_styles import prepared_style
+from sgsst_core.stylizing.color_transfer import luminance_start
+from sgsst_core.stylizing.job import prepared_style
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.optimizer import ColorOptimizer
-from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.warm_start import luminance_start
+from sgsst_core.stylizing.stylizer import ColorOptimizer, Stylizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import ball, cameras, style, wall
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.stylizing.optimizer import ADAM_EPS, ColorOptimizer
+from sgsst_core.stylizing.stylizer import ADAM_EPS, ColorOptimizer
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
@@ -62,7 +62,7 @@ def test_step_does_not_import_pytorchs_compiler() -> None:
     """The compiler would take two seconds and 140 MB in every process that optimizes."""
     code = (
         "import sys, torch\n"
-        "from sgsst_core.stylizing.optimizer import ColorOptimizer\n"
+        "from sgsst_core.stylizing.stylizer import ColorOptimizer\n"
         "ColorOptimizer(torch.zeros(4, 3)).update(torch.ones(4, 3), 0.1)\n"
         "sys.exit('torch._dynamo' in sys.modules)\n"
     )

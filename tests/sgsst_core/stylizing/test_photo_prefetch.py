@@ -22,9 +22,9 @@ from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.photo_prefetch import PhotosAhead
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.views import PhotosAhead
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.device import DEVICE, PretendTensor
 from tests.sgsst_core.synthetic_images import synthetic_image

@@ -9,8 +9,7 @@ import numba
 import pytest
 from rich.console import Console
 
-from sgsst_core.number_format import clock
-from sgsst_core.progress import Progress
+from sgsst_core.progress import Progress, clock
 from sgsst_core.stylizing import progress_bar
 from sgsst_core.stylizing.progress_bar import job_bar
 

@@ -14,7 +14,7 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.progress import Progress
 from sgsst_core.settings import PlannedPrecision, make_settings
 from sgsst_core.stylizing.loop import Callbacks, run
-from sgsst_core.stylizing.rates import Rates, estimate
+from sgsst_core.stylizing.planner import Rates, estimate
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, style, wall
 

@@ -13,8 +13,8 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.quality.measure import Measurements
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.steps import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, style, wall
 

@@ -17,8 +17,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import harmonics_energy
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.stylize import stylize
+from sgsst_core.stylizing.loop import run, stylize
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, style, wall
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.targets import ViewTarget
+from sgsst_core.loss.terms import ViewTarget
 from sgsst_core.quality.float32_reference import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
@@ -24,8 +24,7 @@ from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, fingerprint
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.planner import plan_job
-from sgsst_core.stylizing.result_colors import neighbors_change_by_region, transferred_colors
-from sgsst_core.stylizing.stylizer import Stylizer
+from sgsst_core.stylizing.stylizer import Stylizer, neighbors_change_by_region, transferred_colors
 from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, cameras, style, wall
 

@@ -12,22 +12,22 @@ import pytest
 import torch
 from torch import Tensor
 
+from sgsst_core.devices import Timer
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.convergence import smoothed
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer.tile_intersections import TileIntersections, build_tile_intersections
+from sgsst_core.scales import smoothed
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
-from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.steps import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.timing import Timer
 from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, blind_camera, cameras, style, wall
 

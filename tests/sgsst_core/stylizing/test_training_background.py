@@ -17,10 +17,10 @@ from sgsst_core.scene.pyramid import downscale
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
-from sgsst_core.stylizing.evaluation import mean_loss
 from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.steps import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.training_background import drawn_color, replace_background
+from sgsst_core.stylizing.views import drawn_color, replace_background
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
 from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.style import Style
-from sgsst_core.stylizing.warm_start import luminance_start, warm_start, with_moments
+from sgsst_core.stylizing.color_transfer import luminance_start, warm_start, with_moments
 from tests.sgsst_core.synthetic_images import synthetic_image
 
 Start = Callable[[Tensor, Tensor, Style], Tensor]

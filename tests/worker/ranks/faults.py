@@ -172,7 +172,7 @@ def _fired(request: JobSpec) -> Path:
 def _places() -> dict[str, tuple[Any, str]]:
     from sgsst_core.loss.sos import SosLoss
     from sgsst_core.stylizing import checkpoint
-    from sgsst_core.stylizing.optimizer import ColorOptimizer
+    from sgsst_core.stylizing.stylizer import ColorOptimizer
     from sgsst_core.stylizing.views import Views
     from worker import execute
     from worker.ranks.process_group import ProcessGroupCollectives

@@ -11,24 +11,22 @@ import torch
 from torch import Tensor
 
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.scale_weights import EVEN, ScaleWeights
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import layers_of
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.scales import EVEN, ScaleWeights
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import prepare_job
-from sgsst_core.stylizing.job_styles import JobStyles
+from sgsst_core.stylizing.job import JobStyles, prepare_job
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
-from sgsst_core.stylizing.view_targets import ViewTargets
-from sgsst_core.stylizing.views import Views
+from sgsst_core.stylizing.views import Views, ViewTargets
 from tests.networks import comparing_pixels, tiny_weights
 from tests.sgsst_core.stylizing.test_refining import on_a_rank
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image

@@ -14,11 +14,11 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from sgsst_core.decision import Decision
 from sgsst_core.errors import SceneError
 from sgsst_core.files.photos import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.planning.facts import Machine
+from sgsst_core.progress import Decision
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import Lens
 from worker.capture import Capture

@@ -18,8 +18,7 @@ from torch import Tensor
 from sgsst_core.errors import RanksDriftedError, SceneError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
-from sgsst_core.parallel.collectives import ALONE, Collectives, same_on_all
-from sgsst_core.parallel.division import ImageExchange
+from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, same_on_all
 from sgsst_core.progress import Progress
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer

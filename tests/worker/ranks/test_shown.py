@@ -16,9 +16,8 @@ from benchmarks.iteration_work import moved
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO, STYLE_LAYERS
 from sgsst_core.loss.terms import TERMS
-from sgsst_core.loss.tiling import Divider, Tiling
-from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
-from sgsst_core.parallel.division import ImageExchange, Piece, Shares, divide
+from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, Traffic
+from sgsst_core.parallel.division import Divider, Piece, Shares, Tiling, divide
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene

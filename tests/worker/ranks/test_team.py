@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from sgsst_core.errors import RanksDriftedError
-from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.parallel.collectives import DRIFT_STEPS, Collectives, Team
 from sgsst_core.settings import make_settings
-from sgsst_core.stylizing.team import DRIFT_STEPS, Team
 from tests.worker.ranks.spawn import on_ranks
 
 

@@ -23,7 +23,7 @@ from service.problems import SHARE_ID, UPLOAD_ID
 from service.store import Store
 from service.store.jobs import NewJob
 from service.store.tables import UploadRow
-from sgsst_core.options import declared
+from sgsst_core.settings import declared
 from tests.api.http.sending import (
     BOUNDARY,
     END,

@@ -15,16 +15,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import Any
 
+import numba
+import numpy as np
 import torch
 from torch import Tensor
 
-from sgsst_core.compiled import kernel_threads
+from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.scene.colors import luminance, on_screen
 from sgsst_core.scene.rotations import unit_rotations
 from sgsst_core.style import Style, color_moments, mixed_moments, some_pixels, square_root, style_moments
-from sgsst_core.stylizing import color_transport_kernels
 
 #: A direction counts as flat if the variance of the colors along it is less than this fraction of their largest
 #: variance. It is not stretched to the style's spread, which would amplify rounding errors.
@@ -220,7 +222,7 @@ def _through_compiled(colors: Tensor, rounds: Sequence[tuple[Tensor, list[_Map]]
     axes = torch.stack([axes.contiguous() for axes, _ in rounds])
     moved = colors.clone(memory_format=torch.contiguous_format)
     with kernel_threads():
-        color_transport_kernels.through(*(part.numpy() for part in (moved, axes, knots, targets, slopes)))
+        _transport(*(part.numpy() for part in (moved, axes, knots, targets, slopes)))
     return moved
 
 
@@ -278,3 +280,52 @@ def _mapped(values: Tensor, knots: Tensor, targets: Tensor) -> Tensor:
     low, high = knots[index - 1], knots[index]
     fraction = ((values - low) / (high - low)).clamp(0, 1)
     return torch.lerp(targets[index - 1], targets[index], fraction)
+
+
+#: Number of colors that are processed together; they and the maps of a round fit in a core's L1 and L2 caches.
+_TOGETHER = 512
+
+
+@compiled()
+def _map_values(values: Any, positions: Any, knots: Any, targets: Any, slopes: Any) -> None:
+    """Map values [n] in place by a piecewise linear function with knots [k], constant beyond its ends."""
+    # Each step of the binary search runs over all values before the next one starts. Which half a value is in is
+    # unpredictable, so the code contains no branch on it.
+    for i in range(len(values)):
+        values[i] = max(values[i], knots[0])
+        positions[i] = 0
+    half = len(knots) >> 1
+    while half > 0:
+        for i in range(len(values)):
+            positions[i] += half * (knots[positions[i] + half] <= values[i])
+        half >>= 1
+    for i in range(len(values)):
+        index = positions[i]
+        values[i] = targets[index] + slopes[index] * (values[i] - knots[index])
+
+
+@compiled(parallel=True)
+def _transport(colors: Any, axes: Any, knots: Any, targets: Any, slopes: Any) -> None:
+    """Transform colors by all rounds of `transported`, in place, on all CPU cores.
+
+    Args:
+        colors: [n, 3] float64.
+        axes: [r, 3, 3], axes of each round as columns.
+        knots: [r, 3, k] with k a power of 2, ascending: knots of each axis' map. Unused knots are infinite.
+        targets: [r, 3, k], values at the knots; for unused knots, the last value.
+        slopes: [r, 3, k], slopes between each knot and the next one.
+    """
+    parts = (len(colors) + _TOGETHER - 1) // _TOGETHER
+    for part in numba.prange(parts):
+        some = colors[part * _TOGETHER : (part + 1) * _TOGETHER]
+        along, positions = np.empty((3, len(some))), np.empty(len(some), dtype=np.int64)
+        for r in range(len(axes)):
+            turn = axes[r]
+            for a in range(3):
+                values = along[a]
+                for i in range(len(some)):
+                    values[i] = some[i, 0] * turn[0, a] + some[i, 1] * turn[1, a] + some[i, 2] * turn[2, a]
+                _map_values(values, positions, knots[r, a], targets[r, a], slopes[r, a])
+            for i in range(len(some)):
+                for c in range(3):
+                    some[i, c] = along[0, i] * turn[c, 0] + along[1, i] * turn[c, 1] + along[2, i] * turn[c, 2]

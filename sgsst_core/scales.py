@@ -1,21 +1,17 @@
-"""Scales of a view, and their weights: E = sum_s w_s E_transfer(s) / sum_s w_s.
+"""Scales of a view with their weights, and the mean loss over scales and steps, which decides when a job stops.
 
-By default all weights are equal, so E is the mean over scales, as in the paper. Scales of weight 0 are not computed.
-This module imports no PyTorch: the service estimates jobs with it.
+By default all weights are equal, so E = sum_s w_s E_transfer(s) / sum_s w_s is the mean over scales, as in the paper.
+Scales of weight 0 are not computed. Losses differ between views, so they are compared as geometric means over windows
+of whole rounds; every round visits each view once. This module imports no PyTorch: the service estimates jobs with it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
-from sgsst_core.errors import SettingsError
-from sgsst_core.settings import Settings
-
-if TYPE_CHECKING:
-    from sgsst_core.scene.camera import Camera
 
 
 def scale_count(height: int, width: int, coarsest: int = COARSEST_SHORTER_SIDE) -> int:
@@ -100,56 +96,44 @@ class ScaleWeights:
 EVEN = ScaleWeights()
 
 
-def band_count(cameras: Sequence[Camera], settings: Settings) -> int:
-    """Return the number of depth bands, which is that of the scales of the largest view; 0 without `stroke_depth`."""
-    if not settings.stroke_depth:
-        return 0
-    return max(scale_count(camera.height, camera.width, settings.coarsest_side) for camera in cameras)
+#: Minimum number of steps in a window. If there are fewer views, a window consists of several rounds.
+MIN_WINDOW = 24
+#: The loss has converged when it falls by less than this fraction from one window to the next.
+MIN_FALL = 0.005
 
 
-def check_stroke_depth(settings: Settings, cameras: Sequence[Camera], *, regions: bool) -> None:
-    """Check that `stroke_depth` has scales to choose from, and no other weights to share positions with.
+def window_length(round_length: int) -> int:
+    """Return the length of a window: the smallest number of whole rounds with at least `MIN_WINDOW` steps."""
+    return round_length * math.ceil(MIN_WINDOW / round_length)
 
-    Raises:
-        SettingsError: If every view has one scale, or the job has regions or weights of scales.
+
+def smoothed(losses: Sequence[float], window: int) -> float:
+    """Return the geometric mean of the last `window` losses, or of all losses if there are fewer."""
+    last = losses[-window:]
+    return math.exp(sum(map(log_loss, last)) / len(last))
+
+
+def log_loss(loss: float) -> float:
+    """Return the logarithm of a loss; that of the smallest normal numbers for 0."""
+    return math.log(max(loss, 1e-300))
+
+
+def ratio(after: float, before: float) -> float | None:
+    """Return a loss relative to an earlier one; None if the earlier one is exactly 0."""
+    return after / before if before else None
+
+
+def has_reached(losses: Sequence[float], target: float, round_length: int) -> bool:
+    """Return whether the mean over the last whole round of views is at most `target`."""
+    return len(losses) >= round_length and smoothed(losses, round_length) <= target
+
+
+def has_converged(losses: Sequence[float], round_length: int) -> bool:
+    """Return whether the mean loss of the last window is less than 0.5 % below that of the preceding window.
+
+    Return False if there are fewer than two windows.
     """
-    if not settings.stroke_depth:
-        return
-    if regions or settings.scales:
-        other = "--region" if regions else "--scales"
-        raise SettingsError(f"--stroke-depth and {other} both weight positions. Leave one of them out.")
-    if band_count(cameras, settings) == 1:
-        raise SettingsError(
-            "--stroke-depth needs views of at least two scales, but theirs have one: give larger views or a smaller "
-            "--coarsest-side."
-        )
-
-
-def check_scales(weights: Sequence[float], cameras: Sequence[Camera], coarsest: int) -> None:
-    """Check that every scale with a positive weight exists, and that every view has at least one such scale.
-
-    Args:
-        weights: Weights from the finest scale to coarser ones, at least one of them positive; empty for equal weights.
-        coarsest: Maximum shorter side of the coarsest scale in pixels.
-
-    Raises:
-        SettingsError: If a scale with a positive weight exists in no view, or a view has no scale with a positive
-            weight.
-    """
-    requested = ScaleWeights(tuple(weights))
-    if not requested.values:
-        return
-    counts = {camera.name: scale_count(camera.height, camera.width, coarsest) for camera in cameras}
-    most, last = max(counts.values()), max(scale for scale, weight in enumerate(weights) if weight > 0)
-    if last >= most:
-        have = "one scale, 0" if most == 1 else f"{most} scales, 0 to {most - 1}"
-        raise SettingsError(
-            f"--scales gives scale {last} a weight, but the views have {have} (full size): leave it out, or give "
-            "larger views or a smaller --coarsest-side."
-        )
-    for name, count in counts.items():
-        if not requested.chosen(count):
-            raise SettingsError(
-                f"--scales gives no weight to the {count} of {most} scales that view {name!r} has. Give one of them a "
-                "weight, or use views of one size."
-            )
+    window = window_length(round_length)
+    if len(losses) < 2 * window:
+        return False
+    return smoothed(losses, window) > (1 - MIN_FALL) * smoothed(losses[-2 * window : -window], window)
