@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.stability import Case, measure
 
-#: Maximum growth of memory. No case needs more than a few hundred megabytes; an allocation error takes many gigabytes.
-LARGEST_GROWTH = 1 << 30
+#: Maximum growth of memory. Three jobs with VGG16 need 1.5 GB; an allocation error takes many gigabytes.
+LARGEST_GROWTH = 3 << 30
 
 
 def parameters(cases: Sequence[Case | str]) -> list[Any]:
@@ -23,4 +23,4 @@ def check(case: Case) -> None:
     actual = measure(case)
     result = actual.result
     assert result.passed, f"{case.name}: {case.measure} {result.error:.3g}, bound {result.bound:.3g}. {result.note}"
-    assert actual.peak_growth < LARGEST_GROWTH
+    assert actual.peak_growth < LARGEST_GROWTH, actual.peak_growth
