@@ -89,7 +89,7 @@ class FileCheck:
 
         Args:
             mend: Whether to repair: move damaged files to `QUARANTINE`, delete unused rows whose files are gone, and
-                delete orphans. Orphans are never deleted after a rollback of the database.
+                delete orphans.
         """
         with ThreadPoolExecutor(_AT_A_TIME) as pool:
             for files in self._pages():
@@ -97,7 +97,6 @@ class FileCheck:
                     self.checked += 1
                     if finding is not None:
                         yield finding
-        mend = mend and not self._database.rolled_back
         for objects, what, name in self._unknown():
             if mend:
                 objects.remove(name)

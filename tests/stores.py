@@ -8,7 +8,7 @@ from pathlib import Path
 
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.clocks import Clock
+from service.store.database import Clock
 from tests.postgres import fresh_database
 
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 #: Exit codes of `sgsst fsck` by kind of finding. The exit status is the sum over all kinds that were found.
 _FSCK_CODES = {"missing": 4, "damaged": 8, "orphaned": 16}
-_FSCK_ROLLED_BACK = 32
 
 keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
 
@@ -59,8 +58,7 @@ def fsck(
 ) -> None:
     """Check all files of the service against its database; the service may be running.
 
-    Exit code: 0 if nothing was found, else the sum of 4 (missing files), 8 (damaged), 16 (orphaned) and 32 (the
-    database was rolled back).
+    Exit code: 0 if nothing was found, else the sum of 4 (missing files), 8 (damaged) and 16 (orphaned).
     """
     from sqlalchemy.engine import make_url
 
@@ -83,9 +81,7 @@ def fsck(
     kinds: list[str] = [finding.kind for finding in findings]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in _FSCK_CODES)
     error_console.print(f"Checked {check.checked} files of the database: {counts}")
-    if store.database.rolled_back:
-        error_console.print("The database was rolled back, so orphaned files are kept. See the note in its folder.")
-    code = sum(_FSCK_CODES[kind] for kind in set(kinds)) + (_FSCK_ROLLED_BACK if store.database.rolled_back else 0)
+    code = sum(_FSCK_CODES[kind] for kind in set(kinds))
     store.close()
     raise typer.Exit(code)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -177,7 +177,6 @@ class JobView(BaseModel):
         expires_at=None,
         attempt=1,
         queue_position=None,
-        estimated_start=None,
         preview="previews/step_0000100.jpg",
         progress=example_of(ProgressView),
         result=None,
@@ -199,10 +198,6 @@ class JobView(BaseModel):
     )
     attempt: int = Field(description="Number of the latest attempt; 0 before the first.")
     queue_position: int | None = Field(description="1 is next; null if the job is not queued.")
-    estimated_start: Time | None = Field(
-        description="Time at which a queued job is expected to start, from reports of running jobs and the sizes of "
-        "those ahead; past if it may start any moment, null if unknown."
-    )
     preview: str | None = Field(description="Artifact with the newest preview image; null if there is none yet.")
     progress: ProgressView | None
     result: dict[str, Any] | None = Field(
@@ -525,25 +520,24 @@ def _view(model: type[Model], row: Base, **given: Any) -> Model:
     return model(**{name: getattr(row, name) for name in model.model_fields if name not in given}, **given)
 
 
-def job_view(shown: ShownJob, starts: Mapping[str, float]) -> JobView:
-    """Return a job as the API shows it, given the expected starts of queued jobs."""
-    return _view(JobView, shown.row, **_given_fields(shown, starts))
+def job_view(shown: ShownJob) -> JobView:
+    """Return a job as the API shows it."""
+    return _view(JobView, shown.row, **_given_fields(shown))
 
 
-def job_detail(shown: ShownJob, attempts: Sequence[AttemptRow], starts: Mapping[str, float]) -> JobDetail:
+def job_detail(shown: ShownJob, attempts: Sequence[AttemptRow]) -> JobDetail:
     """Return a job with its attempts."""
     views = [_view(AttemptView, row) for row in attempts]
-    return _view(JobDetail, shown.row, **_given_fields(shown, starts), attempts=views)
+    return _view(JobDetail, shown.row, **_given_fields(shown), attempts=views)
 
 
-def _given_fields(shown: ShownJob, starts: Mapping[str, float]) -> dict[str, Any]:
+def _given_fields(shown: ShownJob) -> dict[str, Any]:
     """Return the fields of a job that are not columns of its row."""
     job = shown.row
     base = address(f"/v1/jobs/{job.id}")
     result = f"{base}/artifacts/stylized.ply" if job.status == JobStatus.SUCCEEDED else None
     return {
         "queue_position": shown.position,
-        "estimated_start": starts.get(job.id),
         "preview": shown.preview,
         # The remaining time is that of the last report, and a job that has ended has none.
         "progress": {**job.progress, **({} if job.status in UNFINISHED else {"eta_s": None})} if job.progress else None,

@@ -32,7 +32,7 @@ export class JobProgress {
     if (this.element.hidden) return;
     if (job.status === "queued" || !progress) {
       this.text.textContent = job.status !== "queued" ? titles[job.status] : job.queue_position === 1 ? say.next : job.queue_position ? say.queue(job.queue_position) : titles.queued;
-      this.left.textContent = job.estimated_start ? say.starts((Date.parse(job.estimated_start) - Date.now()) / 1000) : "";
+      this.left.textContent = "";
       this.bar.removeAttribute("value");
       return;
     }

@@ -35,9 +35,6 @@ _OWNERS, _THREADS, _EACH = 50, 4, 12
 _INPUTS = [{"role": "scene", "name": "scene.ply", "sha256": _SHA, "size": 10**9}]
 #: Seconds between previews (`ServiceSettings.preview_seconds`).
 _PREVIEW_SECONDS = 20.0
-#: Fraction of a saturated fleet's GPUs that are reserved for multi-GPU jobs (3 % were idle in simulation). At most as
-#: many dispatchers as there are reserved GPUs poll for a short job to backfill and find none.
-_RESERVED_GPUS = 0.03
 
 
 def measure(queued: int, gpus: int, dispatchers: int) -> dict[str, Any]:
@@ -99,18 +96,11 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
         """Return the leases of this thread; no two dispatchers write to the same job."""
         return leases[threading.current_thread().name]
 
-    def take(*rules: Callable[[Any], Any]) -> None:
-        lease = store.leases.take(threading.current_thread().name, *rules)
+    def take() -> None:
+        lease = store.leases.take(threading.current_thread().name)
         while lease is None:  # another thread has locked the next row
-            lease = store.leases.take(threading.current_thread().name, *rules)
+            lease = store.leases.take(threading.current_thread().name)
         own().append(lease)
-
-    def reserving(lets_in: bool) -> list[Callable[[Any], Any]]:
-        """Return filters that reject the first job, which is too large, and reserve GPUs for it.
-
-        If `lets_in`, the next job may use the reserved GPUs; otherwise, no job may.
-        """
-        return [lambda job: False, lambda job: True, lambda job: lets_in]
 
     def some() -> Lease:
         own().append(own().pop(0))
@@ -122,8 +112,6 @@ def _calls(store: Store, port: int) -> dict[str, dict[str, float]]:
     what: dict[str, Callable[[], Any]] = {
         "submit": lambda: store.jobs.create(submitted, limit=10**9),
         "lease": take,
-        "lease of reserved GPUs": lambda: take(*reserving(True)),
-        "reserve GPUs in vain": lambda: store.leases.take(threading.current_thread().name, *reserving(False)),
         "gpus": lambda: store.leases.hold_gpus(some(), 2),
         "begin": lambda: store.leases.start(some()),
         "progress": lambda: store.leases.report_progress(some(), progress),
@@ -198,7 +186,6 @@ def _fleet(calls: dict[str, dict[str, float]], gpus: int, dispatchers: int) -> d
         "renew eight": dispatchers * 3 / LEASE_SECONDS,
         "look at eight": dispatchers / POLL_SECONDS,
         "look at the queue": dispatchers / POLL_SECONDS,
-        "reserve GPUs in vain": min(_RESERVED_GPUS * gpus, dispatchers) / POLL_SECONDS,
         "alive": dispatchers * 3 / LEASE_SECONDS,
     }
     statements = {name: round(rate * calls[name]["statements"], 1) for name, rate in rates.items()}

@@ -18,20 +18,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import event, select
+from sqlalchemy import event
 
 from benchmarks.fleet_parts.demand import SimulatedJob
 from service.files.staging import CHECKPOINT
-from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.machine import Machine
-from service.scheduling.packing import Capacity, Grant, estimated_seconds
-from service.scheduling.selection import Holding, JobSelector
+from service.scheduling.packing import Capacity, Grant
+from service.scheduling.selection import lease_next_job
 from service.settings import ServiceSettings
 from service.states import Published
 from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.leases import Lease
-from service.store.tables import ReservationRow
 
 LEASE_SECONDS, CHECKPOINT_SECONDS, POLL_SECONDS = 30.0, 60.0, 0.5
 #: Seconds after which a host polls again if none of the waiting jobs fits its free GPUs (a real host uses
@@ -80,32 +78,23 @@ class Attempt:
     stepping_since: float | None = None
     ends: float | None = None
 
-    @property
-    def holding(self) -> Holding:
-        """Resources in use, as a real attempt reports them: with the expected end only after the first step."""
-        if self.ends is None:
-            return Holding(self.grant)
-        estimated = estimated_seconds(self.lease.job, self.grant.ranks)
-        pace = None if self.record.attempts > 1 else (self.ends - self.begun) / estimated
-        return Holding(self.grant, _EPOCH + self.ends, pace)
-
 
 @dataclass
 class Host:
     """Machine with its dispatcher. `life` counts restarts, so that events from before a restart are ignored."""
 
-    selector: JobSelector
+    name: str
+    capacity: Capacity
     gpus: int
     running: dict[str, Attempt] = field(default_factory=dict)
     life: int = 0
     up: bool = True
-    reserved_for: str | None = None
     looks_again: bool = False
 
     @property
-    def held(self) -> list[Holding]:
+    def held(self) -> list[Grant]:
         """Resources in use by the host's attempts."""
-        return [attempt.holding for attempt in self.running.values()]
+        return [attempt.grant for attempt in self.running.values()]
 
     @property
     def free(self) -> int:
@@ -145,8 +134,7 @@ class Fleet:
         self.hosts = []
         for number in range(hosts):
             capacity = Capacity(Machine(names, 64, 1 << 40), settings.parallel_jobs)
-            clocks = ClockWatch(self.store, settings.lease_seconds)
-            self.hosts.append(Host(JobSelector(f"host-{number}", self.store, capacity, clocks), gpus_each))
+            self.hosts.append(Host(f"host-{number}", capacity, gpus_each))
             self.store.operations.record_heartbeat(f"host-{number}", gpus_each, gpus_each)
 
     def _prepare_store(self) -> None:
@@ -222,7 +210,7 @@ class Fleet:
 
     def _schedule_polls(self) -> None:
         """Schedule polls of all hosts with free GPUs, in random order."""
-        hosts = [host for host in self.hosts if host.free and host.reserved_for is None]
+        hosts = [host for host in self.hosts if host.free]
         self._chance.shuffle(hosts)
         for host in hosts:
             if not self._waiting:
@@ -233,26 +221,18 @@ class Fleet:
         """Lease all jobs that fit a host, as a real dispatcher does in each poll."""
         while host.free and self._waiting:
             self._do("lease")
-            lease = host.selector.lease_next_job(host.held)
+            lease = lease_next_job(host.name, self.store, host.capacity, host.held)
             if lease is None:
                 self._do("look")
-                host.reserved_for = self._reserved(host)
-                if host.reserved_for is None and not host.looks_again:
+                if not host.looks_again:
                     host.looks_again = True
                     self._at(self.now + _LOOK_AGAIN, lambda: self._look_again(host))
                 return
-            host.reserved_for = None
             self._start(host, *lease)
 
     def _look_again(self, host: Host) -> None:
         host.looks_again = False
-        if host.reserved_for is None:
-            self._look(host)
-
-    def _reserved(self, host: Host) -> str | None:
-        with self.store.database.reading() as session:
-            mine = ReservationRow.dispatcher == host.selector.dispatcher
-            return session.scalar(select(ReservationRow.job_id).where(mine))
+        self._look(host)
 
     def _start(self, host: Host, lease: Lease, grant: Grant) -> None:
         record = self.records[lease.job_id]
@@ -263,10 +243,6 @@ class Fleet:
         record.offered = grant.ranks
         attempt = Attempt(record, lease, grant, self.now, self.now)
         host.running[lease.job_id] = attempt
-        for other in self.hosts:
-            if other.reserved_for == lease.job_id:
-                other.reserved_for = None
-                self._at(self._soon(), lambda other=other: self._look(other))  # type: ignore[misc]
         life = host.life
         self._at(self.now + record.job.start_seconds(), lambda: self._planned(host, life, attempt))
 
@@ -339,15 +315,15 @@ class Fleet:
     def _run_out(self, host: Host) -> None:
         self._do("failure")
         held = self.store.leases.waiting()
-        self.store.leases.expire(host.selector.dispatcher)
-        self.store.operations.remove_dispatcher(host.selector.dispatcher)
+        self.store.leases.expire(host.name)
+        self.store.operations.remove_dispatcher(host.name)
         self._waiting += self.store.leases.waiting() - held
         self._at(self._soon(), self._schedule_polls)
 
     def _repair(self, host: Host) -> None:
-        host.up, host.reserved_for = True, None
+        host.up = True
         self._do("failure")
-        self.store.operations.record_heartbeat(host.selector.dispatcher, host.gpus, host.gpus)
+        self.store.operations.record_heartbeat(host.name, host.gpus, host.gpus)
         self._look(host)
         self._fail_some_day(host)
 

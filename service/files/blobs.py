@@ -227,18 +227,13 @@ class Blobs(ABC):
         """Remove the received bytes of an upload whose database row is gone."""
 
     def collect(self) -> int:
-        """Remove unused blobs and leftovers of crashes; return the number of removed files.
-
-        After a rollback of the database no blob is removed, because the rows of jobs that use it may have been lost.
-        """
+        """Remove unused blobs and leftovers of crashes; return the number of removed files."""
         for upload_id in self._inputs.expire_uploads():
             self.discard_upload(upload_id)
-        removed = 0
-        if not self._inputs.database.rolled_back:
-            unused = self._inputs.collect()
-            self.remove(unused)
-            removed = len(unused) + self._collect_orphans()
-        before = self._expiry() - _ORPHAN_SECONDS
+        unused = self._inputs.collect()
+        self.remove(unused)
+        removed = len(unused) + self._collect_orphans()
+        before = time.time() - _ORPHAN_SECONDS
         for path in self.incoming.iterdir():
             if _older(path, before):
                 if path.is_dir() and not path.is_symlink():
@@ -247,10 +242,6 @@ class Blobs(ABC):
                     path.unlink(missing_ok=True)
                 removed += 1
         return removed
-
-    def _expiry(self) -> float:
-        """Return the reference time for expiry: the earlier of this machine's clock and the database's expiry time."""
-        return min(time.time(), self._inputs.database.expiry())
 
     @abstractmethod
     def _collect_orphans(self) -> int:
@@ -340,7 +331,7 @@ class BlobFolder(Blobs):
         self.upload_path(upload_id).unlink(missing_ok=True)
 
     def _collect_orphans(self) -> int:
-        known, before, removed = self._inputs.locations(), self._expiry() - _ORPHAN_SECONDS, 0
+        known, before, removed = self._inputs.locations(), time.time() - _ORPHAN_SECONDS, 0
         for path in self._blobs.glob("*/*"):
             if _older(path, before) and f"{path.parent.name}/{path.name}" not in known:
                 path.unlink(missing_ok=True)

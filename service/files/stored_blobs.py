@@ -190,7 +190,7 @@ class StoredBlobs(Blobs):
             return 0
         self._searched_at = time.monotonic()
         self._take_over()
-        before = self._expiry() - _ORPHAN_SECONDS
+        before = time.time() - _ORPHAN_SECONDS
         old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
         known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
         orphans = [name for name in old if name not in known]

@@ -19,13 +19,12 @@ from types import FrameType
 from service.errors import DamagedWeightsError, DatabaseUnavailableError
 from service.files.artifacts import Artifacts
 from service.files.stored_blobs import open_blobs
-from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.housekeeping import Housekeeper
 from service.scheduling.lease_keeper import RENEW_FRACTION, LeaseKeeper
 from service.scheduling.machine import Machine, is_dead, own_name
 from service.scheduling.packing import Capacity
 from service.scheduling.running import RunningAttempt
-from service.scheduling.selection import JobSelector
+from service.scheduling.selection import lease_next_job
 from service.scheduling.stager import Stager
 from service.scheduling.webhooks import Deliverer
 from service.settings import ServiceSettings
@@ -59,11 +58,9 @@ class Dispatcher:
         self._announced_at = float("-inf")
         self._stop = threading.Event()
         blobs = open_blobs(settings, store.inputs, self._artifacts)
-        clocks = ClockWatch(store, settings.lease_seconds)
         self._stager = Stager(settings, store, blobs, self._artifacts, cluster=machine.cluster)
-        self._selector = JobSelector(self.name, store, self._capacity, clocks)
         self._lease_keeper = LeaseKeeper(store, settings.lease_seconds, self._running)
-        self._helpers = Deliverer(settings, store), Housekeeper(store, self._artifacts, blobs, clocks)
+        self._helpers = Deliverer(settings, store), Housekeeper(store, self._artifacts, blobs)
 
     def stop(self) -> None:
         """Make `run` return: running jobs save their state and return to the queue."""
@@ -114,7 +111,8 @@ class Dispatcher:
         except DamagedWeightsError:
             return
         while not self._stop.is_set():
-            taken = self._selector.lease_next_job([attempt.holding for attempt in self._running.values()])
+            held = [attempt.grant for attempt in self._running.values()]
+            taken = lease_next_job(self.name, self._store, self._capacity, held)
             if taken is None:
                 return
             lease, grant = taken

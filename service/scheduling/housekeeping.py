@@ -13,7 +13,6 @@ import time
 from service.errors import NotFoundError
 from service.files.artifacts import Artifacts
 from service.files.blobs import Blobs
-from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.publishing import sweep
 from service.states import UNFINISHED
 from service.store import Store
@@ -32,14 +31,10 @@ _log = logging.getLogger(__name__)
 
 
 class Housekeeper:
-    """Periodic housekeeping in its own thread, so that a slow file store does not delay renewing leases.
+    """Periodic housekeeping in its own thread, so that a slow file store does not delay renewing leases."""
 
-    Args:
-        clocks: Clock checks that decide whether anything may be deleted.
-    """
-
-    def __init__(self, store: Store, artifacts: Artifacts, blobs: Blobs, clocks: ClockWatch) -> None:
-        self._store, self._artifacts, self._blobs, self._clocks = store, artifacts, blobs, clocks
+    def __init__(self, store: Store, artifacts: Artifacts, blobs: Blobs) -> None:
+        self._store, self._artifacts, self._blobs = store, artifacts, blobs
         self._searched_at = float("-inf")
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="housekeeper", daemon=True)
@@ -62,8 +57,6 @@ class Housekeeper:
             self._stop.wait(_ROUND_SECONDS)
 
     def _clean_up(self) -> None:
-        if not self._clocks.confirm():
-            return
         for job_id in self._store.retention.expire():
             self._artifacts.objects.remove_below(job_id)
         for job_id, epoch in self._store.retention.unswept(_MAX_SWEEPS):
@@ -75,10 +68,8 @@ class Housekeeper:
 
 
 def remove_strays(store: Store, artifacts: Artifacts) -> int:
-    """Delete stray files and return their number; do nothing after a rollback of the database (rows may be lost)."""
-    if store.database.rolled_back:
-        return 0
-    before = min(time.time(), store.database.expiry()) - _STRAY_SECONDS
+    """Delete stray files and return their number."""
+    before = time.time() - _STRAY_SECONDS
     old: dict[str, list[str]] = {}
     for name, changed in artifacts.objects.below("").items():
         job_id = name.partition("/")[0]

@@ -38,8 +38,6 @@ _PIXEL_SECONDS = {"auto": 5e-9, "float32": 5e-8, "winograd": 5e-8, "tf32": 1.2e-
 _GAUSSIAN_SECONDS, _FIXED_SECONDS, _COARSE_FRACTION = 1e-9, 1e-3, 0.1
 #: Default longer side of views, and ratio of height to width.
 _LONGER_SIDE, _ASPECT = 1600, 0.625
-#: Seconds before a job's first step (process, CUDA, network and plan).
-_START_SECONDS = 20.0
 #: Estimated seconds of all steps on one GPU that justify another one.
 _SECONDS_PER_GPU = 10.0
 
@@ -143,35 +141,6 @@ class Capacity:
         limit = max(min(most, int(slots * portion - scene)), _MIN_MEMORY)
         threads = max(1, self._machine.cores * slots // self._slots)
         return Grant(ranks, (), slots, threads, min(requested or limit, limit))
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Duration of a job, estimated from its record, before its files are read.
-
-    The constants are for H200 GPUs; `service.scheduling.selection` scales the estimate by the measured pace.
-
-    Attributes:
-        steps: Duration of all steps on one GPU in seconds.
-        within: Time budget of the job in seconds.
-    """
-
-    steps: float = 0.0
-    within: float = math.inf
-
-    @staticmethod
-    def of(job: JobRow) -> Estimate:
-        """Return the estimate for a job."""
-        return Estimate(_seconds_of_steps(job), _settings(job).within or math.inf)
-
-    def seconds(self, gpus: int = 1) -> float:
-        """Return the seconds on some GPUs."""
-        return min(_START_SECONDS + self.steps / max(gpus, 1), self.within)
-
-
-def estimated_seconds(job: JobRow, gpus: int = 1) -> float:
-    """Estimate the duration of a job in seconds."""
-    return Estimate.of(job).seconds(gpus)
 
 
 def _seconds_of_steps(job: JobRow) -> float:

@@ -236,7 +236,5 @@ def sweep(store: Store, artifacts: Artifacts, job_id: str, epoch: int) -> None:
     Args:
         epoch: Epoch of the job's last lease.
     """
-    if store.database.rolled_back:
-        return
     artifacts.sweep(job_id, epoch, {row.location for row in store.jobs.artifacts(job_id)})
     store.retention.mark_swept(job_id, epoch)

@@ -25,9 +25,8 @@ from service.parameters import stored_parameters
 from service.request import job_spec
 from service.scheduling.child_process import ChildProcess
 from service.scheduling.endings import Ending, Report, StopRequest, attempt_ending, cause_of_error, outage
-from service.scheduling.packing import Grant, estimated_seconds
+from service.scheduling.packing import Grant
 from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
-from service.scheduling.selection import Holding
 from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
 from service.states import AttemptOutcome, Cause, JobStatus
@@ -92,11 +91,6 @@ class RunningAttempt:
     def abandoned(self) -> bool:
         """Whether the attempt was abandoned or has ended."""
         return self._stop_request == StopRequest.ABANDON or not self.alive
-
-    @property
-    def holding(self) -> Holding:
-        """Capacity of the attempt, and its expected end."""
-        return self._progress.holding(self.grant)
 
     def start(self) -> None:
         """Start the attempt."""
@@ -279,12 +273,9 @@ class ProgressWriter:
         #: Time of the last message to the job's webhook; infinite if it gets none.
         self._notified_at = 0.0 if "progress" in (lease.job.webhook_events or ()) else math.inf
         self._pending: Progress | None = None
-        self._ends_at: float | None = None
 
     def update(self, progress: Progress) -> None:
         """Set the progress to be written next."""
-        if progress.is_step and progress.eta_s is not None:
-            self._ends_at = time.monotonic() + progress.eta_s
         self._pending = progress
 
     def write(self, *, now: bool = False) -> None:
@@ -297,17 +288,6 @@ class ProgressWriter:
             if notify:
                 self._notified_at = time_now
             self._pending, self._written_at = None, time_now
-
-    def holding(self, grant: Grant) -> Holding:
-        """Return the capacity of the attempt with its expected end according to the last step."""
-        ends_at, job = self._ends_at, self._lease.job
-        if ends_at is None:
-            return Holding(grant)
-        until = self._store.database.clock() + ends_at - time.monotonic()
-        if job.attempt > 1:  # it may have resumed from a checkpoint, so its pace is unknown
-            return Holding(grant, until)
-        pace = (ends_at - self._started_at) / estimated_seconds(job, grant.ranks)
-        return Holding(grant, until, pace)
 
 
 def progress_seconds(elapsed: float) -> float:

@@ -8,8 +8,7 @@ import time
 from service.errors import DatabaseUnavailableError
 from service.settings import ServiceSettings
 from service.store.access import Keys, Sessions, ShareLinks
-from service.store.clocks import Clock
-from service.store.database import ANSWER_SECONDS, Database
+from service.store.database import ANSWER_SECONDS, Clock, Database
 from service.store.inputs import InputRows
 from service.store.jobs import Jobs
 from service.store.leases import Leases
@@ -68,5 +67,4 @@ def open_store(
             _log.warning("database unavailable, retrying: %s", error.__cause__ or error)
             time.sleep(_RETRY_SECONDS)
         else:
-            store.database.detect_rollback()
             return store

@@ -18,7 +18,6 @@ from sqlalchemy import bindparam, delete, func, select
 from service import problems
 from service.states import JobStatus
 from service.store.changes import job_of_owner
-from service.store.clocks import expiry_time
 from service.store.database import Database, new_id
 from service.store.quotas import NO_QUOTAS, Quotas
 from service.store.tables import Base, JobRow, KeyRow, SessionRow, ShareRow
@@ -110,7 +109,7 @@ class Sessions:
         """Create a session of a key and return the only copy of its text; expired sessions are deleted."""
         text, now = secrets.token_urlsafe(32), self._database.clock()
         with self._database.writing() as session:
-            session.execute(delete(SessionRow).where(SessionRow.expires_at <= expiry_time(session, now)))
+            session.execute(delete(SessionRow).where(SessionRow.expires_at <= now))
             of_key = select(SessionRow.sha256).where(SessionRow.key_id == key_id)
             old = session.scalars(of_key.order_by(SessionRow.created_at.desc()).offset(MOST_SESSIONS - 1)).all()
             session.execute(delete(SessionRow).where(SessionRow.sha256.in_(old)))
@@ -163,8 +162,8 @@ class ShareLinks:
             if job.status != JobStatus.SUCCEEDED:
                 raise problems.NO_RESULT(job_status=job.status)
             of_job = ShareRow.job_id == job_id
-            session.execute(delete(ShareRow).where(of_job, ShareRow.expires_at <= expiry_time(session, now)))
-            valid = select(func.count()).select_from(ShareRow).where(of_job, ShareRow.expires_at > now)
+            session.execute(delete(ShareRow).where(of_job, ShareRow.expires_at <= now))
+            valid = select(func.count()).select_from(ShareRow).where(of_job)
             if (session.scalar(valid) or 0) >= MOST_SHARES:
                 raise problems.TOO_MANY_SHARES(limit=MOST_SHARES)
             row = ShareRow(id=new_id("shr", now), job_id=job_id, created_at=now, expires_at=now + seconds)

@@ -13,7 +13,6 @@ from sqlalchemy.orm import Session
 
 from service import problems
 from service.states import Transition, WebhookEvent, next_status
-from service.store.clocks import retained_until
 from service.store.database import count, new_id
 from service.store.tables import Base, BlobRow, BlobUseRow, DeliveryRow, EventRow, JobRow
 
@@ -59,7 +58,7 @@ def end(session: Session, job: JobRow, transition: Transition, now: float, reten
         retention: Time in seconds until its results expire.
     """
     status = next_status(job.status, transition)
-    job.finished_at, job.expires_at = now, retained_until(session, now, retention)
+    job.finished_at, job.expires_at = now, now + retention
     job.lease_owner = job.lease_expires_at = None
     move(session, job, transition, now)
     count(session, "sgsst_jobs_finished_total", f'status="{status}"')

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import fcntl
+import math
 import secrets
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
@@ -19,11 +20,11 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
 from service import problems
-from service.store.clocks import Clock, ServerClock, expiry_time
 from service.store.outages import Gate, impatient_connection, translated
-from service.store.rollback import NEWEST_EVENT, Marker
 from service.store.tables import Base, CounterRow, IdempotencyRow
 from sgsst_core.errors import SettingsError
+
+Clock = Callable[[], float]
 
 #: Version of the newest migration; a database with this version is opened without loading the migrations.
 SCHEMA = "0011"
@@ -48,6 +49,8 @@ _POSTGRESQL: dict[str, int | None] = {
 IDEMPOTENCY_SECONDS = 86_400.0
 #: Key of the PostgreSQL advisory lock for migrations; other applications are unlikely to use this number.
 _LOCK = 7_347_758
+#: Interval between queries of the server's time, in seconds.
+_CLOCK_SECONDS = 10.0
 _SERVER_TIME = text("SELECT extract(epoch FROM clock_timestamp())")
 #: Upper bounds of histogram buckets in seconds, from one second to one day.
 BUCKETS = (1, 5, 15, 60, 300, 900, 1800, 3600, 7200, 14400, 43200, 86400)
@@ -68,7 +71,8 @@ class Database:
     def __init__(self, url: str, clock: Clock | None = None, answer_seconds: float = ANSWER_SECONDS) -> None:
         self.url = make_url(url)
         self.sqlite = self.url.get_backend_name() == "sqlite"
-        self.clock: Clock = clock or (time.time if self.sqlite else ServerClock(self._server_time))
+        self.clock: Clock = clock or (time.time if self.sqlite else self._server_time)
+        self._offset, self._asked_at = 0.0, -math.inf
         if self.sqlite and self.url.database:
             Path(self.url.database).parent.mkdir(parents=True, exist_ok=True)
         self._answer_seconds = answer_seconds
@@ -77,7 +81,6 @@ class Database:
         # PostgreSQL's default gives each statement a snapshot of its own
         one_snapshot = {} if self.sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
         self._reader = self.engine.execution_options(**one_snapshot)
-        self._marker = Marker(Path(self.url.database)) if self.sqlite and self.url.database else None
         self._reserved = self._make_engine(_RESERVED_SECONDS, pool_size=2, max_overflow=0)
         # SQLite's writers wait for each other by polling; a lock avoids that within one process
         self._write_lock = threading.Lock() if self.sqlite else None
@@ -109,9 +112,6 @@ class Database:
             session.begin(),
         ):
             yield session
-            newest = session.scalar(NEWEST_EVENT) if self._marker is not None else None
-        if self._marker is not None and newest is not None:
-            self._marker.reach(newest)
 
     @contextmanager
     def _locked_for_writing(self) -> Iterator[None]:
@@ -147,15 +147,17 @@ class Database:
         with translated(), self._reserved.connect() as connection:
             yield connection
 
-    def expiry(self) -> float:
-        """Return the time by which data expire (`service.store.clocks`); it is never ahead of the clock."""
-        now = self.clock()
-        with self.reading_rows() as connection:
-            return expiry_time(connection, now)
-
     def _server_time(self) -> float:
-        with self.reserved_connection() as connection:
-            return float(connection.execute(_SERVER_TIME).scalar_one())
+        """Return the server's time, from the monotonic clock and an offset that is measured every few seconds.
+
+        It is never ahead of the server's, and behind by at most the duration of a query.
+        """
+        now = time.monotonic()
+        if now - self._asked_at > _CLOCK_SECONDS:
+            with self.reserved_connection() as connection:
+                server = float(connection.execute(_SERVER_TIME).scalar_one())
+            self._offset, self._asked_at = server - time.monotonic(), now
+        return self._offset + time.monotonic()
 
     def upgrade(self) -> None:
         """Migrate the tables to this version; if several processes start at once, only one does it.
@@ -180,20 +182,6 @@ class Database:
                     self._migrate(engine)
         finally:
             engine.dispose()
-
-    def detect_rollback(self) -> None:
-        """Detect whether an SQLite database was rolled back to an earlier state, and set `rolled_back` if so."""
-        if self._marker is not None:
-            with self._upgrading(self.engine):
-                marked = self._marker.read()
-                with self.reading() as session:
-                    newest = session.scalar(NEWEST_EVENT)
-                self._marker.compare(marked, newest or 0)
-
-    @property
-    def rolled_back(self) -> bool:
-        """Whether the database may have lost the rows of existing files."""
-        return self._marker is not None and self._marker.note.exists()
 
     def is_up_to_date(self) -> bool:
         """Return whether the tables have this version or a later one."""

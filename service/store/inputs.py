@@ -100,7 +100,7 @@ class InputRows:
 
     def collect(self) -> list[str]:
         """Delete the rows of blobs that have been unused for a while; return their locations for removing the files."""
-        before = self.database.expiry() - GRACE_SECONDS
+        before = self.database.clock() - GRACE_SECONDS
         used = exists().where(BlobUseRow.sha256 == BlobRow.sha256)
         with self.database.writing() as session:
             query = select(BlobRow).where(BlobRow.touched_at < before, ~used).limit(1000)
@@ -282,7 +282,7 @@ class InputRows:
 
     def expire_uploads(self) -> list[str]:
         """Delete expired uploads and return their ids for removing their bytes."""
-        now = self.database.expiry()
+        now = self.database.clock()
         with self.database.writing() as session:
             query = select(UploadRow).where(UploadRow.expires_at < now).limit(500)
             rows = session.scalars(query.with_for_update(skip_locked=True)).all()

@@ -74,7 +74,7 @@ class NewJob:
 
     def row(self, now: float) -> dict[str, Any]:
         """Return the columns of the queued job."""
-        times = dict.fromkeys(("created_at", "queued_at", "not_before"), now)
+        times = {"created_at": now, "queued_at": now, "not_before": 0.0}
         counts = dict.fromkeys(("attempt", "failures", "lease_epoch"), 0)
         return {**vars(self), **times, **counts, "id": new_id("job", now), "status": JobStatus.QUEUED}
 
@@ -283,7 +283,7 @@ class Jobs:
             _check_queue(session, job.owner, limit)
             count_job(session, job.owner, quotas, now)
             check_bytes(session, job.owner, quotas)
-            job.queued_at, job.not_before, job.failures, job.swept = now, now, 0, False
+            job.queued_at, job.not_before, job.failures, job.swept = now, 0.0, 0, False
             if ended_well:
                 derived = ArtifactRow.created_at > job.finished_at
                 session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, derived))

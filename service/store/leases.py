@@ -22,7 +22,7 @@ from service.states import ACTIVE, AttemptOutcome, Cause, JobStatus, Published, 
 from service.store.changes import add_event, end, move, send_webhook
 from service.store.database import Database, count, observe, upsert
 from service.store.history import add_point
-from service.store.queue import LOST, WAITING, next_jobs, reserve, reserved_by
+from service.store.queue import LOST, WAITING, next_jobs
 from service.store.quotas import count_gpu_seconds
 from service.store.retries import DISPATCHER_LOST, MAX_LOSSES, FailureCount, RetryPolicy, Verdict, cause_of
 from service.store.tables import (
@@ -32,7 +32,6 @@ from service.store.tables import (
     EventRow,
     JobRow,
     ProgressPointRow,
-    ReservationRow,
     TurnRow,
 )
 from sgsst_core.errors import InfrastructureError
@@ -47,8 +46,8 @@ MAX_PROGRESS_EVENTS = 200
 LIVE = "live/"
 #: Maximum number of past attempts that the retry policy looks at: by then the delay is at its maximum.
 _MAX_CAUSES = 2 * MAX_LOSSES
-#: Maximum number of candidates for backfilling, each from a different owner.
-_MAX_BACKFILL_CANDIDATES = 16
+#: Time in seconds for which jobs of other owners overtake a waiting job that needs more capacity than is free.
+OVERTAKEN_SECONDS = 600.0
 
 _PROGRESS = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
 _OLD = select(EventRow.id).where(_PROGRESS).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
@@ -92,56 +91,31 @@ class Leases:
 
     # --- taking and holding ----------------------------------------------------------------------------------------
 
-    def take(
-        self,
-        dispatcher: str,
-        fits: Callable[[JobRow], bool] = lambda job: True,
-        should_reserve: Callable[[JobRow], bool] = lambda job: True,
-        backfills: Callable[[JobRow], bool] = lambda job: False,
-        is_lost: Callable[[JobRow], bool] = lambda job: True,
-    ) -> Lease | None:
+    def take(self, dispatcher: str, fits: Callable[[JobRow], bool] = lambda job: True) -> Lease | None:
         """Take the next job: by highest priority, then the owner who has waited longest, then the oldest job.
 
         Jobs with expired leases are candidates like queued ones. If such a job has used up its attempts, it is ended as
         failed, and if it was being canceled, as canceled; then the next job is tried.
 
-        If a job does not fit, it is reserved: this dispatcher takes no other job of the same priority until the
-        reserved job fits, so that smaller jobs do not overtake it forever. Other dispatchers take the job if it fits
-        there first and skip it otherwise, so a large job blocks only one dispatcher. Jobs that `backfills` allows are
-        taken meanwhile, and the reservation remains.
+        Jobs of other owners overtake a job that does not fit, but only until it has waited for `OVERTAKEN_SECONDS`.
+        Then nothing is taken until it fits here or another dispatcher takes it.
 
         Args:
             fits: Callback that returns whether there is capacity for a job.
-            should_reserve: Callback that returns whether to reserve capacity for a job that does not fit; if not, the
-                job is skipped.
-            backfills: Callback that returns whether a job fits and would not delay the job that was just reserved.
-            is_lost: Callback that returns whether a job with an expired lease may be taken over; if not, the job is
-                skipped.
         """
-        skipped: list[str] = []
-        while True:
-            now = self._database.clock()
-            with self._database.writing() as session:
-                jobs = next_jobs(session, dispatcher, now, skipped, most=1)
-                if not jobs:
-                    return None
-                job = jobs[0]
+        now = self._database.clock()
+        with self._database.writing() as session:
+            for job in next_jobs(session, now):
                 lost = job.status in ACTIVE
-                if lost and not is_lost(job):
-                    skipped.append(job.id)
-                    continue
                 if lost and self._close_lost(session, job, dispatcher, now):
                     continue
                 if fits(job):
                     return self._lease(session, job, dispatcher, now)
                 if lost:  # otherwise the same loss would be counted again next time
-                    self._requeue(session, job, now, now)
-                skipped.append(job.id)
-                if should_reserve(job) and reserve(session, job.id, dispatcher, now, self._seconds):
-                    for other in next_jobs(session, dispatcher, now, skipped, _MAX_BACKFILL_CANDIDATES):
-                        if other.status == JobStatus.QUEUED and backfills(other):
-                            return self._lease(session, other, dispatcher, now, keep_reservation=True)
-                    return None
+                    self._requeue(session, job, now, 0.0)
+                if now - job.queued_at > OVERTAKEN_SECONDS:
+                    break
+        return None
 
     def waiting(self, most: int = 1_000_000) -> int:
         """Return the number of jobs that could be leased now, counting up to `most`."""
@@ -152,10 +126,7 @@ class Leases:
                 total += connection.execute(query, {"now": now, "most": most - total}).scalar_one()
         return total
 
-    def _lease(
-        self, session: Session, job: JobRow, dispatcher: str, now: float, *, keep_reservation: bool = False
-    ) -> Lease:
-        """Lease a job; `keep_reservation` preserves the dispatcher's reservation for another job."""
+    def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:
         job.attempt += 1
         job.lease_epoch += 1
         job.lease_owner, job.lease_expires_at = dispatcher, now + self._seconds
@@ -163,10 +134,6 @@ class Leases:
         attempt = AttemptRow(job_id=job.id, number=job.attempt, epoch=job.lease_epoch, dispatcher=dispatcher)
         attempt.started_at = now
         session.add(attempt)
-        of_job = ReservationRow.job_id == job.id
-        session.execute(
-            delete(ReservationRow).where(of_job if keep_reservation else or_(reserved_by(dispatcher), of_job))
-        )
         served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
         turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
         session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
@@ -204,11 +171,10 @@ class Leases:
             return sorted({str(owner) for owner in session.scalars(query)})
 
     def expire(self, dispatcher: str) -> None:
-        """Expire the leases and the reservation of a dispatcher that is known to be dead."""
+        """Expire the leases of a dispatcher that is known to be dead."""
         with self._database.writing() as session:
             held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
             session.execute(update(JobRow).where(held).values(lease_expires_at=EXPIRED))
-            session.execute(delete(ReservationRow).where(reserved_by(dispatcher)))
 
     def hold_gpus(self, lease: Lease, gpus: int) -> None:
         """Set the number of GPUs that the attempt holds, and charge its usage so far to the job's owner."""
@@ -305,7 +271,7 @@ class Leases:
         with self._held(lease) as (session, job, now):
             verdict = self._close(session, job, AttemptOutcome.RELEASED, None, now)
             if verdict.transition == Transition.REQUEUE:
-                self._requeue(session, job, now, now)
+                self._requeue(session, job, now, 0.0)
             else:
                 end(session, job, verdict.transition, now, self._retention)
 

@@ -9,12 +9,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, SQLColumnExpression, and_, bindparam, case, delete, func, literal, select, text
+from sqlalchemy import ColumnElement, SQLColumnExpression, bindparam, case, delete, func, literal, select, text
 
 from service import problems
-from service.states import ACTIVE, JobStatus
+from service.states import JobStatus
 from service.store.database import Database, upsert
-from service.store.tables import AttemptRow, Base, CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
+from service.store.tables import Base, CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
 
 _JOBS = Base.metadata.tables[JobRow.__tablename__]
 #: Live dispatchers: those with a heartbeat within a lease duration. A heartbeat far in the future comes from a wrong
@@ -41,21 +41,6 @@ class Delivery:
     url: str
     body: dict[str, Any]
     tries: int
-
-
-@dataclass(frozen=True)
-class Line:
-    """Jobs that run and wait, in one snapshot.
-
-    Attributes:
-        running: Jobs that dispatchers hold, each with the start of its attempt and the number of its GPUs.
-        queued: First queued jobs by priority and age.
-        capacity: GPUs, or slots for jobs, of all live dispatchers.
-    """
-
-    running: list[tuple[JobRow, float, int]]
-    queued: list[JobRow]
-    capacity: int
 
 
 def _counted(counts: Mapping[str, int], column: SQLColumnExpression[str]) -> ColumnElement[int]:
@@ -101,11 +86,6 @@ class Operations:
                 raise problems.DATABASE_UNAVAILABLE()
             return connection.execute(_ALIVE, span).scalar_one()
 
-    def heartbeats(self) -> dict[str, float]:
-        """Return the time of each dispatcher's last heartbeat by its own clock, for dead dispatchers too."""
-        with self._database.reading() as session:
-            return dict(session.execute(select(DispatcherRow.name, DispatcherRow.seen_at)).all())
-
     def _span(self) -> dict[str, float]:
         now = self._database.clock()
         return {"since": now - self._lease_seconds, "until": now + self._lease_seconds}
@@ -133,31 +113,6 @@ class Operations:
         with self._database.reading() as session:
             rows = session.scalars(select(JobRow.progress).where(JobRow.status == JobStatus.RUNNING)).all()
         return [(progress["step"], progress["seconds"]) for progress in rows if progress and progress.get("seconds")]
-
-    def line(self, most: int) -> Line:
-        """Return the running jobs and up to `most` queued ones, to forecast when those start.
-
-        Their rows have neither inputs nor parameters, which may be long.
-        """
-        names = ("id", "status", "queued_at", "not_before", "attempt", "progress")
-        shown = [_JOBS.c[name] for name in names]
-        attempt = and_(AttemptRow.job_id == _JOBS.c.id, AttemptRow.number == _JOBS.c.attempt)
-        active = (
-            select(*shown, AttemptRow.started_at.label("since"), AttemptRow.gpus)
-            .select_from(_JOBS)
-            .join(AttemptRow, attempt)
-        )
-        queued = select(*shown).where(_JOBS.c.status == JobStatus.QUEUED).limit(most)
-        capacity = select(func.coalesce(func.sum(DispatcherRow.slots), 0)).where(_IS_ALIVE)
-        with self._database.reading_rows() as connection:
-            active_rows = connection.execute(active.where(_JOBS.c.status.in_(ACTIVE))).all()
-            waiting = connection.execute(queued.order_by(_JOBS.c.priority.desc(), _JOBS.c.queued_at, _JOBS.c.id)).all()
-            total = connection.execute(capacity, self._span()).scalar_one()
-
-        def job(row: Any) -> JobRow:
-            return JobRow(**{name: getattr(row, name) for name in names})
-
-        return Line([(job(row), row.since, row.gpus) for row in active_rows], [job(row) for row in waiting], total)
 
     def webhook_secret(self) -> str:
         """Return the secret that signs webhooks, in the format of Standard Webhooks; it is created on first use."""

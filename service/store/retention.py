@@ -6,7 +6,6 @@ from sqlalchemy import and_, delete, select, update
 
 from service.states import FINISHED, JobStatus, Transition
 from service.store.changes import forget, holder_name, move
-from service.store.clocks import advance_expiry_time, expiry_time, retained_until
 from service.store.database import IDEMPOTENCY_SECONDS, Database
 from service.store.tables import ArtifactRow, BlobUseRow, DispatcherRow, IdempotencyRow, JobRow
 
@@ -26,36 +25,25 @@ class Retention:
         self._database = database
         self._retention = retention
 
-    def advance(self, seconds: float) -> None:
-        """Advance the time by which data expire (`service.store.clocks`).
-
-        Args:
-            seconds: Working time of the caller since its last call, by its monotonic clock.
-        """
-        now = self._database.clock()
-        with self._database.writing() as session:
-            advance_expiry_time(session, now, seconds)
-
     def expire(self) -> list[str]:
         """Expire old results, and delete the records of jobs that expired long ago.
 
         Returns:
             Ids of jobs whose files are to be removed.
         """
-        clock = self._database.clock()
+        now = self._database.clock()
         with self._database.writing() as session:
-            now = expiry_time(session, clock)
             old = select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
             due = session.scalars(old.with_for_update(skip_locked=True)).all()
             for job in due:
                 if job.status == JobStatus.EXPIRED:
                     forget(session, job)
                     continue
-                job.expires_at = retained_until(session, clock, self._retention)
+                job.expires_at = now + self._retention
                 session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
                 # blobs without other holders are collected later
                 session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
-                move(session, job, Transition.EXPIRE, clock)
+                move(session, job, Transition.EXPIRE, now)
             session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
             return [job.id for job in due]

@@ -117,16 +117,6 @@ class TurnRow(Base):
     served: Mapped[int] = mapped_column(Sequence)
 
 
-class ReservationRow(Base):
-    """Queued job for which a dispatcher reserves capacity; the reservation ends at `until` unless it is renewed."""
-
-    __tablename__ = "reservations"
-
-    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
-    dispatcher: Mapped[str] = mapped_column(String(120))
-    until: Mapped[float] = mapped_column(Float)
-
-
 class EventRow(Base):
     """Event of a job; event streams resume from an `id`."""
 

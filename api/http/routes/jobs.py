@@ -30,7 +30,6 @@ from service import problems
 from service.files.staging import default_job_name
 from service.parameters import JobParameters, stored_parameters
 from service.problems import JOB_ID
-from service.scheduling.forecast import expected_starts
 from service.store.tables import JobRow
 from service.weights import check_weights
 
@@ -81,8 +80,7 @@ async def list_jobs(
     def read(before: str | None, most: int) -> tuple[list[JobView], str | None]:
         page = context.store.jobs.page(caller.owner, status=status or (), before=before, limit=most + 1)
         following = page[most - 1].row.id if len(page) > most else None  # one more shows if more follow
-        starts = expected_starts(context.store, [job.row.id for job in page[:most] if job.position])
-        return [job_view(job, starts) for job in page[:most]], following
+        return [job_view(job) for job in page[:most]], following
 
     return await send_list("jobs", read, cursor, limit, context.readers.of(caller.owner), at_once=16)
 
@@ -199,8 +197,7 @@ def _job_response(
     context: Context, caller: Caller, job_id: str, if_none_match: str | None = None, status: int = 200
 ) -> Response:
     job, attempts = context.store.jobs.detail(job_id, caller.owner)
-    view = job_detail(job, attempts, expected_starts(context.store, [job_id] if job.position else []))
-    body = view.model_dump_json().encode()
+    body = job_detail(job, attempts).model_dump_json().encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     response_headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
     wait = poll_seconds(job.row)

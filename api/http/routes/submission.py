@@ -32,7 +32,6 @@ from service.files.staging import MOST_STYLES, check_roles, default_job_name, st
 from service.inspection.inspector import Show
 from service.parameters import JobParameters
 from service.problems import UPLOAD_ID
-from service.scheduling.forecast import expected_starts
 from service.scheduling.webhooks import check_url
 from service.states import JobStatus, WebhookEvent
 from service.store.jobs import Idempotency, NewJob
@@ -268,7 +267,7 @@ def _queue_job(
     if not created:
         response_headers["Idempotency-Replayed"] = "true"
     shown, _ = jobs.detail(job.id, caller.owner)
-    body = job_view(shown, expected_starts(context.store, [job.id] if shown.position else [])).model_dump_json()
+    body = job_view(shown).model_dump_json()
     return Response(body, 202, response_headers, media_type="application/json")
 
 

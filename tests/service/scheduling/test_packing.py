@@ -10,16 +10,16 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sqlalchemy import event, select
+from sqlalchemy import event
 
-from service.scheduling.clock_watch import ClockWatch
 from service.scheduling.machine import Machine
-from service.scheduling.packing import Capacity, Grant, estimated_seconds
-from service.scheduling.selection import Holding, JobSelector
+from service.scheduling.packing import Capacity, Grant
+from service.scheduling.selection import lease_next_job
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
-from service.store.tables import JobRow, ReservationRow
+from service.store.leases import OVERTAKEN_SECONDS
+from service.store.tables import JobRow
 from tests.stores import new_store
 
 GB = 1_000_000_000
@@ -33,19 +33,15 @@ def machine(gpus: int, **more: Any) -> Machine:
 
 
 class Queue:
-    """Database with jobs, and the selector of a dispatcher on a simulated machine; no job runs."""
+    """Database with jobs, and the capacity of a simulated machine; no job runs."""
 
-    def __init__(self, folder: Path, gpus: int, parallel_jobs: int | None = None, name: str = "here") -> None:
+    def __init__(self, folder: Path, gpus: int, parallel_jobs: int | None = None) -> None:
         self.now = 1_000_000.0
         settings = ServiceSettings(data=folder)
         self.store = new_store(settings, lambda: self.now)
         self.store.inputs.add_blob(SHA, "aa/blob", 3)
-        capacity, clocks = Capacity(machine(gpus), parallel_jobs), ClockWatch(self.store, settings.lease_seconds)
-        self.selector = JobSelector(name, self.store, capacity, clocks)
+        self.capacity = Capacity(machine(gpus), parallel_jobs)
         self.held: dict[str, Grant] = {}
-        #: Expected ends of jobs that report progress; `pace` is their duration relative to the estimate.
-        self.ends: dict[str, float] = {}
-        self.pace = 1.0
 
     def add(self, owner: str = "local", priority: int = 0, **parameters: Any) -> str:
         self.now += 1
@@ -53,17 +49,10 @@ class Queue:
         parameters = LARGE | parameters
         return self.store.jobs.create(NewJob(owner, "", priority, parameters, [scene]), limit=100)[0].id
 
-    def holdings(self) -> list[Holding]:
-        ends = [self.ends.get(job_id) for job_id in self.held]
-        return [
-            Holding(grant, end, None if end is None else self.pace)
-            for grant, end in zip(self.held.values(), ends, strict=True)
-        ]
-
     def start(self) -> list[str]:
         """Start the jobs that fit, as the dispatcher does; return their ids in order."""
         started = []
-        while (leased := self.selector.lease_next_job(self.holdings())) is not None:
+        while (leased := lease_next_job("here", self.store, self.capacity, [*self.held.values()])) is not None:
             lease, grant = leased
             self.held[lease.job_id] = grant
             started.append(lease.job_id)
@@ -74,12 +63,6 @@ class Queue:
     def ranks(self) -> list[int]:
         assert all(len(grant.gpus) == grant.ranks for grant in self.held.values())
         return [grant.ranks for grant in self.held.values()]
-
-
-def reserved_jobs(queue: Queue) -> list[str]:
-    """Return the jobs that GPUs are reserved for."""
-    with queue.store.database.reading() as session:
-        return list(session.scalars(select(ReservationRow.job_id)))
 
 
 @pytest.fixture
@@ -135,124 +118,19 @@ def test_requested_workers_are_granted(eight: Queue) -> None:
     assert eight.ranks() == [8], "no more than there are"
 
 
-def test_large_job_is_not_overtaken_while_it_waits_for_gpus(eight: Queue) -> None:
-    small = [eight.add(workers=1) for _ in range(7)]
-    assert eight.start() == small
-    big = eight.add(workers=8)
-    for job_id in small:
-        eight.add(workers=1)
+def test_large_job_is_overtaken_for_a_limited_time(eight: Queue) -> None:
+    running = [eight.add("a", workers=1) for _ in range(7)]
+    assert eight.start() == running
+    big = eight.add("b", workers=8)
+    small = [eight.add(owner, workers=1) for owner in "bc"]
+    assert eight.start() == small[1:], "jobs of the same key do not overtake it"
+    eight.now += OVERTAKEN_SECONDS
+    eight.add("d", workers=1)
+    for job_id in [*running, small[1]]:
         assert eight.start() == []
         del eight.held[job_id]
-    assert eight.start() == [big]
-    urgent = eight.add(priority=1)
-    del eight.held[big]
-    assert eight.start()[0] == urgent, "but for one of a higher priority"
-
-
-def test_large_job_blocks_only_one_machine(tmp_path: Path) -> None:
-    here, there = (Queue(tmp_path, gpus=8, name=name) for name in ("here", "there"))
-    running = [here.add(workers=1), here.add(workers=1)]
-    assert [*here.start(), *there.start()] == running
-    big, *small = [here.add(workers=workers) for workers in (8, 1, 1, 1)]
-    there.now = here.now
-    assert here.start() == [], "it keeps its seven GPUs for the big one"
-    there.held["else"] = Grant(1, ("gpu7",))
-    assert there.start() == small
-    there.held.clear()
-    assert there.start() == [big], "wherever it fits first"
-    later = here.add(workers=1)
-    assert here.start() == [later], "and who kept its room has it back"
-    for queue in (here, there):
-        queue.store.close()
-
-
-def test_short_jobs_backfill_gpus_reserved_for_a_large_job(eight: Queue) -> None:
-    long = [eight.add("a", workers=1) for _ in range(8)]
-    assert eight.start() == long
-    big = eight.add("b", workers=8)
-    short = [eight.add(f"c{number}", preset="preview", resolution=640) for number in range(3)]
-    for job_id in long[:2]:
-        del eight.held[job_id]
-    eight.ends = dict.fromkeys(long, eight.now + 600)
-    assert eight.start() == short[:2]  # as many as there are free GPUs, in order
-    assert reserved_jobs(eight) == [big]
-    for job_id in short[:2]:
-        del eight.held[job_id]
-    eight.now += 575  # the third job would end too late now
-    assert eight.start() == []
-    eight.held.clear()
-    assert eight.start() == [big]
-
-
-def test_backfilling_requires_a_known_pace_and_a_short_job(eight: Queue) -> None:
-    long = [eight.add("a", workers=1) for _ in range(8)]
-    assert eight.start() == long
-    big, short = eight.add("b", workers=8), eight.add("c", preset="preview", resolution=640)
-    del eight.held[long[0]]
-    assert eight.start() == []
-    eight.ends = dict.fromkeys(long, eight.now + 100)
-    eight.pace = 10.0
-    assert eight.start() == []
-    eight.pace = 1.0
-    assert eight.start() == [short]
-    assert reserved_jobs(eight) == [big]
-
-
-def test_reserved_job_waits_no_longer_than_its_first_forecast(eight: Queue) -> None:
-    """Running jobs that exceed their forecasts do not let further jobs be backfilled."""
-    long = [eight.add("a", workers=1) for _ in range(8)]
-    assert eight.start() == long
-    eight.add("b", workers=8)
-    del eight.held[long[0]]
-    eight.ends = dict.fromkeys(long, eight.now + 100)
-    first = eight.add("c", preset="preview", resolution=640)
-    assert eight.start() == [first]
-    del eight.held[first]
-    eight.add("d", preset="preview", resolution=640)
-    eight.now += 90
-    eight.ends = dict.fromkeys(long, eight.now + 100)
-    assert eight.start() == []
-
-
-def test_machine_with_the_earliest_capacity_reserves_it(tmp_path: Path) -> None:
-    """A machine whose capacity is freed late leaves a large job to others until the job has waited long enough."""
-    late, soon = (Queue(tmp_path, gpus=8, name=name) for name in ("late", "soon"))
-    for queue in (late, soon):
-        queue.store.operations.record_heartbeat(queue.selector.dispatcher, 8, 0)
-    running = [late.add("a", workers=1) for _ in range(14)]
-    soon.now = late.now
-    for queue, some in ((late, running[:7]), (soon, running[7:])):
-        queue.held = {job_id: Grant(1, (f"gpu{number}",)) for number, job_id in enumerate(some)}
-    late.ends = dict.fromkeys(running, late.now + 3600)
-    soon.ends = dict.fromkeys(running, late.now + 60)
-    for job_id in running:
-        late.store.jobs.cancel(job_id, None)
-    big = late.add("b", workers=8)
-    assert late.start() == []
-    assert reserved_jobs(late) == []
-    soon.now = late.now
-    assert soon.start() == []
-    assert reserved_jobs(soon) == []
-    soon.now = late.now = late.now + 60
-    for queue in (late, soon):
-        queue.store.operations.record_heartbeat(queue.selector.dispatcher, 8, 0)
-    assert late.start() == []
-    assert soon.start() == []
-    assert reserved_jobs(soon) == [big]
-    with soon.store.database.reading() as session:
-        assert session.scalars(select(ReservationRow.dispatcher)).all() == ["soon"]
-    for queue in (late, soon):
-        queue.store.close()
-
-
-def test_job_of_higher_priority_takes_reserved_gpus(eight: Queue) -> None:
-    long = [eight.add("a", workers=1) for _ in range(8)]
-    assert eight.start() == long
-    big = eight.add("b", workers=8)
-    del eight.held[long[0]]
-    assert eight.start() == []
-    urgent = eight.add("c", priority=1, workers=1)
-    assert eight.start() == [urgent]
+    urgent = eight.add("e", priority=1, workers=1)
+    assert eight.start() == [urgent], "only a higher priority comes first"
     eight.held.clear()
     assert eight.start() == [big]
 
@@ -267,7 +145,7 @@ def test_dispatchers_share_the_queue(eight: Queue) -> None:
     for name in ("here", "there"):
         eight.store.operations.record_heartbeat(name, 8, 8)
     first, _ = eight.add(), eight.add()
-    lease = eight.selector.lease_next_job([])
+    lease = lease_next_job("here", eight.store, eight.capacity, [])
     assert lease is not None
     assert (lease[0].job_id, lease[1].ranks) == (first, 8), "the other job is for the other dispatcher"
 
@@ -346,17 +224,15 @@ def test_larger_jobs_get_more_gpus(parameters: dict[str, Any], ranks: int) -> No
     assert grant.ranks == ranks
 
 
-def test_estimated_seconds_do_not_depend_on_the_format() -> None:
-    plain = estimated_seconds(job(248_000_000))
+def test_gpus_do_not_depend_on_the_format() -> None:
+    capacity = Capacity(machine(8), None)
+    plain = capacity.grant(job(248_000_000, precision="float32"), [], 1)
     for name, scene in (("s.compressed.ply", 61_000_000), ("s.SPZ", 25_000_000), ("s.splat", 32_000_000)):
-        row = JobRow(id="job", parameters={}, inputs=[{"role": "scene", "name": name, "size": scene}])
-        assert estimated_seconds(row) == plain
-
-
-def test_estimated_seconds_end_with_the_time_budget() -> None:
-    long = {"preset": "paper", "resolution": 5187}
-    assert estimated_seconds(job(GB, **long)) > 1000
-    assert estimated_seconds(job(GB, **long, within=30)) == 30
+        inputs = [{"role": "scene", "name": name, "size": scene}]
+        grant = capacity.grant(JobRow(id="job", parameters={"precision": "float32"}, inputs=inputs), [], 1)
+        assert grant
+        assert plain
+        assert grant.ranks == plain.ranks
 
 
 def test_memory_limit_of_a_single_job_is_at_most_its_fraction_of_the_machine() -> None:

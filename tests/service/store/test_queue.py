@@ -8,6 +8,7 @@ import pytest
 
 from service.states import JobStatus
 from service.store import Store
+from service.store.leases import OVERTAKEN_SECONDS
 from service.store.tables import JobRow
 from tests.service.store.helpers import ATTEMPTS, LEASE, Clock, lease, queue
 
@@ -43,7 +44,7 @@ def test_queue_order_equals_a_plain_sort(store: Store, clock: Clock, seed: int) 
             store.leases.succeed(lease, [], {})  # in the fourth case the job is lost
 
 
-def test_reserving_dispatcher_takes_no_other_job(store: Store, clock: Clock) -> None:
+def test_jobs_of_others_overtake_a_job_that_does_not_fit_for_a_while(store: Store, clock: Clock) -> None:
     big = queue(store, "a")
     small = []
     for owner in "bca":
@@ -53,82 +54,12 @@ def test_reserving_dispatcher_takes_no_other_job(store: Store, clock: Clock) -> 
     def full(job: JobRow) -> bool:
         return job.id != big
 
-    assert store.leases.take("one", full) is None
-    assert [held.job_id for _ in range(2) if (held := store.leases.take("two", full))] == small[:2]
-    assert store.leases.take("one", full) is None, "it is kept, however often others were served"
-    assert lease(store, "one").job_id == big
-    assert lease(store, "one").job_id == small[2]
-
-
-def test_job_without_a_reservation_is_skipped(store: Store, clock: Clock) -> None:
-    big = queue(store, "a")
-    clock.now += 1
-    small = queue(store, "b")
-    clock.now += 1
-    lease = store.leases.take("one", lambda job: job.id == small, should_reserve=lambda job: False)
-    assert lease is not None
-    assert lease.job_id == small
-    assert store.leases.take("one", lambda job: False, should_reserve=lambda job: False) is None
-    queue(store, "c")
-    assert store.leases.take("one", lambda job: job.id != big) is None, "and now it is kept"
-
-
-def test_harmless_jobs_run_before_the_reserved_job(store: Store, clock: Clock) -> None:
-    big = queue(store, "a", priority=1)
-    others = []
-    for owner in "bcbd":
-        clock.now += 1
-        others.append(queue(store, owner))
-
-    def full(job: JobRow) -> bool:
-        return job.id != big
-
-    def before(job: JobRow) -> bool:
-        return job.id != others[1]
-
-    taken = [held.job_id for _ in range(4) if (held := store.leases.take("one", full, backfills=before))]
-    assert taken == [others[0], others[3], others[2]], "in turns, but for the one that is in the way"
-    leased = store.leases.take("two", full, backfills=before)
-    assert leased is not None
-    assert leased.job_id == others[1], "only the first dispatcher has a reservation"
-    assert store.leases.take("two", full, backfills=before) is None
-    assert lease(store, "one").job_id == big
-
-
-def test_reserved_job_runs_where_it_fits_first(store: Store) -> None:
-    big = queue(store)
-    assert store.leases.take("one", lambda job: False) is None
-    assert lease(store, "two").job_id == big
-    other = queue(store)
-    assert lease(store, "one").job_id == other, "and nothing is kept any more"
-
-
-def test_reservation_of_a_dead_dispatcher_expires(store: Store, clock: Clock) -> None:
-    big = queue(store, "a")
-    clock.now += 1
-    small = queue(store, "b")
-    clock.now += 1
-    queue(store, "b")
-
-    def full(job: JobRow) -> bool:
-        return job.id != big
-
-    assert store.leases.take("dead", full) is None
-    lease = store.leases.take("two", full)
-    assert lease is not None
-    assert lease.job_id == small
-    clock.now += LEASE + 1
-    assert store.leases.take("two", full) is None, "it keeps its own room from now on"
-    lease = store.leases.take("three", full)
-    assert lease is not None
-
-
-def test_higher_priority_runs_before_the_reserved_job(store: Store, clock: Clock) -> None:
-    big = queue(store)
-    assert store.leases.take("one", lambda job: False) is None
-    urgent = queue(store, "b", priority=1)
-    assert lease(store, "one").job_id == urgent
-    assert lease(store, "one").job_id == big
+    taken = [held.job_id for _ in range(3) if (held := store.leases.take("one", full))]
+    assert taken == small[:2], "but not its owner's"
+    clock.now += OVERTAKEN_SECONDS
+    queue(store, "d")
+    assert store.leases.take("two", full) is None
+    assert lease(store, "one").job_id == big, "wherever it fits first"
 
 
 def test_waiting_jobs_are_counted_up_to_a_maximum(store: Store, clock: Clock) -> None:
