@@ -8,7 +8,7 @@ import re
 from functools import cache
 from pathlib import Path
 
-from service.optional import installed_extras
+from service.settings import installed_extras
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import DOWNLOADS, FORMATS, RESULT_FORMATS
 from sgsst_core.settings import STRENGTHS
@@ -64,7 +64,7 @@ def _tables() -> dict[str, object]:
 
 @cache
 def exported_viewer() -> dict[str, str]:
-    """Return the sources of a page that shows a scene without a server (`worker.exported_page`).
+    """Return the sources of a page that shows a scene without a server (`worker.derived`).
 
     `document` is its HTML with placeholders, `style` its style sheet, `page` and `worker` are scripts.
     """

@@ -51,8 +51,8 @@ from sgsst_core.scales import EVEN
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from tests.rounding import RoundedToFloat16, RoundedToTf32
-from worker.region_requests import parse_selection
-from worker.selecting import select
+from worker.inputs import select
+from worker.options import parse_selection
 
 COLUMNS = (
     "loss",

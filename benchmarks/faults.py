@@ -30,8 +30,8 @@ from benchmarks.machine import write_result
 from sgsst_core.progress import Progress
 from tests.worker.ranks.faults import Fault, FaultyRank, Place, fired, folders, forget, shared_memory, small_request
 from worker.job import JobSpec
-from worker.ranks.attempts import stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.ranks.driver import stylize_on_ranks
 from worker.ranks.rank import WorkerOptions
 from worker.run import Ended, Listener
 

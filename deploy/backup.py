@@ -27,7 +27,7 @@ from sqlalchemy.engine import URL
 
 from service.files.blobs import BLOBS
 from service.files.objects import ObjectStore
-from service.files.staging import CHECKPOINT
+from service.inputs import CHECKPOINT
 from service.settings import ServiceSettings, read_settings
 from service.store import Store
 from service.store.tables import ArtifactRow, BlobRow, JobRow, UploadPartRow

@@ -15,7 +15,7 @@ PROGRAMS = (
     "torch.distributed",
     "worker.execute",
     "worker.prepare",
-    "worker.ranks.attempts",
+    "worker.ranks.driver",
 )
 
 for name in PROGRAMS:

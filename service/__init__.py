@@ -1,1 +1,1 @@
-"""Job service: settings, durable store, inputs and artifacts on disk, and the dispatcher that runs the jobs."""
+"""Jobs of users: the store, files, inspection and scheduling. Modules here are shared by several of these packages."""

@@ -1,15 +1,27 @@
-"""Deadline of a request: the time since its last sign of progress is limited, whatever it waits for.
+"""Limits of the time that work may take: the deadline of a request, and threads for work on files, which may hang.
 
-The code that serves a request extends the request's deadline for large files, and suspends it for work that has a time
-limit of its own. Outside of requests, both do nothing.
+A request ends some time after its last sign of progress, whatever it waits for. The code that serves it extends the
+deadline for large files, and suspends it for work that has a limit of its own; outside of requests, both do nothing.
+
+The threads for the file store and the data folder are separate from those that read the database. Each owner occupies
+few of them, so a hanging file of one owner does not stop the others. Work that takes too long is given up; its thread
+stays occupied until the file store answers.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+import tempfile
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, contextmanager, suppress
+from contextvars import ContextVar, copy_context
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+from weakref import WeakValueDictionary
+
+from service import problems
 
 #: Minimum rate of work on files in bytes per second; it adds to the time that work on a file of known size may take.
 LEAST_RATE = 10e6
@@ -83,3 +95,89 @@ def suspended() -> Iterator[None]:
         return
     with deadline.suspended():
         yield
+
+
+#: Number of threads, and maximum number per owner. Threads mostly wait for the disk or the network.
+_THREADS, _THREADS_PER_OWNER = 16, 4
+
+Returned = TypeVar("Returned")
+
+
+class OwnerLimit:
+    """Semaphore of each owner, which exists as long as it is used."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._free: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
+
+    def of(self, owner: str) -> asyncio.Semaphore:
+        """Return the semaphore of an owner."""
+        free = self._free.get(owner)
+        if free is None:
+            free = self._free[owner] = asyncio.Semaphore(self._most)
+        return free
+
+
+class FileThreads:
+    """Pool of threads that owners take turns on.
+
+    Args:
+        seconds: Time limit of a piece of work, including the wait for a thread.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._pool = ThreadPoolExecutor(_THREADS, "files")
+        self._limit = OwnerLimit(_THREADS_PER_OWNER)
+        self._cleaning: set[asyncio.Task[Any]] = set()
+
+    async def run(self, owner: str, function: Callable[..., Returned], *arguments: Any, size: int = 0) -> Returned:
+        """Call a function in a thread as soon as the owner has a free one, and return its result.
+
+        Args:
+            size: Bytes that the function reads or writes, as far as they are known; they add to the time limit.
+
+        Raises:
+            StoreError: If the result is not there in time.
+        """
+        extend(size)
+        free = self._limit.of(owner)
+        try:
+            async with asyncio.timeout(self._seconds + size / LEAST_RATE) as limit:
+                await free.acquire()
+                try:
+                    future = self._pool.submit(copy_context().run, function, *arguments)
+                except BaseException:
+                    free.release()
+                    raise
+                future.add_done_callback(partial(_release, asyncio.get_running_loop(), free))
+                return await asyncio.wrap_future(future)
+        except TimeoutError as error:
+            if not limit.expired():
+                raise
+            raise problems.STORE_UNAVAILABLE() from error
+
+    @asynccontextmanager
+    async def folder(self, owner: str, parent: Path) -> AsyncIterator[Path]:
+        """Provide a temporary folder for the duration of the block."""
+        folder = await self.run(owner, partial(tempfile.TemporaryDirectory, dir=parent, ignore_cleanup_errors=True))
+        try:
+            yield Path(folder.name)
+        finally:
+            await self.clean_up(self.run(owner, folder.cleanup))
+
+    async def clean_up(self, work: Coroutine[Any, Any, Returned]) -> Returned:
+        """Await some work, which continues in the background if the request that waits for it is canceled."""
+        task = asyncio.ensure_future(work)
+        self._cleaning.add(task)  # the event loop itself holds weak references only
+        task.add_done_callback(self._cleaning.discard)
+        return await asyncio.shield(task)
+
+    def close(self) -> None:
+        """Stop the threads without waiting for those that hang."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _release(loop: asyncio.AbstractEventLoop, free: asyncio.Semaphore, _done: Any) -> None:
+    with suppress(RuntimeError):  # the event loop has been closed
+        loop.call_soon_threadsafe(free.release)

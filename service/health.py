@@ -42,8 +42,8 @@ def main() -> int:
 
 def dispatcher_is_healthy(store: Store) -> bool:
     """Return whether a dispatcher of this machine or container has sent a heartbeat lately, or the database is down."""
-    from service.errors import DatabaseUnavailableError
-    from service.scheduling.machine import is_of_this_machine
+    from service.problems import DatabaseUnavailableError
+    from service.scheduling.capacity import is_of_this_machine
 
     try:
         alive = store.operations.dispatchers()

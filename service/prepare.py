@@ -10,9 +10,9 @@ from __future__ import annotations
 import sys
 import time
 
-from service.errors import DatabaseUnavailableError, StoreError
 from service.files.objects import ObjectStore
-from service.startup import start
+from service.problems import DatabaseUnavailableError, StoreError
+from service.settings import start
 from service.store import open_store
 from sgsst_core.errors import SettingsError
 

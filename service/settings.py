@@ -1,18 +1,32 @@
-"""Settings of the service: environment variables `SGSST_...`, with defaults for a single machine."""
+"""Settings of the service: environment variables `SGSST_...`, with defaults for a single machine.
+
+In addition, what every process does at its start: set up its log, the permissions of its files, and the check of the
+network weights.
+"""
 
 from __future__ import annotations
 
 import ipaddress
+import json
+import logging
+import os
 import re
-from functools import cached_property
+import stat
+import sys
+import textwrap
+import time
+from functools import cached_property, lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from service import problems
 from service.outgoing import parse_origins
 from sgsst_core.errors import SettingsError
+from sgsst_core.features.weight_files import damaged_weights
 from sgsst_core.settings import reason
 
 GB = 1_000_000_000
@@ -210,3 +224,137 @@ def read_settings() -> ServiceSettings:
         name = ".".join(str(part) for part in first["loc"])
         value = "" if name in ("database", "artifacts") else f" = {first['input']!r}"  # URLs may hold passwords
         raise SettingsError(f"Environment variable SGSST_{name.upper()}{value}: {reason(first)}.") from error
+
+
+#: Module that each extra installs, and what it is for.
+_EXTRAS = {"video": ("av", "Videos"), "heif": ("pillow_heif", "HEIC images")}
+
+
+def installed_extras() -> dict[str, bool]:
+    """Return whether each optional extra is installed."""
+    return {extra: find_spec(module) is not None for extra, (module, _) in _EXTRAS.items()}
+
+
+def missing_extras() -> list[str]:
+    """Return a line for the operator about each feature that is not offered, with the command that installs it."""
+    missing = [extra for extra, there in installed_extras().items() if not there]
+    return [f"{_EXTRAS[each][1]} are not offered. To add them: {install_command(each)}" for each in missing]
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra."""
+    return f"pip install 'sgsst-service[{extra}]'"
+
+
+_log = logging.getLogger(__name__)
+
+
+def check_weights() -> None:
+    """Verify the installed weights, and log each damaged file once, with instructions for the operator.
+
+    Raises:
+        DamagedWeightsError: If any weights are damaged.
+    """
+    if damages := damaged_weights():
+        for damage in damages:
+            _log_once(damage)
+        raise problems.WEIGHTS_DAMAGED()
+
+
+@lru_cache
+def _log_once(damage: str) -> None:
+    _log.error("weights damaged, no job is accepted or started: %s", damage)
+
+
+#: Suffixes of the files that SQLite creates for a database.
+_BESIDE = ("", "-wal", "-shm")
+_FIELDS = ("job", "attempt", "method", "path", "status", "seconds", "request_id", "owner")
+
+
+class JsonFormatter(logging.Formatter):
+    """Formatter that writes one JSON object per line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record as a JSON object."""
+        entry = {
+            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created)) + f".{int(record.msecs):03d}Z",
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        entry |= {name: getattr(record, name) for name in _FIELDS if hasattr(record, name)}
+        if record.exc_info:
+            entry["exception"] = self.formatException(record.exc_info)
+        return json.dumps(entry)
+
+
+class TextFormatter(logging.Formatter):
+    """Formatter that writes time, level, message, and the job if there is one.
+
+    Every record starts on a new line, and all its further lines are indented. Text from a request therefore cannot
+    forge a record.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record as a line of text, followed by the indented traceback if there is one."""
+        own = " ".join(f"{name}={_value(getattr(record, name))}" for name in _FIELDS if hasattr(record, name))
+        line = f"{self.formatTime(record, '%H:%M:%S')} {record.levelname.lower():<7} {record.getMessage()}"
+        line = _printable(f"{line}  {own}" if own else line)
+        if record.exc_info:
+            trace = "\n".join(_printable(part) for part in self.formatException(record.exc_info).split("\n"))
+            line += "\n" + textwrap.indent(trace, "  ")
+        return line
+
+
+def _value(value: object) -> str:
+    """Return a value as a single word, quoted if it contains spaces, quotes, backslashes or unprintable characters."""
+    text = str(value)
+    return text if text.isprintable() and re.fullmatch(r'[^\s"\\]+', text) else json.dumps(text)
+
+
+def _printable(text: str) -> str:
+    """Escape characters that would end the line, control a terminal, or change the text direction."""
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+
+
+def set_up(log_format: str) -> None:
+    """Log records of level INFO and above to stderr in the format "json" or "text"."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter() if log_format == "json" else TextFormatter())
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+    for noisy in ("httpx2", "httpcore", "alembic", "botocore", "uvicorn.access"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def start() -> ServiceSettings:
+    """Return the settings of this process, once its log and its files are set up; end it if they cannot be used."""
+    try:
+        settings = read_settings()
+    except SettingsError as error:
+        sys.exit(f"error: {error}")
+    set_up(settings.log_format)
+    keep_private(settings)
+    return settings
+
+
+def keep_private(settings: ServiceSettings) -> None:
+    """Create the data folder, restrict it and the database to the owner, and set a umask for everything written later.
+
+    Paths that belong to another user and cannot be restricted are logged.
+    """
+    from fsspec.core import split_protocol
+    from sqlalchemy.engine import make_url
+
+    os.umask(0o077)
+    settings.folder.mkdir(parents=True, exist_ok=True)
+    (protocol, artifacts), url = split_protocol(settings.artifacts_url), make_url(settings.database_url)
+    paths = [settings.folder, *([Path(artifacts)] if protocol in (None, "file", "local") else [])]
+    if url.get_backend_name() == "sqlite" and url.database:
+        paths += [Path(url.database + ending) for ending in _BESIDE]
+    for path in filter(Path.exists, paths):
+        mode = stat.S_IMODE(path.stat().st_mode)
+        if mode & 0o077:
+            try:
+                path.chmod(mode & 0o700)
+            except PermissionError:
+                _log.warning("file readable by other users, and owned by another user: path=%s", path)

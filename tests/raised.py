@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.errors import ProblemType, ServiceError
+from service.problems import ProblemType, ServiceError
 
 
 def raises_problem(problem: ProblemType, match: str | None = None) -> pytest.RaisesExc[ServiceError]:

@@ -30,8 +30,7 @@ from sgsst_core.stylizing.steps import Evaluation, mean_loss, on_scales_of, roun
 from sgsst_core.stylizing.stylizer import Stylizer
 from worker.job import CONTINUABLE, Result
 from worker.options import RunOptions
-from worker.prepare import Job, Warn
-from worker.previews import Previews
+from worker.prepare import Job, Previews, Warn
 
 if TYPE_CHECKING:
     from worker.run import Listener

@@ -13,13 +13,18 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.camera_folder import cameras_beside
+from sgsst_core.files.formats import format_of_name
 from sgsst_core.settings import Color, Settings
-from worker.options import Backbone, ViewOptions
-from worker.region_requests import RegionRequest
-from worker.styles import StyleFile
+from worker.options import Backbone, RegionRequest, StyleFile, ViewOptions
 
 #: Reasons of an early end after which a job can be continued: it keeps its checkpoint.
 CONTINUABLE = ("within", "on-request")
+#: Bytes of a Gaussian of SH degree 3 in memory: 62 float32 values.
+GAUSSIAN_BYTES = 248
+#: Bytes that a rank needs in addition to the scene: libraries of CUDA and PyTorch, and pinned buffers.
+_RANK_BYTES = 3_000_000_000
+#: Copies of the scene on a machine while it is loaded: the arrays read from the file, and the shared memory.
+_SCENE_COPIES = 2
 
 
 class SceneRequest(ViewOptions):
@@ -150,3 +155,19 @@ def check_steps(settings: Settings) -> None:
     """
     if not settings.steps_coarse + settings.steps_sos:
         raise SettingsError("Both numbers of steps are 0, so that nothing would change. Give some.")
+
+
+def scene_bytes(name: str, size: int) -> int:
+    """Estimate the bytes of a scene in memory from its file.
+
+    Args:
+        name: Name of the file; its ending determines the format.
+        size: Size of the file in bytes.
+    """
+    format = format_of_name(name)
+    return size if format is None else size * GAUSSIAN_BYTES // format.bytes_per_gaussian
+
+
+def memory_beside_gpus(ranks: int, scene: int) -> int:
+    """Estimate the host memory in bytes of `ranks` ranks on one machine with a scene of `scene` bytes."""
+    return ranks * _RANK_BYTES + _SCENE_COPIES * scene

@@ -1,11 +1,17 @@
-"""Identification and reliable termination of processes, and sockets bound to one address."""
+"""Identification and reliable termination of processes, and sockets bound to one address.
+
+Run as a script with a folder, this module is the sweeper of that folder (`start_sweeper`); it therefore imports little.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
+import shutil
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -17,6 +23,11 @@ import psutil
 _PR_SET_PDEATHSIG = 1
 #: Signals that ask a program to stop: Ctrl-C, the usual one, and that of a closed terminal, which Windows lacks.
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+#: Message to a sweeper whose owner has deleted the folder itself.
+_DONE = b"done"
+#: Seconds until remaining processes are killed, and until the sweeper stops waiting for them.
+_PATIENCE, _LIMIT = 1.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -108,3 +119,60 @@ def split_address(address: str) -> tuple[str, int]:
 def listen(host: str, port: int = 0) -> socket.socket:
     """Return a socket that listens on one address of this machine only; port 0 chooses a free port."""
     return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+
+
+def start_sweeper(folder: Path) -> subprocess.Popen[bytes]:
+    """Start a process that sweeps a folder if this process is killed; `dismiss_sweeper` ends it.
+
+    It reads from a pipe: if the pipe closes without a message, this process was killed.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-I", __file__, str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # only the owner handles Ctrl-C
+    )
+
+
+def dismiss_sweeper(process: subprocess.Popen[bytes]) -> None:
+    """End a sweeper after the owner has deleted the folder itself. Further calls have no effect."""
+    if process.stdin and not process.stdin.closed:
+        process.communicate(_DONE)
+
+
+def sweep(folder: Path) -> None:
+    """Delete a folder once no other process uses it. Processes that use it for too long are killed.
+
+    A process uses the folder if it has a file of the folder open, or if its command line contains the folder's path.
+    """
+    started = time.monotonic()
+    while users := _users(folder):
+        if time.monotonic() - started > _LIMIT:
+            break
+        if time.monotonic() - started > _PATIENCE:
+            for process in users:
+                with contextlib.suppress(psutil.Error):  # the process has ended meanwhile
+                    process.kill()
+        time.sleep(0.1)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _users(folder: Path) -> list[psutil.Process]:
+    """Return the other processes of this user that use a folder."""
+    return [process for process in psutil.process_iter() if process.pid != os.getpid() and _uses(process, str(folder))]
+
+
+def _uses(process: psutil.Process, folder: str) -> bool:
+    try:
+        command = " ".join(process.cmdline())
+        if folder in command:
+            return __file__ not in command
+        return any(file.path.startswith(folder + os.sep) for file in process.open_files())
+    except (psutil.Error, OSError):  # the process has ended meanwhile, or belongs to another user
+        return False
+
+
+if __name__ == "__main__":
+    if sys.stdin.buffer.read() != _DONE:
+        sweep(Path(sys.argv[1]))

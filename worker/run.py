@@ -101,7 +101,7 @@ def stylize(request: JobSpec, workers: int | None, listener: Listener, options: 
         RanksFailedError: If ranks are lost too often, or fail for a reason that is not an error of the job.
     """
     if workers is not None:
-        from worker.ranks.attempts import stylize_on_ranks
+        from worker.ranks.driver import stylize_on_ranks
 
         return stylize_on_ranks(request, workers, listener, options=options)
     result = run_rank(request, listener, options, Resume(request.resume, options.resume_required))
@@ -134,8 +134,7 @@ def run_rank(
     from sgsst_core.devices import seconds_left
     from sgsst_core.parallel.collectives import ALONE
     from worker.execute import execute
-    from worker.prepare import describe, prepare
-    from worker.previews import Previews
+    from worker.prepare import Previews, describe, prepare
 
     # what preceded a job of several ranks belongs to its command, on another clock perhaps
     start = max(time.time() - options.started, 0.0) if collectives is None else 0.0

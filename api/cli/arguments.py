@@ -12,10 +12,20 @@ import typer
 from api.cli.console import error_console
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import SUFFIXES, scene_path
-from worker.options import ESSENTIALS, REGIONS, VIEWS, StylizeOptions, ViewOptions
+from worker.options import (
+    ESSENTIALS,
+    REGIONS,
+    SHAPES,
+    VIEWS,
+    RegionOptions,
+    StylizeOptions,
+    ViewOptions,
+    parse_styles,
+    path_or_url,
+    region_options,
+    region_requests,
+)
 from worker.outputs import check_file, check_folder
-from worker.region_requests import SHAPES, RegionOptions, region_options, region_requests
-from worker.styles import parse_styles, path_or_url
 
 if TYPE_CHECKING:
     from worker.job import JobSpec, SceneRequest

@@ -27,7 +27,7 @@ from api.cli.console import (
 )
 from api.cli.options import with_arguments, with_options
 from api.client.inputs import different_names
-from service.parameters import JobParameters
+from service.inputs import JobParameters
 from service.states import ACTIONS, STEPPING, Transition, WebhookEvent
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.atomic import file_digest
@@ -43,10 +43,8 @@ from sgsst_core.files.formats import (
 )
 from sgsst_core.progress import Progress, duration
 from sgsst_core.stylizing.progress_bar import live_bar, set_total
-from worker.options import ESSENTIALS
+from worker.options import ESSENTIALS, RegionOptions, parse_styles, path_or_url, region_requests, split_weight
 from worker.outputs import check_file, check_folder, check_is_not_input
-from worker.region_requests import RegionOptions, region_requests
-from worker.styles import parse_styles, path_or_url, split_weight
 
 if TYPE_CHECKING:
     from stamina.instrumentation import RetryDetails

@@ -23,11 +23,11 @@ from pydantic import BaseModel, Field
 from api.client import AsyncClient
 from api.client.answers import Job
 from api.client.inputs import IMAGE_SUFFIXES, JobFiles, input_files
-from service.parameters import JobParameters
+from service.inputs import JobParameters
 from sgsst_core.errors import SgsstError
 from sgsst_core.files import formats
 from sgsst_core.files.formats.ply import PLY
-from worker.styles import path_or_url
+from worker.options import path_or_url
 
 _INSTRUCTIONS = """
 Style transfer for 3D Gaussian Splatting scenes: the colors of a scene are optimized so that its views look like a

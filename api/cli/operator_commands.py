@@ -62,7 +62,7 @@ def fsck(
     """
     from sqlalchemy.engine import make_url
 
-    from service.fsck import FileCheck
+    from service.scheduling.housekeeping import FileCheck
     from sgsst_core.errors import SettingsError
 
     url = make_url(_service_settings(data).database_url)
@@ -106,7 +106,7 @@ def create_key(
     as_json: JsonOption = False,
 ) -> None:
     """Create an API key and print it. Only a digest is stored, so the key cannot be shown again."""
-    from service.store.quotas import Quotas
+    from service.store.keys import Quotas
 
     quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
     row, text = _open_store(data).keys.create(name, priority, quotas)
@@ -162,7 +162,7 @@ def _service_settings(data: Path | None) -> ServiceSettings:
 
 
 def _open_store(data: Path | None) -> Store:
-    from service.startup import keep_private
+    from service.settings import keep_private
     from service.store import open_store
 
     settings = _service_settings(data)

@@ -33,7 +33,7 @@ from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
     from sgsst_core.files.scene_file import SceneFile
-    from worker.video import VideoRequest
+    from worker.derived import VideoRequest
 
 #: Number of frames after which the time of a video is estimated.
 _TIMED_FRAMES = 6
@@ -138,7 +138,7 @@ def render(
     around = video is not None and video_options.path == "orbit"
     source = (SceneRequest.of if around else source_of)(scene, cameras, options)
     if video is not None:
-        from worker.video import VideoRequest
+        from worker.derived import VideoRequest
 
         _render_video(VideoRequest(source, video, video_options, background, compare, transparent))
     elif given:
@@ -152,7 +152,7 @@ def render(
 
 
 def _render_video(request: VideoRequest) -> None:
-    from worker.video import check_video_request, render_video
+    from worker.derived import check_video_request, render_video
 
     check_video_request(request)
     with _frame_bar() as progress:
@@ -214,7 +214,7 @@ def convert(
     chosen: StylizeOptions,
 ) -> None:
     """Convert a scene to another format, which the name of OUT determines."""
-    from worker.derive import convert as convert_scene
+    from worker.derived import convert as convert_scene
     from worker.job import SceneRequest
 
     source = SceneRequest.of(scene, cameras, options)
@@ -246,7 +246,7 @@ def view(
     """Write a scene as one HTML file, which shows it in 3D in a browser, without a server."""
     from api.static_files import exported_viewer
     from sgsst_core.files.scene_file import read_scene
-    from worker.exported_page import write_page
+    from worker.derived import write_page
 
     if out.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{out}: not the name of an HTML file. Give one, such as scene.html.")

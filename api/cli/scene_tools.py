@@ -1,7 +1,7 @@
 """Implementation of the commands `plan`, `check`, `render` and `blend`.
 
 The functions check all inputs, compute, and write the outputs, but print nothing. `stylize` is implemented by
-`worker.run`, and `convert` by `worker.derive`.
+`worker.run`, and `convert` by `worker.derived`.
 """
 
 from __future__ import annotations
@@ -25,13 +25,12 @@ from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
-from worker.derive import blend
+from worker.derived import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
-from worker.options import ViewOptions
+from worker.options import ViewOptions, split_weight
 from worker.outputs import check_is_not_input
 from worker.prepare import dry_run
-from worker.styles import split_weight
 
 # --- plan ----------------------------------------------------------------------------------------------------------
 

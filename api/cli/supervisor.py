@@ -12,9 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from api.cli.console import leave_terminal
-from service.optional import missing_extras
-from service.settings import ServiceSettings
-from service.startup import keep_private
+from service.settings import ServiceSettings, keep_private, missing_extras
 from service.store import open_store
 from sgsst_core.errors import InvalidInputError
 from worker.processes import STOP_SIGNALS

@@ -20,7 +20,7 @@ from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.formats import download_of_name
 from sgsst_core.files.formats.ply import PLY
-from worker.styles import path_or_url
+from worker.options import path_or_url
 
 #: Jobs per page of a list.
 _PAGE = 200

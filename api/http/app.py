@@ -26,15 +26,14 @@ from api.http.routes import artifacts, events, inputs, jobs, operations, session
 from api.http.routes.submission import JobFromUploads
 from api.http.schemas import ANSWERS
 from api.http.static import add_static
-from service.errors import DamagedWeightsError
-from service.files.artifacts import Artifacts
-from service.files.stored_blobs import open_blobs
-from service.files.threads import FileThreads, OwnerLimit
+from service.deadlines import FileThreads, OwnerLimit
+from service.files.blobs import open_blobs
+from service.files.objects import Artifacts
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
-from service.settings import ServiceSettings
+from service.problems import DamagedWeightsError
+from service.settings import ServiceSettings, check_weights
 from service.store import open_store
-from service.weights import check_weights
 
 #: Number of threads for requests that read the database.
 _THREADS = 40

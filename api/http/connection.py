@@ -15,7 +15,7 @@ from api.http.context import SESSION_COOKIE
 from api.http.problems import from_service
 from api.http.request_memory import memory
 from service import problems
-from service.errors import ServiceError
+from service.problems import ServiceError
 
 #: Maximum bytes of a request line and headers. The limit is lower while many connections are open; see
 #: `api.http.request_memory`.

@@ -28,15 +28,15 @@ from api.http.limits import Rates, SignIns
 from api.http.monitoring import Metrics, Readiness
 from api.http.receipts import Receipts
 from service import problems
-from service.files.artifacts import Artifacts
+from service.deadlines import FileThreads, OwnerLimit
 from service.files.blobs import Blobs
-from service.files.threads import FileThreads, OwnerLimit
+from service.files.objects import Artifacts
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
-from service.scheduling.machine import Machine
+from service.scheduling.capacity import Machine
 from service.settings import ServiceSettings, is_loopback
 from service.store import Store
-from service.store.quotas import NO_QUOTAS, Quotas
+from service.store.keys import NO_QUOTAS, Quotas
 from service.store.tables import KeyRow
 
 #: Owner of everything that is created without a key, on services that require none.

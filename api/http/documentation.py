@@ -1,7 +1,7 @@
 """Parts of the OpenAPI document that route types do not cover: headers of responses, and errors with examples.
 
 Examples of bodies are defined with their models (`api.http.schemas`, `api.http.routes.submission`,
-`service.parameters`).
+`service.inputs`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from starlette.routing import BaseRoute
 
 from api.http.problems import MEDIA_TYPE, from_service
 from service import problems
-from service.errors import ProblemType, ServiceError
-from service.problems import JOB_ID, SHA256
+from service.problems import JOB_ID, SHA256, ProblemType, ServiceError
 from sgsst_core.errors import (
     CameraError,
     ImageError,

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic_core import to_jsonable_python
 
 from api.http.schemas import utc
-from service.errors import DatabaseUnavailableError
+from service.problems import DatabaseUnavailableError
 from service.states import ENDED
 from service.store import Store
 from service.store.tables import EventRow

@@ -20,11 +20,11 @@ from api.http.multipart import check_size
 from api.http.receipts import Receipt
 from api.http.request_memory import memory
 from service import problems
-from service.errors import ServiceError
+from service.deadlines import FileThreads, OwnerLimit
 from service.files.blobs import Blobs, Receiver
-from service.files.staging import staged_name
-from service.files.threads import FileThreads, OwnerLimit
+from service.inputs import staged_name
 from service.outgoing import origin, parse_origins, parse_url, send
+from service.problems import ServiceError
 from service.settings import ServiceSettings
 
 _REDIRECTS = (301, 302, 303, 307, 308)

@@ -21,12 +21,12 @@ from api.http.documentation import raises
 from api.http.receipts import Receipt
 from api.http.request_memory import memory
 from service import problems
-from service.errors import ServiceError
+from service.deadlines import FileThreads
 from service.files.blobs import Blobs, Receiver
-from service.files.staging import MAX_CAMERA_FILES, MOST_STYLES, ROLES, staged_name
-from service.files.threads import FileThreads
+from service.inputs import MAX_CAMERA_FILES, MOST_STYLES, ROLES, staged_name
+from service.problems import ServiceError
 from service.settings import ServiceSettings
-from worker.region_requests import MOST_REGIONS
+from worker.options import MOST_REGIONS
 
 #: Maximum bytes of a text field: JSON parameters or an id.
 MAX_TEXT = 1 << 16

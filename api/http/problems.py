@@ -16,12 +16,12 @@ from starlette.types import Scope
 
 from api.http.addresses import address, path_of
 from service import problems
-from service.errors import ServiceError
-from service.files.cache import is_full
-from service.parameters import JobParameters
+from service.files.objects import is_full
+from service.inputs import JobParameters
+from service.problems import ServiceError
 from sgsst_core.errors import InvalidInputError
 from sgsst_core.settings import merged, reason, unknown_text
-from worker.region_requests import RegionOptions
+from worker.options import RegionOptions
 
 MEDIA_TYPE = "application/problem+json"
 #: Names of statuses that HTTPStatus lacks; 460 is defined by the tus protocol.

@@ -16,7 +16,7 @@ from api.http.event_hub import HEARTBEAT_SECONDS
 from api.http.problems import from_service
 from api.http.schemas import ArtifactView, PlanView
 from service import problems
-from service.errors import ServiceError
+from service.problems import ServiceError
 
 _EVENTS = "text/event-stream"
 #: Status in the log if the client has closed the connection, as in nginx. It is never sent.

@@ -12,11 +12,11 @@ from functools import partial
 from types import TracebackType
 from typing import Self
 
-from service.errors import DatabaseUnavailableError, StoreError
+from service.deadlines import FileThreads
 from service.files.blobs import Blobs
-from service.files.threads import FileThreads
-from service.store.inputs import GRACE_SECONDS, InputRows
-from service.store.quotas import Quotas
+from service.problems import DatabaseUnavailableError, StoreError
+from service.store.files import GRACE_SECONDS, InputRows
+from service.store.keys import Quotas
 
 #: Seconds between two renewals. If a process dies, its receipts and partial files expire.
 _RENEWAL_SECONDS = GRACE_SECONDS / 6

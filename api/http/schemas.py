@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from api.http.addresses import address
-from service.files.artifacts import media_type
-from service.parameters import JobName, JobParameters
+from service.files.objects import media_type
+from service.inputs import JobName, JobParameters
 from service.problems import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
 from service.states import UNFINISHED, AttemptOutcome, JobStatus
 from service.store.jobs import ShownJob

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from api.http.documentation import Responses, headers, raises
 from api.http.request_memory import memory
 from service import problems
-from service.files.threads import FileThreads
+from service.deadlines import FileThreads
 from service.problems import SHA256
 
 #: Maximum size in bytes of two chunks. Sending 64 kB at a time takes several times as much CPU time per byte.

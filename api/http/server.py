@@ -13,7 +13,7 @@ import uvicorn
 
 from api.http.app import create_app
 from api.http.connection import Connection, Reader
-from service.startup import start
+from service.settings import start
 
 #: Seconds that open requests have to finish at a shutdown.
 _GRACE = 10

@@ -1,5 +1,5 @@
 // @ts-check
-/** The page of an exported scene. The same file holds its modules and its data; `worker/exported_page.py` writes it. */
+/** The page of an exported scene. The same file holds its modules and its data; `worker/derived.py` writes it. */
 import { Blend } from "./blend.js";
 import { h } from "./dom.js";
 import { Stage } from "./stage.js";

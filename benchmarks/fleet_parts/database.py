@@ -20,13 +20,13 @@ from sqlalchemy import event, insert, text
 
 from benchmarks.fleet_parts.demand import KINDS, Demand
 from benchmarks.fleet_parts.simulation import CHECKPOINT_SECONDS, LEASE_SECONDS, POLL_SECONDS
-from service.files.staging import CHECKPOINT
-from service.scheduling.running import progress_seconds
+from service.inputs import CHECKPOINT
+from service.scheduling.attempts import progress_seconds
 from service.settings import ServiceSettings
 from service.states import Published
 from service.store import Store, open_store
 from service.store.jobs import _JOBS, NewJob
-from service.store.leases import Lease
+from service.store.queue import Lease
 from sgsst_core.progress import Progress
 from tests.postgres import fresh_database, server
 

@@ -21,15 +21,14 @@ from typing import Any
 from sqlalchemy import event
 
 from benchmarks.fleet_parts.demand import SimulatedJob
-from service.files.staging import CHECKPOINT
-from service.scheduling.machine import Machine
-from service.scheduling.packing import Capacity, Grant
-from service.scheduling.selection import lease_next_job
+from service.inputs import CHECKPOINT
+from service.scheduling.capacity import Capacity, Grant, Machine
+from service.scheduling.dispatcher import lease_next_job
 from service.settings import ServiceSettings
 from service.states import Published
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from service.store.leases import Lease
+from service.store.queue import Lease
 
 LEASE_SECONDS, CHECKPOINT_SECONDS, POLL_SECONDS = 30.0, 60.0, 0.5
 #: Seconds after which a host polls again if none of the waiting jobs fits its free GPUs (a real host uses

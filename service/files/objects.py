@@ -1,4 +1,4 @@
-"""File store behind an fsspec URL: a local folder, an S3-compatible bucket, or any other file system of fsspec.
+"""Files behind an fsspec URL (a local folder, an S3-compatible bucket), a cache of them, and the results of jobs there.
 
 Objects are written as a whole, and overwritten only to repair them. Failures of a remote store (unreachable, slow,
 broken) are raised as `StoreError`; errors of a local folder are raised unchanged.
@@ -7,12 +7,19 @@ broken) are raised as `StoreError`; errors of a local folder are raised unchange
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import hashlib
 import logging
+import mimetypes
+import os
+import secrets
+import shutil
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -22,7 +29,11 @@ import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from service import problems
-from service.errors import StoreError
+from service.problems import StoreError
+from service.states import Published
+from sgsst_core.errors import OutputError
+from sgsst_core.files.atomic import atomic_path, file_digest
+from sgsst_core.files.formats import RESULT_FORMATS
 
 #: Limits of each request to S3: timeouts for connecting and for responses in seconds, and number of tries, with
 #: exponential backoff. The S3 client alone retries; retries of fsspec around it would multiply both. A store that
@@ -45,6 +56,25 @@ T = TypeVar("T")
 
 #: File system metadata that change with an object's content: size, times, and inode or ETag.
 Stamp = tuple[Any, ...]
+
+
+@contextlib.contextmanager
+def disk_errors() -> Iterator[None]:
+    """Convert errors of the disk; missing files and a limit of open files are none.
+
+    Raises:
+        NoSpaceError: If the disk or a quota is full, or a file is too large for the file system.
+        StoreError: If the disk fails otherwise, or denies access.
+    """
+    try:
+        yield
+    except (OSError, OutputError) as error:
+        cause = error.__cause__ if isinstance(error, OutputError) else error
+        if not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EMFILE, errno.ENFILE):
+            raise
+        full = cause.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        problem = problems.NO_SPACE if full else problems.STORE_UNAVAILABLE
+        raise problem(f"The service cannot write the file: {cause.strerror}.") from error
 
 
 class TruncatedError(OSError):
@@ -309,3 +339,285 @@ def _changed(entry: dict[str, Any]) -> float:
         return max(modified, float(entry.get("mtime", 0.0)))
     modified = modified or entry.get("mtime")
     return modified.timestamp() if isinstance(modified, datetime) else float(modified or 0.0)
+
+
+#: Number of fetches with a wrong digest after which the file counts as damaged in the store.
+_FETCHES = 2
+#: Age in seconds at which partially fetched files are removed; no fetch takes that long, so their processes have died.
+_PARTIAL_SECONDS = 6 * 3600.0
+#: Error numbers of a full disk.
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+#: Function that copies an object of the store to a file.
+Fetch = Callable[[Path], None]
+
+
+class FileCache:
+    """Cache in a folder.
+
+    Args:
+        folder: Folder of the cache; created if missing.
+        limit: Maximum total size in bytes; files in use are never evicted and may exceed it.
+    """
+
+    def __init__(self, folder: Path, limit: int) -> None:
+        self._files, self._locks, self._partial = folder / "files", folder / "locks", folder / "half"
+        self._limit = limit
+        for path in (self._files, self._locks, self._partial):
+            path.mkdir(parents=True, exist_ok=True)
+
+    def link(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
+        """Hard-link a file to `target`, after fetching it if it is not cached or its cached copy is damaged.
+
+        Args:
+            target: New path on the cache's file system.
+            fetch: Function that copies the file from the store.
+
+        Raises:
+            LostFileError: If the store does not have the file.
+            DamagedFileError: If the fetched file does not match its digest.
+            StoreError: If `fetch` raises it.
+            NoSpaceError: If the disk is full even after evicting all unused files.
+        """
+        if self._link(sha256, target):
+            return
+        with self._locked(sha256[:2]):
+            if self._link(sha256, target):
+                return
+            self._fill(sha256, size, target, fetch)
+        self.evict()
+
+    def adopt(self, source: Path, sha256: str) -> None:
+        """Move a complete, verified file into the cache; if its content is already cached, `source` is deleted."""
+        with self._locked(sha256[:2]):
+            if self._path(sha256).exists():
+                source.unlink()
+            else:
+                self._add(source, sha256)
+        self.evict()
+
+    def evict(self, reserve: int = 0) -> None:
+        """Evict the least recently used files that are not in use.
+
+        Args:
+            reserve: Bytes to leave free below the limit.
+        """
+        if self._total() + reserve <= self._limit:
+            return
+        with self._locked("evict"):
+            total = self._total() + reserve
+            for path, status in sorted(self._entries(), key=lambda entry: entry[1].st_atime_ns):
+                if total <= self._limit:
+                    break
+                if status.st_nlink == 1:
+                    path.unlink(missing_ok=True)
+                    total -= status.st_size
+            for path in self._partial.iterdir():
+                with contextlib.suppress(FileNotFoundError):
+                    # ctime, because a complete file has a synthetic modification time shortly before it is moved
+                    if path.stat().st_ctime < time.time() - _PARTIAL_SECONDS:
+                        path.unlink()
+
+    def free(self, size: int) -> None:
+        """Evict unused files to free `size` bytes of disk space for other purposes."""
+        self.evict(self._limit - self._total() + size)
+
+    def _fill(self, sha256: str, size: int, target: Path, fetch: Fetch) -> None:
+        self.evict(size)
+        partial, digest = self._partial / secrets.token_hex(8), ""
+        try:
+            for _ in range(_FETCHES):
+                self._fetch(partial, fetch)
+                digest = file_digest(partial)
+                if digest == sha256:
+                    os.link(partial, target)  # link first: a file without other links could be evicted
+                    self._add(partial, sha256)
+                    return
+        except FileNotFoundError as error:
+            raise problems.FILE_LOST(sha256=sha256) from error
+        finally:
+            partial.unlink(missing_ok=True)
+        _log.error("file damaged in the store: sha256=%s received=%s", sha256, digest)
+        raise problems.FILE_DAMAGED(sha256=sha256)
+
+    def _fetch(self, partial: Path, fetch: Fetch) -> None:
+        """Fetch a file; if the disk is full, evict all unused files and retry."""
+        try:
+            fetch(partial)
+            return
+        except Exception as error:
+            if not is_full(error):
+                raise
+        partial.unlink(missing_ok=True)
+        self.evict(self._limit)
+        try:
+            fetch(partial)
+        except Exception as error:
+            if is_full(error):
+                raise problems.NO_SPACE(f"The disk of {self._files.parent} is full.") from error
+            raise
+
+    def _add(self, source: Path, sha256: str) -> None:
+        """Move a file into the cache.
+
+        The modification time is derived from the digest, so that it is the same on every host and after every fetch.
+        """
+        seconds = int(sha256[:8], 16)
+        source.chmod(0o400)
+        os.utime(source, ns=(time.time_ns(), seconds * 1_000_000_000))
+        final = self._path(sha256)
+        final.parent.mkdir(exist_ok=True)
+        source.replace(final)
+
+    def _link(self, sha256: str, target: Path) -> bool:
+        path = self._path(sha256)
+        try:
+            os.link(path, target)
+            # the time of last use is set explicitly, because most file systems do not track it reliably
+            os.utime(target, ns=(time.time_ns(), target.stat().st_mtime_ns))
+        except FileNotFoundError:
+            return False
+        if file_digest(target) == sha256:
+            return True
+        _log.error("cached file damaged, fetching it again: path=%s", path)
+        target.unlink()
+        path.unlink(missing_ok=True)
+        return False
+
+    def _path(self, sha256: str) -> Path:
+        return self._files / sha256[:2] / sha256
+
+    def _total(self) -> int:
+        return sum(status.st_size for _, status in self._entries())
+
+    def _entries(self) -> Iterator[tuple[Path, os.stat_result]]:
+        for path in self._files.glob("*/*"):
+            with contextlib.suppress(FileNotFoundError):
+                yield path, path.stat()
+
+    @contextlib.contextmanager
+    def _locked(self, name: str) -> Iterator[None]:
+        """Hold an exclusive lock against other processes and threads; the system releases it if the process dies."""
+        with (self._locks / name).open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+
+def is_full(error: BaseException | None) -> bool:
+    """Return whether an error, or one of its causes, reports a full disk."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+#: Error numbers that mean that a hard link is impossible: different file systems, or no support for hard links.
+_NO_LINKS = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK)
+_MEDIA_TYPES = {
+    **{each.suffix: each.media_type for each in RESULT_FORMATS},
+    ".json": "application/json",
+    ".txt": "text/plain; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+}
+
+
+class Artifacts:
+    """Results in the file store.
+
+    The objects of a job are below a folder with its id. Their names are never reused; database rows refer to the
+    current version of each file.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.objects = ObjectStore(url)
+        self.local = self.objects.local
+        if self.local:
+            Path(self.objects.root).mkdir(parents=True, exist_ok=True)
+
+    @disk_errors()
+    def put(self, job_id: str, epoch: int, name: str, source: Path, *, final: bool = False) -> Published:
+        """Store a result file.
+
+        The file is complete and durable when this function returns. Users can see it once it has a database row.
+
+        Args:
+            final: Whether the content of `source` no longer changes; the path may still be replaced with another file.
+                A final file is hard-linked instead of copied if the file store is on the same file system.
+        """
+        location = f"{job_id}/{epoch}/{secrets.token_hex(6)}/{name}"
+        if not self.local:
+            with _snapshot(source) as snapshot:
+                size, sha256 = snapshot.stat().st_size, file_digest(snapshot)
+                self.objects.put(snapshot, location)
+            return Published(name, location, size, sha256)
+        target = Path(self.objects.root, location)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(target) as temporary:
+            if final:
+                temporary.unlink()
+            if not (final and _link(source, temporary)):
+                shutil.copyfile(source, temporary)
+            size, sha256 = temporary.stat().st_size, file_digest(temporary)
+        return Published(name, location, size, sha256)
+
+    @disk_errors()
+    def fetch(self, location: str, target: Path, sha256: str) -> None:
+        """Copy a result to a local file, atomically.
+
+        Raises:
+            LostFileError: If the file store does not have the result.
+            DamagedFileError: If the received file has a different SHA-256.
+        """
+        try:
+            with atomic_path(target) as temporary:
+                self.objects.get(location, temporary)
+                digest = file_digest(temporary)
+                if digest != sha256:
+                    _log.error("file damaged: name=%s sha256=%s expected=%s", location, digest, sha256)
+                    raise problems.FILE_DAMAGED(sha256=sha256)
+        except FileNotFoundError as error:
+            raise problems.FILE_LOST(sha256=sha256) from error
+
+    def sweep(self, job_id: str, epoch: int, retained: set[str]) -> None:
+        """Remove files that interrupted attempts at a job left behind and that no database row refers to.
+
+        Args:
+            epoch: Latest lease epoch whose files are removed; files of later leases may not have their rows yet.
+            retained: Locations that database rows refer to; their files are not removed.
+        """
+        for location in self.objects.below(job_id):
+            below = location.partition("/")[2]
+            if location not in retained and int(below.partition("/")[0]) <= epoch:
+                self.objects.remove(location)
+
+
+def media_type(name: str) -> str:
+    """Return the media type of a result for HTTP."""
+    known = next((kind for suffix, kind in _MEDIA_TYPES.items() if name.endswith(suffix)), None)
+    return known or mimetypes.guess_type(name)[0] or "application/octet-stream"
+
+
+def _link(source: Path, target: Path) -> bool:
+    """Create a hard link to `source`; return False if the file system does not support that."""
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        return False
+    return True
+
+
+@contextmanager
+def _snapshot(source: Path) -> Iterator[Path]:
+    """Provide a second hard link to a file, so that replacing the file during its upload does not affect the upload."""
+    link = source.with_name(f".{secrets.token_hex(6)}-{source.name}")
+    if not _link(source, link):
+        yield source
+        return
+    try:
+        yield link
+    finally:
+        link.unlink(missing_ok=True)

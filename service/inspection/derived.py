@@ -17,27 +17,24 @@ from pathlib import Path
 from typing import Any
 
 from service import problems
-from service.deadlines import suspended
-from service.errors import LostFileError
-from service.files.artifacts import Artifacts
+from service.deadlines import FileThreads, suspended
 from service.files.blobs import Blobs
-from service.files.staging import RESULT, Staged, stage
-from service.files.threads import FileThreads
+from service.files.objects import Artifacts
+from service.inputs import RESULT, Staged, WorkRequest, stage, stored_parameters
 from service.inspection.inspector import (
     MEMORY_PER_BYTE,
     InspectionProcess,
+    Lanes,
     Show,
     findings_of,
     threads_of_a_job,
     working_folder,
 )
-from service.inspection.lanes import Lanes
-from service.inspection.work import WorkRequest
-from service.parameters import stored_parameters
+from service.problems import LostFileError
 from service.settings import ServiceSettings
 from service.states import Published
 from service.store import Store
-from service.store.quotas import Quotas
+from service.store.keys import Quotas
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import result_name
 from sgsst_core.files.formats.scene_format import SceneFormat
@@ -149,7 +146,7 @@ class DerivedFiles:
         """Return the HTML page that shows a job's result in 3D, beside its scene if both have the same Gaussians.
 
         Args:
-            viewer: Sources of the page; see `worker.exported_page`.
+            viewer: Sources of the page; see `worker.derived`.
         """
         return await self._existing(job, PAGE) or await self._derived(
             job, PAGE, lambda: self._write_page(job, viewer, quotas)

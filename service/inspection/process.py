@@ -31,12 +31,9 @@ import psutil
 import torch
 
 from service import problems
-from service.files.staging import ROLES, Staged
+from service.inputs import ROLES, JobParameters, Staged, WorkRequest, job_spec
 from service.inspection.sandbox import confine, installation
-from service.inspection.work import WorkRequest
-from service.optional import install_command
-from service.parameters import JobParameters
-from service.request import job_spec
+from service.settings import install_command
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders, load_registries
 from sgsst_core.devices import seconds_left
@@ -57,15 +54,12 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.planner import estimate
 from worker.capture import choose_axes, orbit_request
-from worker.derive import blend, convert
-from worker.exported_page import write_page
-from worker.inputs import Inputs, errors_of, read_inputs
+from worker.derived import VideoRequest, blend, convert, render_video, write_page
+from worker.inputs import Inputs, cropped, errors_of, read_inputs
 from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo
 from worker.prepare import dry_run
 from worker.processes import die_with_parent, process_start
-from worker.selecting import cropped
-from worker.video import VideoRequest, render_video
 
 with contextlib.suppress(ImportError):
     import av  # noqa: F401  # before the first fork, so that every child has it

@@ -17,14 +17,10 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import BaseModel
-
-from service.files.staging import PLAN
-from service.scheduling.endings import OUTAGE, Ending, Report, cause_of_error, outage
-from service.scheduling.store_workplace import StoreWorkplace
+from service.inputs import PLAN
+from service.scheduling.messages import OUTAGE, Ending, Report, Task, cause_of_error, outage
 from service.states import AttemptOutcome, Cause
 from sgsst_core.progress import Progress
-from worker.job import JobSpec
 from worker.processes import die_with_parent, process_start
 
 if TYPE_CHECKING:
@@ -35,26 +31,6 @@ if TYPE_CHECKING:
 _NICENESS = 5
 #: Folder of previews, relative to the attempt's folder.
 _PREVIEWS = Path("out", "previews")
-
-
-class Task(BaseModel):
-    """Content of `task.json`.
-
-    Attributes:
-        spec: Specification of the job, with paths relative to the folder. Whether it resumes depends on a checkpoint,
-            which is in `out` or in the workplace and may turn out to be unusable.
-        workers: Maximum number of ranks; 1 runs the job in this process alone.
-        cluster: Whether to run even a single rank on the Ray cluster.
-        workplace: Description of the job's files for ranks on machines that share no folder with this one; None if all
-            ranks share the folder.
-    """
-
-    spec: JobSpec
-    workers: int
-    cluster: bool
-    checkpoint_seconds: float
-    preview_seconds: float
-    workplace: StoreWorkplace | None = None
 
 
 class AttemptProcess:

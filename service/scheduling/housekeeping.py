@@ -1,21 +1,33 @@
-"""Housekeeping of the file store: deletion of expired files and of files that no database row refers to.
+"""Agreement of files and database: periodic housekeeping by dispatchers, and the check and repair by `sgsst fsck`.
 
 Files of failed attempts are swept when their job ends. Stray files come from interrupted attempts that stored another
-file after the job had already ended elsewhere.
+file after the job had already ended elsewhere. Both are safe while the service is running.
 """
 
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
 
-from service.errors import NotFoundError
-from service.files.artifacts import Artifacts
-from service.files.blobs import Blobs
+from sqlalchemy import Select, delete, exists, select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute
+
+from service.files.blobs import BLOBS, UPLOADS, Blobs, open_blobs
+from service.files.objects import Artifacts, ObjectStore
+from service.inputs import CHECKPOINT
+from service.problems import NotFoundError
 from service.scheduling.publishing import sweep
+from service.settings import ServiceSettings
 from service.states import UNFINISHED
 from service.store import Store
+from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadPartRow, UploadRow
 
 #: Interval between rounds of housekeeping, and between searches for stray files, in seconds.
 _ROUND_SECONDS, _STRAY_SEARCH_SECONDS = 60.0, 3600.0
@@ -95,3 +107,232 @@ def strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
         return unknown
     # the running attempt may still write rows; earlier ones cannot
     return [name for name in unknown if int(name.split("/")[1]) < job.lease_epoch]
+
+
+#: Rows per query, and number of files that are read concurrently.
+_PAGE, _AT_A_TIME = 500, 4
+#: Minimum age of an orphan in seconds; younger files may not have their database row yet. The limit for remote file
+#: stores is longer, because their clocks may differ from this machine's.
+_ORPHAN_SECONDS, _REMOTE_ORPHAN_SECONDS = 3600.0, 6 * 3600.0
+#: Folder of a file store to which damaged files are moved.
+QUARANTINE = "quarantine"
+
+Kind = Literal["missing", "damaged", "orphaned"]
+What = Literal["input", "result", "checkpoint", "upload"]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """File that is inconsistent with the database.
+
+    Attributes:
+        name: Name of the file in the file store or in the data folder.
+        mended: Description of the repair; empty if nothing was done.
+    """
+
+    kind: Kind
+    what: What
+    name: str
+    holders: tuple[str, ...] = ()
+    mended: str = ""
+
+
+@dataclass(frozen=True)
+class _File:
+    """File that a row refers to.
+
+    Attributes:
+        is_current: Callback that returns whether the row still refers to the file.
+        forget: Callback that deletes the row if possible and returns what happened.
+    """
+
+    what: What
+    objects: ObjectStore
+    name: str
+    fault: Callable[[], Literal["missing", "damaged"] | None]
+    is_current: Callable[[], bool]
+    forget: Callable[[], str]
+    holders: Callable[[], tuple[str, ...]]
+
+
+class FileCheck:
+    """Check of all files of a database and its file stores."""
+
+    def __init__(self, settings: ServiceSettings, store: Store) -> None:
+        self._store, self._database = store, store.database
+        self._artifacts = Artifacts(settings.artifacts_url)
+        self._blobs = open_blobs(settings, store.inputs, self._artifacts)
+        self._objects = self._blobs.objects
+        #: Number of files read so far.
+        self.checked = 0
+
+    def findings(self, *, mend: bool = False) -> Iterator[Fault]:
+        """Yield all files that are inconsistent with the database.
+
+        Args:
+            mend: Whether to repair: move damaged files to `QUARANTINE`, delete unused rows whose files are gone, and
+                delete orphans.
+        """
+        with ThreadPoolExecutor(_AT_A_TIME) as pool:
+            for files in self._pages():
+                for finding in pool.map(lambda file: self._examine(file, mend=mend), files):
+                    self.checked += 1
+                    if finding is not None:
+                        yield finding
+        for objects, what, name in self._unknown():
+            if mend:
+                objects.remove(name)
+            yield Fault("orphaned", what, name, mended="deleted" if mend else "")
+
+    def _examine(self, file: _File, *, mend: bool) -> Fault | None:
+        # The second check rules out that a running service has just replaced or removed the file and its row.
+        kind = file.fault() and file.is_current() and file.fault()
+        if not kind:
+            return None
+        finding = Fault(kind, file.what, file.name, file.holders())
+        if not mend:
+            return finding
+        done = ""
+        if kind == "damaged":
+            target = f"{QUARANTINE}/{file.name.replace('/', '_')}-{secrets.token_hex(3)}"
+            file.objects.move(file.name, target)
+            done = f"moved to {target}; "
+        return replace(finding, mended=done + file.forget())
+
+    # --- files that rows refer to ----------------------------------------------------------------------------------
+
+    def _pages(self) -> Iterator[Sequence[_File]]:
+        """Yield files page by page in row order, so that a table of any length takes bounded memory."""
+        unfinished = UploadRow.sha256.is_(None) & (UploadRow.offset > 0)
+        for blobs in self._rows(select(BlobRow), BlobRow.sha256):
+            yield [self._input(row) for row in blobs]
+        for artifacts in self._rows(select(ArtifactRow), ArtifactRow.job_id, ArtifactRow.name):
+            yield [self._result(row) for row in artifacts]
+        for uploads in self._rows(select(UploadRow).where(unfinished), UploadRow.id):
+            yield [file for row in uploads for file in self._parts(row)]
+
+    def _rows(self, query: Select[T], *key: InstrumentedAttribute[str]) -> Iterator[Sequence[T]]:
+        """Yield pages of the rows that a query selects, ordered by columns that identify a row."""
+        after = ("",) * len(key)
+        while rows := self._page(query.where(tuple_(*key) > after).order_by(*key).limit(_PAGE)):
+            yield rows
+            after = tuple(getattr(rows[-1], column.key) for column in key)
+
+    def _page(self, query: Select[T]) -> Sequence[T]:
+        with self._database.reading() as session:
+            return session.scalars(query).all()
+
+    def _input(self, row: BlobRow) -> _File:
+        name = f"{BLOBS}/{row.location}"
+
+        def is_current() -> bool:
+            now = self._store.inputs.blobs([row.sha256]).get(row.sha256)
+            return now is not None and now.location == row.location
+
+        def holders() -> tuple[str, ...]:
+            with self._database.reading() as session:
+                query = select(BlobUseRow.holder).where(BlobUseRow.sha256 == row.sha256).order_by(BlobUseRow.holder)
+                return tuple(session.scalars(query))
+
+        def forget() -> str:
+            used = exists().where(BlobUseRow.sha256 == row.sha256)
+            with self._database.writing() as session:
+                deleted = session.execute(
+                    delete(BlobRow).where(BlobRow.sha256 == row.sha256, BlobRow.location == row.location, ~used)
+                )
+                return "its row is deleted" if deleted.rowcount else "it comes back when it is sent again"  # type: ignore[attr-defined]
+
+        return _File(
+            "input", self._objects, name, lambda: self._objects.fault(name, row.sha256), is_current, forget, holders
+        )
+
+    def _result(self, row: ArtifactRow) -> _File:
+        objects = self._artifacts.objects
+
+        def is_current() -> bool:
+            now = self._store.jobs.artifact(row.job_id, row.name)
+            return now is not None and now.location == row.location
+
+        def forget() -> str:
+            same = (ArtifactRow.job_id == row.job_id) & (ArtifactRow.name == row.name)
+            with self._database.writing() as session:
+                session.execute(delete(ArtifactRow).where(same, ArtifactRow.location == row.location))
+            return "its row is deleted"
+
+        return _File(
+            "checkpoint" if row.name == CHECKPOINT else "result",
+            objects,
+            row.location,
+            lambda: objects.fault(row.location, row.sha256),
+            is_current,
+            forget,
+            lambda: (f"job:{row.job_id}",),
+        )
+
+    def _parts(self, row: UploadRow) -> list[_File]:
+        """Return the files that hold the bytes of an unfinished upload."""
+
+        def is_current() -> bool:
+            with self._database.reading() as session:
+                now = session.get(UploadRow, row.id)
+                return now is not None and now.sha256 is None
+
+        def forget() -> str:
+            self._store.inputs.delete_upload(row.id, row.owner)
+            return "the upload is deleted"
+
+        def part(name: str, size: int) -> _File:
+            return _File(
+                "upload",
+                self._objects,
+                name,
+                lambda: None if self._objects.size(name) >= size else "missing",
+                is_current,
+                forget,
+                lambda: (f"upload:{row.id}",),
+            )
+
+        if self._objects.local:
+            return [part(f"{UPLOADS}/{row.id}.part", row.offset)]
+        return [part(each.location, each.size) for each in self._store.inputs.parts(row.id)]
+
+    # --- files that no row refers to -------------------------------------------------------------------------------
+
+    def _unknown(self) -> Iterator[tuple[ObjectStore, What, str]]:
+        """Yield files that no database row refers to or will refer to.
+
+        Files are listed before rows are read, so that the row of every listed file is already visible.
+        """
+        blobs = self._old(self._objects, BLOBS)
+        known = {f"{BLOBS}/{location}" for location in self._store.inputs.locations()}
+        yield from ((self._objects, "input", name) for name in blobs if name not in known)
+        for name in self._old(self._objects, UPLOADS):
+            if self._is_orphaned_part(name):
+                yield self._objects, "upload", name
+        incoming = ObjectStore(f"file://{self._blobs.incoming}")
+        yield from ((incoming, "upload", name) for name in self._old(incoming, ""))
+        yield from self._unknown_results()
+
+    def _is_orphaned_part(self, name: str) -> bool:
+        upload_id = name.split("/")[1].removesuffix(".part")
+        with self._database.reading() as session:
+            row = session.get(UploadRow, upload_id)
+            if row is None or row.sha256 is not None:
+                return True
+            known = UploadPartRow.location == name
+            return not self._objects.local and session.scalar(select(exists().where(known))) is False
+
+    def _unknown_results(self) -> Iterator[tuple[ObjectStore, What, str]]:
+        objects = self._artifacts.objects
+        jobs: defaultdict[str, list[str]] = defaultdict(list)
+        for name in self._old(objects, ""):
+            job_id = name.partition("/")[0]
+            if job_id.startswith("job_"):
+                jobs[job_id].append(name)
+        for job_id, names in jobs.items():
+            yield from ((objects, "result", name) for name in strays_of_job(self._store, job_id, names))
+
+    def _old(self, objects: ObjectStore, folder: str) -> list[str]:
+        before = time.time() - (_ORPHAN_SECONDS if objects.local else _REMOTE_ORPHAN_SECONDS)
+        return sorted(name for name, changed in objects.below(folder).items() if changed < before)

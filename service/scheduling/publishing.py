@@ -13,13 +13,12 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from service.errors import NoSpaceError, ServiceError, StoreError
-from service.files.artifacts import Artifacts
-from service.files.blobs import disk_errors
-from service.files.staging import CHECKPOINT, RESULT
+from service.files.objects import Artifacts, disk_errors
+from service.inputs import CHECKPOINT, RESULT
+from service.problems import NoSpaceError, ServiceError, StoreError
 from service.states import Published
 from service.store import Store
-from service.store.leases import LIVE, Lease
+from service.store.queue import LIVE, Lease
 
 #: Length of the log's end in the error of a crash, in bytes.
 _LOG_TAIL = 2000

@@ -23,15 +23,13 @@ from pathlib import Path
 from typing import Any
 
 from service import problems
-from service.errors import DamagedFileError, LostFileError, ServiceError
-from service.files.artifacts import Artifacts
-from service.files.objects import ObjectStore
-from service.files.staging import RESULT, stage
-from service.files.stored_blobs import open_cache
+from service.files.blobs import open_cache
+from service.files.objects import Artifacts, ObjectStore
+from service.inputs import RESULT, stage
+from service.problems import DamagedFileError, LostFileError, ServiceError
+from service.scheduling.messages import StoredFile, StoreWorkplace
 from service.scheduling.publishing import Outbox, put_patiently
-from service.scheduling.store_workplace import StoredFile, StoreWorkplace
-from service.settings import ServiceSettings, read_settings
-from service.startup import keep_private
+from service.settings import ServiceSettings, keep_private, read_settings
 from service.states import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.weight_files import cache_folder

@@ -21,7 +21,7 @@ from service import problems
 from service.outgoing import parse_url, send
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.changes import PROGRESS_MESSAGE
+from service.store.jobs import PROGRESS_MESSAGE
 from service.store.operations import Delivery
 
 #: Delays before further attempts in seconds: the schedule that Standard Webhooks suggests, up to a day.

@@ -5,16 +5,14 @@ from __future__ import annotations
 import logging
 import time
 
-from service.errors import DatabaseUnavailableError
+from service.problems import DatabaseUnavailableError
 from service.settings import ServiceSettings
-from service.store.access import Keys, Sessions, ShareLinks
 from service.store.database import ANSWER_SECONDS, Clock, Database
-from service.store.inputs import InputRows
-from service.store.jobs import Jobs
-from service.store.leases import Leases
-from service.store.operations import Operations
-from service.store.retention import Retention
-from service.store.retries import RetryPolicy
+from service.store.files import InputRows
+from service.store.jobs import Jobs, ShareLinks
+from service.store.keys import Keys, Sessions
+from service.store.operations import Operations, Retention
+from service.store.queue import Leases, RetryPolicy
 
 #: Interval between attempts to connect to an unavailable database, in seconds.
 _RETRY_SECONDS = 1.0

@@ -1,12 +1,26 @@
-"""Operations of users on their jobs: create, list, rename, finish, cancel, retry, delete; their files and events."""
+"""Jobs of users: create, list, rename, finish, cancel, retry, delete; their inputs, files, events, history and shares.
+
+Changes that dispatchers make too are functions that run within the caller's transaction. Every transaction takes its
+locks in one order, so that no two wait for each other: the owner's limits, uploads by id, jobs by id, then the rows of
+each job, blobs by digest, counters.
+
+The loss history is thinned as it is written: a point is stored when the job's running time has grown by one percent
+since the previous one, so points are evenly spaced on the logarithmic time axis of loss charts (784 for 25 hours). If a
+job with many attempts has too many, every second one is deleted.
+"""
 
 from __future__ import annotations
 
+import hmac
+import json
+import re
+import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
-from sqlalchemy import Connection, Float, String, bindparam, delete, func, insert, select, tuple_
+from sqlalchemy import Connection, Float, String, TextClause, bindparam, delete, func, insert, select, text, tuple_
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -22,13 +36,248 @@ from service.states import (
     allowed,
     next_status,
 )
-from service.store import job_inputs
-from service.store.changes import add_status_event, end, forget, holder_name, job_of_owner, move
-from service.store.database import Database, count, idempotency_row, new_id
-from service.store.history import points
-from service.store.inputs import close_receipt
-from service.store.quotas import NO_QUOTAS, Quotas, check_bytes, count_job, lock_owner
-from service.store.tables import ArtifactRow, AttemptRow, Base, EventRow, JobRow
+from service.store.database import Database, count, idempotency_row, new_id, upsert
+from service.store.files import close_receipt, release_blobs
+from service.store.keys import NO_QUOTAS, Quotas, check_bytes, count_job, digest, lock_owner
+from service.store.tables import (
+    ArtifactRow,
+    AttemptRow,
+    Base,
+    DeliveryRow,
+    EventRow,
+    JobRow,
+    KeyRow,
+    ProgressPointRow,
+    ShareRow,
+)
+
+#: Type of messages about progress, which are sent once, and a job's message of this type.
+PROGRESS_MESSAGE = "job.progress"
+_WAITING_PROGRESS = (
+    select(DeliveryRow)
+    .where(DeliveryRow.job_id == bindparam("job_id"), DeliveryRow.body["type"].as_string() == PROGRESS_MESSAGE)
+    .with_for_update()
+)
+_EVENTS = Base.metadata.tables[EventRow.__tablename__]
+
+
+def job_of_owner(session: Session, job_id: str, owner: str | None, *, lock: bool = False) -> JobRow:
+    """Return a job of this owner, or of any owner if None.
+
+    Args:
+        lock: Whether to lock the row. Whoever adds rows that refer to the job does so first; it is then not deleted.
+
+    Raises:
+        NoJobError: If there is no such job or it belongs to another owner.
+    """
+    job = session.get(JobRow, job_id, with_for_update=lock, populate_existing=lock)
+    if job is None or (owner is not None and job.owner != owner):
+        raise problems.NO_JOB(job_id=job_id)
+    return job
+
+
+def move(session: Session, job: JobRow, transition: Transition, now: float) -> None:
+    """Change a job's status and add an event for clients that watch the job.
+
+    Raises:
+        TransitionError: If the job's status does not allow the transition.
+    """
+    job.status = next_status(job.status, transition)
+    add_status_event(session, job, now)
+
+
+def end(session: Session, job: JobRow, transition: Transition, now: float, retention: float) -> None:
+    """End a job.
+
+    Args:
+        retention: Time in seconds until its results expire.
+    """
+    status = next_status(job.status, transition)
+    job.finished_at, job.expires_at = now, now + retention
+    job.lease_owner = job.lease_expires_at = None
+    move(session, job, transition, now)
+    count(session, "sgsst_jobs_finished_total", f'status="{status}"')
+    for waiting in session.scalars(_WAITING_PROGRESS, {"job_id": job.id}) if job.webhook_events else ():
+        session.delete(waiting)
+    send_webhook(session, job, "completed", status, now)
+
+
+def send_webhook(session: Session, job: JobRow, event: WebhookEvent, kind: str, now: float, **more: Any) -> None:
+    """Queue a message about an event of a job, if its webhook gets such messages; by default only the last one.
+
+    A message about progress replaces the one before if that still waits to be sent.
+
+    Args:
+        kind: Last part of the message's type.
+        more: Further values about the job.
+    """
+    if not job.webhook or event not in (job.webhook_events or ("completed",)):
+        return
+    data = {"id": job.id, "name": job.name, "status": job.status, "error": job.error, **more}
+    body = {"type": f"job.{kind}", "timestamp": now, "data": data}
+    waiting = session.scalar(_WAITING_PROGRESS, {"job_id": job.id}) if event == "progress" else None
+    if waiting is None:
+        message_id = new_id("msg", now)
+        session.add(DeliveryRow(id=message_id, job_id=job.id, url=job.webhook, body=body, tries=0, next_at=now))
+    elif not waiting.tries:
+        waiting.body = body
+
+
+def add_status_event(session: Session, job: JobRow, now: float) -> None:
+    """Add an event about a job's status."""
+    data: dict[str, Any] = {"status": job.status, "attempt": job.attempt}
+    if job.error:
+        data["error"] = job.error
+    add_event(session, job.id, "status", data, now)
+
+
+def add_event(session: Session, job_id: str, kind: str, data: dict[str, Any], now: float) -> None:
+    """Add an event to a job."""
+    session.execute(insert(_EVENTS), {"job_id": job_id, "kind": kind, "data": data, "created_at": now})
+
+
+def holder_name(job_id: str) -> str:
+    """Return the name under which a job holds its inputs."""
+    return f"job:{job_id}"
+
+
+def forget(session: Session, job: JobRow) -> list[str]:
+    """Delete a job's rows and return the locations of unused inputs, as `release_blobs` does."""
+    unused = release_blobs(session, holder_name(job.id))
+    session.delete(job)  # deletes attempts, events and artifacts by cascade
+    return unused
+
+
+#: Ratio of the running times of consecutive points.
+GROWTH = 1.01
+#: Number of points of a job above which every second one is deleted at the start of an attempt.
+MOST_POINTS = 2000
+
+_POINTS = Base.metadata.tables[ProgressPointRow.__tablename__]
+_OF_JOB = _POINTS.c.job_id == bindparam("job_id")
+_OF_ATTEMPT = _POINTS.c.attempt == bindparam("attempt")
+_LAST = select(_POINTS.c.step, _POINTS.c.seconds).where(_OF_JOB, _OF_ATTEMPT).order_by(_POINTS.c.step.desc()).limit(1)
+_ALL = select(_POINTS.c.progress).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
+_STEPS = select(_POINTS.c.attempt, _POINTS.c.step).where(_OF_JOB).order_by(_POINTS.c.attempt, _POINTS.c.step)
+_COUNT = select(func.count()).where(_OF_JOB)
+
+
+def add_point(session: Session, job_id: str, progress: dict[str, Any]) -> None:
+    """Store a job's progress as a point if one is due; progress without a loss is ignored.
+
+    Args:
+        progress: Progress as stored by `Leases.report_progress`.
+    """
+    if not _is_step(progress):
+        return
+    attempt, step, seconds = progress["attempt"], progress["step"], progress["seconds"]
+    last = session.execute(_LAST, {"job_id": job_id, "attempt": attempt}).one_or_none()
+    if last is None:
+        _halve(session, job_id)
+    elif step <= last.step or seconds < GROWTH * last.seconds:
+        return
+    values = {"job_id": job_id, "attempt": attempt, "step": step, "seconds": seconds, "progress": progress}
+    session.execute(upsert(session)(_POINTS).values(values).on_conflict_do_nothing())
+
+
+def _halve(session: Session, job_id: str) -> None:
+    """Delete every second point of a job that has too many; the first one remains."""
+    if (session.scalar(_COUNT, {"job_id": job_id}) or 0) <= MOST_POINTS:
+        return
+    steps = session.execute(_STEPS, {"job_id": job_id}).all()
+    one = delete(_POINTS).where(_OF_JOB, _OF_ATTEMPT, _POINTS.c.step == bindparam("at"))
+    session.execute(one, [{"job_id": job_id, "attempt": attempt, "at": step} for attempt, step in steps[1::2]])
+
+
+def points(connection: Connection, job_id: str, current: dict[str, Any] | None, most: int) -> list[dict[str, Any]]:
+    """Return a job's loss history: its points, and its current progress as the last one, as in `add_point`.
+
+    Args:
+        current: Current progress of the job; ignored if it is None or has no loss.
+        most: Maximum number of points, at least 2; longer histories are sampled evenly, including both ends.
+    """
+    known: list[dict[str, Any]] = list(connection.execute(_ALL, {"job_id": job_id}).scalars())
+    if current and _is_step(current) and (not known or _position(current) > _position(known[-1])):
+        known.append(current)
+    if len(known) > most:
+        known = [known[number * (len(known) - 1) // (most - 1)] for number in range(most)]
+    return known
+
+
+def _is_step(progress: dict[str, Any]) -> bool:
+    return progress.get("loss") is not None and progress.get("seconds") is not None
+
+
+def _position(progress: dict[str, Any]) -> tuple[int, int]:
+    return progress["attempt"], progress["step"]
+
+
+#: Roles of few files, which are shown with every job.
+NAMED_ROLES = ("scene", "style", "cameras")
+
+#: Table of the entries in `jobs.inputs`, and expressions for the position, the JSON and the role of an entry.
+_ENTRIES = {
+    "sqlite": ("json_each(jobs.inputs) AS entry", "entry.key", "entry.value", "json_extract(entry.value, '$.role')"),
+    "postgresql": (
+        "json_array_elements(jobs.inputs) WITH ORDINALITY AS entry(value, number)",
+        "entry.number - 1",
+        "CAST(entry.value AS TEXT)",
+        "entry.value ->> 'role'",
+    ),
+}
+
+
+def counts_and_named(
+    connection: Connection, job_ids: Sequence[str]
+) -> tuple[dict[str, dict[str, int]], dict[str, list[dict[str, Any]]]]:
+    """Return the number of files by role of each job, and its entries of scene, style images and camera files."""
+    counts: dict[str, dict[str, int]] = {job_id: {} for job_id in job_ids}
+    named: dict[str, list[dict[str, Any]]] = {job_id: [] for job_id in job_ids}
+    if job_ids:
+        of_jobs = {"ids": list(job_ids)}
+        for job_id, role, number in connection.execute(_query(connection, "counts"), of_jobs):
+            counts[job_id][role] = number
+        for job_id, entry in connection.execute(_query(connection, "named"), {**of_jobs, "roles": list(NAMED_ROLES)}):
+            named[job_id].append(json.loads(entry))
+    return counts, named
+
+
+def page_of_inputs(connection: Connection, job_id: str, start: int, limit: int) -> list[tuple[int, dict[str, Any]]]:
+    """Return a job's entries from a position on, each with its index among those of its role."""
+    rows = connection.execute(_query(connection, "page"), {"ids": [job_id], "start": start, "most": limit})
+    return [(index, json.loads(entry)) for index, entry in rows]
+
+
+def one_input(connection: Connection, job_id: str, role: str, index: int) -> dict[str, Any] | None:
+    """Return a job's entry by its role and its index among those of the role; None if there is none."""
+    parameters = {"ids": [job_id], "roles": [role], "index": index}
+    entry = connection.execute(_query(connection, "one"), parameters).scalar()
+    return None if entry is None else dict(json.loads(entry))
+
+
+def _query(connection: Connection, name: str) -> TextClause:
+    return _queries(connection.dialect.name)[name]
+
+
+@cache
+def _queries(dialect: str) -> dict[str, TextClause]:
+    table, position, value, role = _ENTRIES[dialect]
+    of_jobs = f"FROM jobs, {table} WHERE jobs.id IN :ids"
+    of_role = f"{of_jobs} AND {role} IN :roles ORDER BY jobs.id, {position}"
+    index = f"row_number() OVER (PARTITION BY {role} ORDER BY {position}) - 1"
+    texts = {
+        "counts": f"SELECT jobs.id, {role}, count(*) {of_jobs} GROUP BY jobs.id, {role}",
+        "named": f"SELECT jobs.id, {value} {of_role}",
+        "one": f"SELECT {value} {of_role} LIMIT 1 OFFSET :index",
+        "page": f"SELECT number, value FROM (SELECT {position} AS position, {value} AS value, {index} AS number "
+        f"{of_jobs}) AS entries WHERE position >= :start ORDER BY position LIMIT :most",
+    }
+    lists = {name: [each for each in ("ids", "roles") if f":{each}" in text_] for name, text_ in texts.items()}
+    return {
+        name: text(text_).bindparams(*(bindparam(each, expanding=True) for each in lists[name]))
+        for name, text_ in texts.items()
+    }
+
 
 _JOBS, _ATTEMPTS, _ARTIFACTS, _BLOB_USES = (
     Base.metadata.tables[name] for name in ("jobs", "attempts", "artifacts", "blob_uses")
@@ -54,6 +303,11 @@ _EARLIER = _QUEUED.where(
 )
 #: Number of the queued jobs ahead of a job, in two ranges of the queue's index.
 _AHEAD = select(_HIGHER.scalar_subquery() + _EARLIER.scalar_subquery())
+
+
+#: Maximum number of shares of a job that have not expired.
+MOST_SHARES = 20
+_TOKEN = re.compile(r"(shr_[0-9a-f]{20,36})\.[A-Za-z0-9_-]{43}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -190,12 +444,12 @@ class Jobs:
     def input_page(self, job_id: str, start: int, limit: int) -> list[tuple[int, dict[str, Any]]]:
         """Return a job's inputs from a position on, each with its index among those of its role."""
         with self._database.reading_rows() as connection:
-            return job_inputs.page(connection, job_id, start, limit)
+            return page_of_inputs(connection, job_id, start, limit)
 
     def input(self, job_id: str, role: str, index: int) -> dict[str, Any] | None:
         """Return an input of a job by its role and its index among those of the role; None if there is none."""
         with self._database.reading_rows() as connection:
-            return job_inputs.one(connection, job_id, role, index)
+            return one_input(connection, job_id, role, index)
 
     def detail(self, job_id: str, owner: str | None) -> tuple[ShownJob, list[AttemptRow]]:
         """Return a job as it is shown, and its attempts, all in one snapshot."""
@@ -395,7 +649,7 @@ def _check_queue(session: Session, owner: str, limit: int) -> None:
 
 def _shown(connection: Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:
     """Return jobs as users see them, in the same snapshot."""
-    counts, inputs = job_inputs.counts_and_named(connection, [job.id for job in jobs])
+    counts, inputs = counts_and_named(connection, [job.id for job in jobs])
     started = [job.id for job in jobs if job.attempt]
     rows = connection.execute(_NEWEST_PREVIEWS, {"ids": started}) if started else ()
     previews = {row.job_id: row.newest for row in rows}
@@ -410,3 +664,86 @@ def _queue_position(connection: Connection, job: JobRow) -> int | None:
         return None
     own = {"priority": job.priority, "queued_at": job.queued_at, "job_id": job.id}
     return 1 + int(connection.execute(_AHEAD, own).scalar_one())
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Valid share, with its job."""
+
+    share: ShareRow
+    job: JobRow
+
+
+class ShareLinks:
+    """Links to shared results."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(self, job_id: str, owner: str, seconds: float) -> tuple[ShareRow, str]:
+        """Share the result of a job; return the share and the only copy of its token.
+
+        Args:
+            seconds: Lifetime of the share.
+
+        Raises:
+            NoJobError: If there is no such job or it belongs to another owner.
+            NO_RESULT: If the job has no result.
+            TOO_MANY_SHARES: If the job has `MOST_SHARES` shares.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = job_of_owner(session, job_id, owner, lock=True)  # which a deletion then waits for
+            if job.status != JobStatus.SUCCEEDED:
+                raise problems.NO_RESULT(job_status=job.status)
+            of_job = ShareRow.job_id == job_id
+            session.execute(delete(ShareRow).where(of_job, ShareRow.expires_at <= now))
+            valid = select(func.count()).select_from(ShareRow).where(of_job)
+            if (session.scalar(valid) or 0) >= MOST_SHARES:
+                raise problems.TOO_MANY_SHARES(limit=MOST_SHARES)
+            row = ShareRow(id=new_id("shr", now), job_id=job_id, created_at=now, expires_at=now + seconds)
+            token = f"{row.id}.{secrets.token_urlsafe(32)}"
+            row.sha256 = digest(token)
+            session.add(row)
+        return row, token
+
+    def of_job(self, job_id: str) -> Sequence[ShareRow]:
+        """Return the shares of a job that have not expired, oldest first."""
+        now = self._database.clock()
+        with self._database.reading() as session:
+            query = select(ShareRow).where(ShareRow.job_id == job_id, ShareRow.expires_at > now)
+            return session.scalars(query.order_by(ShareRow.id)).all()
+
+    def revoke(self, job_id: str, share_id: str) -> None:
+        """Delete a share, so that its link no longer works.
+
+        Raises:
+            NoShareError: If the job has no such share.
+        """
+        with self._database.writing() as session:
+            row = session.get(ShareRow, share_id, with_for_update=True)
+            if row is None or row.job_id != job_id:
+                raise problems.NO_SHARE()
+            session.delete(row)
+
+    def find(self, token: str) -> Shared:
+        """Return the share with this token, and its job.
+
+        Raises:
+            NoShareError: If there is none, it has expired or was revoked, its job has no result any more, or the key of
+                its owner was revoked.
+        """
+        match = _TOKEN.fullmatch(token)
+        if match is None:
+            raise problems.NO_SHARE()
+        with self._database.reading() as session:
+            row = session.get(ShareRow, match[1])
+            # compared in constant time, so that the time of the answer tells nothing about the digest
+            if row is None or not hmac.compare_digest(row.sha256, digest(token)):
+                raise problems.NO_SHARE()
+            job = session.get_one(JobRow, row.job_id)  # both are of one snapshot
+            key = session.get(KeyRow, job.owner)
+            revoked = key is not None and key.revoked_at is not None
+            if row.expires_at <= self._database.clock() or job.status != JobStatus.SUCCEEDED or revoked:
+                raise problems.NO_SHARE()
+            return Shared(row, job)

@@ -1,4 +1,4 @@
-"""Data for monitoring and webhooks in the store: dispatchers, counters, secrets and messages."""
+"""Data for monitoring, webhooks and housekeeping: dispatchers, counters, secrets, messages, and expired jobs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,35 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, SQLColumnExpression, bindparam, case, delete, func, literal, select, text
+from sqlalchemy import (
+    ColumnElement,
+    SQLColumnExpression,
+    and_,
+    bindparam,
+    case,
+    delete,
+    func,
+    literal,
+    select,
+    text,
+    update,
+)
 
 from service import problems
-from service.states import JobStatus
-from service.store.database import Database, upsert
-from service.store.tables import Base, CounterRow, DeliveryRow, DispatcherRow, JobRow, SecretRow
+from service.states import FINISHED, JobStatus, Transition
+from service.store.database import IDEMPOTENCY_SECONDS, Database, upsert
+from service.store.jobs import forget, holder_name, move
+from service.store.tables import (
+    ArtifactRow,
+    Base,
+    BlobUseRow,
+    CounterRow,
+    DeliveryRow,
+    DispatcherRow,
+    IdempotencyRow,
+    JobRow,
+    SecretRow,
+)
 
 _JOBS = Base.metadata.tables[JobRow.__tablename__]
 #: Live dispatchers: those with a heartbeat within a lease duration. A heartbeat far in the future comes from a wrong
@@ -179,3 +202,55 @@ class Operations:
                 session.delete(row)
             else:
                 row.next_at = self._database.clock() + wait_seconds
+
+
+#: Time in seconds after which a dispatcher without heartbeat is forgotten.
+_FORGET_SECONDS = 86_400.0
+
+
+class Retention:
+    """Housekeeping of the store, which any dispatcher may do.
+
+    Args:
+        retention: Time in seconds until results expire; the record of an expired job is deleted after another such
+            period.
+    """
+
+    def __init__(self, database: Database, retention: float) -> None:
+        self._database = database
+        self._retention = retention
+
+    def expire(self) -> list[str]:
+        """Expire old results, and delete the records of jobs that expired long ago.
+
+        Returns:
+            Ids of jobs whose files are to be removed.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            old = select(JobRow).where(JobRow.expires_at < now).order_by(JobRow.id).limit(100)
+            due = session.scalars(old.with_for_update(skip_locked=True)).all()
+            for job in due:
+                if job.status == JobStatus.EXPIRED:
+                    forget(session, job)
+                    continue
+                job.expires_at = now + self._retention
+                session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
+                # blobs without other holders are collected later
+                session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))
+                move(session, job, Transition.EXPIRE, now)
+            session.execute(delete(DispatcherRow).where(DispatcherRow.seen_at < now - _FORGET_SECONDS))
+            session.execute(delete(IdempotencyRow).where(IdempotencyRow.created_at < now - IDEMPOTENCY_SECONDS))
+            return [job.id for job in due]
+
+    def unswept(self, limit: int) -> list[tuple[str, int]]:
+        """Return ended jobs that may have files without database rows, each with the epoch of its last lease."""
+        query = select(JobRow.id, JobRow.lease_epoch).where(JobRow.swept.is_(False), JobRow.status.in_(FINISHED))
+        with self._database.reading() as session:
+            return [(job_id, epoch) for job_id, epoch in session.execute(query.limit(limit))]
+
+    def mark_swept(self, job_id: str, epoch: int) -> None:
+        """Mark a job as having no files without rows, unless it has been queued again."""
+        same = and_(JobRow.id == job_id, JobRow.lease_epoch == epoch, JobRow.status.in_(FINISHED))
+        with self._database.writing() as session:
+            session.execute(update(JobRow).where(same).values(swept=True))

@@ -1,13 +1,22 @@
-"""Queries for the next job, which every dispatcher runs continually.
+"""The queue: which job is next, leases of jobs by dispatchers, and the policy for repeating attempts.
+
+A dispatcher holds a lease of each job that it runs. A lease lasts some seconds unless it is renewed. Each lease of a
+job has a number, its epoch. Every write of a dispatcher names the epoch that it holds, and raises `LeaseLostError`
+without effect if the job has been leased again since. Two dispatchers may thus both believe that they run a job, but
+only one of them can write.
 
 The queue may have tens of thousands of jobs, most of them of a few owners. Only the first job of each owner can be
-next. The query therefore steps from owner to owner in an index and compares only their first jobs: the time grows with
-the number of waiting owners, not of jobs.
+next. The query therefore steps from owner to owner in an index: its time grows with the number of waiting owners.
+
+Only the job's own failures count against it. An attempt that a machine, the network, the database, the disk or the file
+store has ended is repeated until it succeeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import (
@@ -20,15 +29,25 @@ from sqlalchemy import (
     and_,
     bindparam,
     case,
+    delete,
     func,
     or_,
     select,
     union_all,
+    update,
 )
 from sqlalchemy.orm import Session, aliased, undefer
 
-from service.states import ACTIVE, JobStatus
-from service.store.tables import JobRow, TurnRow
+from service import problems
+from service.problems import ServiceError
+from service.states import ACTIVE, AttemptOutcome, Cause, JobStatus, Published, Transition
+from service.store.database import Database, count, observe, upsert
+from service.store.jobs import add_event, add_point, end, move, send_webhook
+from service.store.keys import count_gpu_seconds
+from service.store.tables import ArtifactRow, AttemptRow, DispatcherRow, EventRow, JobRow, ProgressPointRow, TurnRow
+from sgsst_core.errors import InfrastructureError
+from sgsst_core.progress import Progress
+from worker.job import CONTINUABLE
 
 #: Maximum number of candidates, each of another owner.
 _MOST_CANDIDATES = 16
@@ -91,3 +110,460 @@ def next_jobs(session: Session, now: float) -> Sequence[JobRow]:
     ids = [job_id for job_id in session.scalars(_CANDIDATES, {"now": now}) if job_id is not None]
     # a separate statement: inside one query, PostgreSQL overestimates the candidates and reads all jobs
     return session.scalars(_FIRST, {"now": now, "candidates": ids}).all() if ids else []
+
+
+#: Maximum delay between attempts in seconds; the delay doubles up to this limit.
+MAX_RETRY_SECONDS = 300.0
+#: Number of attempts in a row without a step that were lost with their dispatcher, after which a job fails. The
+#: dispatcher may have died of the job itself: some container runtimes end all processes of a container that has run out
+#: of memory.
+MAX_LOSSES = 10
+#: Code of the error of an attempt that was lost with its dispatcher.
+DISPATCHER_LOST = "dispatcher-lost"
+
+
+def cause_of(error: Mapping[str, Any] | None) -> Cause:
+    """Return the cause of an attempt's end from its recorded error."""
+    code = (error or {}).get("code")
+    if code == DISPATCHER_LOST:
+        return Cause.DISPATCHER
+    return Cause((error or {}).get("cause", Cause.MACHINE)) if code == InfrastructureError.code else Cause.JOB
+
+
+@dataclass(frozen=True)
+class FailureCount:
+    """Count of consecutive failed attempts without progress.
+
+    Attributes:
+        failed_step: Last saved step at the time of the last failure; None for no step.
+    """
+
+    failures: int
+    failed_step: int | None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Decision about a job.
+
+    Attributes:
+        transition: STOP, FAIL or REQUEUE.
+        count: New count of failures for the job's record.
+        wait: Delay in seconds before the job may be taken again.
+    """
+
+    transition: Transition
+    count: FailureCount
+    wait: float = 0.0
+
+
+@dataclass(frozen=True)
+class RetryPolicy:
+    """Policy for retrying jobs.
+
+    Attributes:
+        max_attempts: Consecutive attempts without progress after which a job fails.
+        retry_seconds: Delay after the first failure in seconds; it doubles with each further one, up to
+            `MAX_RETRY_SECONDS`.
+    """
+
+    max_attempts: int
+    retry_seconds: float
+
+    def after_attempt(
+        self,
+        outcome: AttemptOutcome,
+        status: JobStatus,
+        count: FailureCount,
+        saved_step: int | None,
+        causes: Sequence[Cause] = (Cause.JOB,),
+        *,
+        permanent: bool = False,
+    ) -> Verdict:
+        """Decide whether a job is retried after an attempt that failed, was lost or was released.
+
+        Args:
+            causes: Cause of the attempt's end, then those of earlier attempts back to the last one that made a step.
+            status: Status of the job while the attempt ran.
+            count: Count of failures before this attempt.
+            saved_step: Last saved step of the job; None for no step.
+            permanent: Whether another attempt would fail in the same way.
+        """
+        if status == JobStatus.CANCELING:
+            return Verdict(Transition.STOP, count)
+        if outcome == AttemptOutcome.RELEASED:
+            return Verdict(Transition.REQUEUE, count)
+        if causes[0] == Cause.JOB:
+            # progress resets the count: a long job survives many sporadic failures, but not one at the same step again
+            progress = (saved_step or 0) > (count.failed_step or 0)
+            count = FailureCount(0 if progress else count.failures + 1, saved_step)
+            failed, repeated = permanent or count.failures >= self.max_attempts, count.failures
+        else:
+            failed = list(causes[:MAX_LOSSES]) == [Cause.DISPATCHER] * MAX_LOSSES
+            repeated = next((number for number, cause in enumerate(causes) if cause == Cause.JOB), len(causes))
+        if failed:
+            return Verdict(Transition.FAIL, count)
+        wait = min(self.retry_seconds * 2.0 ** max(repeated - 1, 0), MAX_RETRY_SECONDS)
+        # a lost attempt has already cost the duration of a lease
+        return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else wait)
+
+
+#: Expiry of a lease whose dispatcher is known to be dead.
+EXPIRED = 0.0
+#: Number of progress events stored per job; a client that resumes from an older event misses only old progress.
+MAX_PROGRESS_EVENTS = 200
+#: Prefix of files that only clients of an unfinished job need. They are removed once it has succeeded.
+LIVE = "live/"
+#: Maximum number of past attempts that the retry policy looks at: by then the delay is at its maximum.
+_MAX_CAUSES = 2 * MAX_LOSSES
+#: Time in seconds for which jobs of other owners overtake a waiting job that needs more capacity than is free.
+OVERTAKEN_SECONDS = 600.0
+
+_PROGRESS = and_(EventRow.job_id == bindparam("of_job"), EventRow.kind == "progress")
+_OLD = select(EventRow.id).where(_PROGRESS).order_by(EventRow.id.desc()).offset(MAX_PROGRESS_EVENTS).limit(1)
+#: Statement that deletes all but the last progress events of a job.
+_DELETE_OLD_PROGRESS = delete(EventRow).where(_PROGRESS, EventRow.id <= _OLD.scalar_subquery())
+
+
+@dataclass(frozen=True)
+class Lease:
+    """Right to write to a job, valid until the job is leased again with a higher epoch."""
+
+    job: JobRow
+    dispatcher: str
+    epoch: int
+
+    @property
+    def job_id(self) -> str:
+        """Id of the job."""
+        return self.job.id
+
+    @property
+    def log_fields(self) -> dict[str, Any]:
+        """Fields of log records about the attempt."""
+        return {"job": self.job.id, "attempt": self.job.attempt}
+
+
+class Leases:
+    """Operations of dispatchers on the store.
+
+    Args:
+        seconds: Duration of a lease.
+        policy: Policy for jobs whose attempts failed.
+        retention: Time in seconds until the results of an ended job expire.
+    """
+
+    def __init__(self, database: Database, seconds: float, policy: RetryPolicy, retention: float) -> None:
+        self._database = database
+        self._seconds = seconds
+        self._policy = policy
+        self._retention = retention
+
+    # --- taking and holding ----------------------------------------------------------------------------------------
+
+    def take(self, dispatcher: str, fits: Callable[[JobRow], bool] = lambda job: True) -> Lease | None:
+        """Take the next job: by highest priority, then the owner who has waited longest, then the oldest job.
+
+        Jobs with expired leases are candidates like queued ones. If such a job has used up its attempts, it is ended as
+        failed, and if it was being canceled, as canceled; then the next job is tried.
+
+        Jobs of other owners overtake a job that does not fit, but only until it has waited for `OVERTAKEN_SECONDS`.
+        Then nothing is taken until it fits here or another dispatcher takes it.
+
+        Args:
+            fits: Callback that returns whether there is capacity for a job.
+        """
+        now = self._database.clock()
+        with self._database.writing() as session:
+            for job in next_jobs(session, now):
+                lost = job.status in ACTIVE
+                if lost and self._close_lost(session, job, dispatcher, now):
+                    continue
+                if fits(job):
+                    return self._lease(session, job, dispatcher, now)
+                if lost:  # otherwise the same loss would be counted again next time
+                    self._requeue(session, job, now, 0.0)
+                if now - job.queued_at > OVERTAKEN_SECONDS:
+                    break
+        return None
+
+    def waiting(self, most: int = 1_000_000) -> int:
+        """Return the number of jobs that could be leased now, counting up to `most`."""
+        now = self._database.clock()
+        total = 0
+        with self._database.reading_rows() as connection:
+            for query in (WAITING, LOST):
+                total += connection.execute(query, {"now": now, "most": most - total}).scalar_one()
+        return total
+
+    def _lease(self, session: Session, job: JobRow, dispatcher: str, now: float) -> Lease:
+        job.attempt += 1
+        job.lease_epoch += 1
+        job.lease_owner, job.lease_expires_at = dispatcher, now + self._seconds
+        job.started_at = job.started_at or now
+        attempt = AttemptRow(job_id=job.id, number=job.attempt, epoch=job.lease_epoch, dispatcher=dispatcher)
+        attempt.started_at = now
+        session.add(attempt)
+        served = (session.scalar(select(func.max(TurnRow.served))) or 0) + 1
+        turn = upsert(session)(TurnRow).values(owner=job.owner, served=served)
+        session.execute(turn.on_conflict_do_update(index_elements=["owner"], set_={"served": served}))
+        move(session, job, Transition.TAKE, now)
+        count(session, "sgsst_attempts_total")
+        observe(session, "sgsst_queue_wait_seconds", max(0.0, now - job.queued_at))
+        return Lease(job, dispatcher, job.lease_epoch)
+
+    def renew(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
+        """Renew leases; return the status of each job, or None if its lease is lost."""
+        until = self._database.clock() + self._seconds
+        statuses: dict[str, JobStatus | None] = {}
+        with self._database.writing() as session:
+            for lease in sorted(leases, key=lambda each: each.job_id):
+                job = self._leased_job(session, lease)
+                if job is not None:
+                    job.lease_expires_at = until
+                statuses[lease.job_id] = JobStatus(job.status) if job is not None else None
+        return statuses
+
+    def statuses(self, leases: Sequence[Lease]) -> dict[str, JobStatus | None]:
+        """Return what `renew` returns, without renewing the leases."""
+        ids = [lease.job_id for lease in leases]
+        with self._database.reading() as session:
+            rows = {row.id: row for row in session.scalars(select(JobRow).where(JobRow.id.in_(ids)))}
+        return {
+            lease.job_id: JobStatus(job.status) if (job := rows.get(lease.job_id)) and _is_held(job, lease) else None
+            for lease in leases
+        }
+
+    def holders(self) -> list[str]:
+        """Return the names of all dispatchers that hold a lease."""
+        with self._database.reading() as session:
+            query = select(JobRow.lease_owner).where(JobRow.status.in_(ACTIVE), JobRow.lease_owner.is_not(None))
+            return sorted({str(owner) for owner in session.scalars(query)})
+
+    def expire(self, dispatcher: str) -> None:
+        """Expire the leases of a dispatcher that is known to be dead."""
+        with self._database.writing() as session:
+            held = and_(JobRow.lease_owner == dispatcher, JobRow.status.in_(ACTIVE))
+            session.execute(update(JobRow).where(held).values(lease_expires_at=EXPIRED))
+
+    def hold_gpus(self, lease: Lease, gpus: int) -> None:
+        """Set the number of GPUs that the attempt holds, and charge its usage so far to the job's owner."""
+        with self._held(lease) as (session, job, now):
+            attempt = session.get_one(AttemptRow, (job.id, job.attempt))
+            _count_gpus(session, job, attempt, now)
+            attempt.gpus, attempt.gpus_since = gpus, now
+
+    # --- while the job runs ----------------------------------------------------------------------------------------
+
+    def start(self, lease: Lease) -> None:
+        """Mark a job as running once its inputs are read; a job that is being canceled keeps its status.
+
+        A job whose user wanted it to finish during an earlier attempt is marked as finishing again.
+        """
+        with self._held(lease) as (session, job, now):
+            if job.status == JobStatus.STARTING:
+                move(session, job, Transition.START, now)
+                send_webhook(session, job, "started", "started", now, attempt=job.attempt)
+                if job.finish_requested:
+                    move(session, job, Transition.FINISH, now)
+
+    def report_progress(self, lease: Lease, progress: Progress, *, notify: bool = False) -> None:
+        """Replace the job's progress and add it to the loss history (`history`).
+
+        This is by far the most frequent write of dispatchers, so it uses as few statements as possible.
+
+        Args:
+            notify: Whether the job's webhook gets a message.
+        """
+        now = self._database.clock()
+        data = {**progress.model_dump(), "attempt": lease.job.attempt, "updated_at": now}
+        held = and_(JobRow.lease_epoch == lease.epoch, JobRow.lease_owner == lease.dispatcher)
+        with self._database.writing() as session:
+            change = update(JobRow).where(JobRow.id == lease.job_id, held, JobRow.status.in_(ACTIVE))
+            changed: Any = session.execute(change.values(progress=data))
+            if not changed.rowcount:
+                raise _lost(lease)
+            add_event(session, lease.job_id, "progress", data, now)
+            add_point(session, lease.job_id, data)
+            session.execute(_DELETE_OLD_PROGRESS, {"of_job": lease.job_id})
+            if notify:
+                job = session.get_one(JobRow, lease.job_id)
+                send_webhook(session, job, "progress", "progress", now, progress=data)
+
+    def publish(self, lease: Lease, files: Sequence[Published]) -> list[str]:
+        """Publish files, replacing those of the same names; return the locations of the replaced files."""
+        with self._held(lease) as (session, job, now):
+            return _publish(session, job, files, now)
+
+    # --- the end of an attempt -------------------------------------------------------------------------------------
+
+    def succeed(self, lease: Lease, files: Sequence[Published], result: dict[str, Any]) -> list[str]:
+        """End a job as succeeded and publish its results in one transaction, as `publish` does.
+
+        If a cancellation came too late, the job still counts as succeeded.
+        """
+        with self._held(lease) as (session, job, now):
+            unused = _publish(session, job, files, now)
+            # the colors of the unfinished job, and its checkpoint unless it can be continued
+            prefixes = (LIVE,) if result.get("stopped") in CONTINUABLE else (".", LIVE)
+            obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in prefixes))
+            session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, obsolete))
+            job.result, job.error = result, None
+            _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
+            observe(session, "sgsst_job_seconds", max(0.0, now - (job.started_at or now)))
+            end(session, job, Transition.SUCCEED, now, self._retention)
+            return unused
+
+    def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool) -> bool:
+        """End a failed attempt: the job is queued again after a delay, or fails (`retries`).
+
+        An error with the code of `InfrastructureError` is never permanent.
+
+        Args:
+            error: `code` and `message`, and the `cause` of an outage (`states.Cause`).
+            permanent: Whether another attempt would fail in the same way.
+
+        Returns:
+            Whether the job will be retried.
+        """
+        with self._held(lease) as (session, job, now):
+            verdict = self._close(session, job, AttemptOutcome.FAILED, error, now, permanent=permanent)
+            if verdict.transition != Transition.STOP:
+                job.error = error
+            if verdict.transition != Transition.REQUEUE:
+                end(session, job, verdict.transition, now, self._retention)
+                return False
+            self._requeue(session, job, now, now + verdict.wait)
+            return True
+
+    def release(self, lease: Lease) -> None:
+        """Return an unfinished job to the queue without counting a failure, because the dispatcher is shutting down."""
+        with self._held(lease) as (session, job, now):
+            verdict = self._close(session, job, AttemptOutcome.RELEASED, None, now)
+            if verdict.transition == Transition.REQUEUE:
+                self._requeue(session, job, now, 0.0)
+            else:
+                end(session, job, verdict.transition, now, self._retention)
+
+    def stop(self, lease: Lease) -> None:
+        """End a job that was being canceled."""
+        with self._held(lease) as (session, job, now):
+            _close_attempt(session, job, AttemptOutcome.CANCELED, None, now)
+            end(session, job, Transition.STOP, now, self._retention)
+
+    def _close_lost(self, session: Session, job: JobRow, dispatcher: str, now: float) -> bool:
+        """Close an attempt whose lease `dispatcher` has found expired; return whether this has ended the job."""
+        error = {"code": DISPATCHER_LOST, "message": "The process that ran the job stopped responding."}
+        if job.lease_owner == dispatcher or self._lives(session, job):
+            message = "The process that ran the job could not reach the database in time. The job will be retried."
+            error = {"code": InfrastructureError.code, "message": message, "cause": Cause.DATABASE}
+        verdict = self._close(session, job, AttemptOutcome.LOST, error, now)
+        count(session, "sgsst_lease_expirations_total")
+        if verdict.transition == Transition.REQUEUE:
+            return False
+        if verdict.transition == Transition.FAIL:
+            job.error = error | {"message": f"{error['message']} This was attempt {job.attempt}."}
+        end(session, job, verdict.transition, now, self._retention)
+        return True
+
+    def _lives(self, session: Session, job: JobRow) -> bool:
+        """Return whether the dispatcher of an expired lease has reported after it failed to renew the lease."""
+        owner = session.get(DispatcherRow, job.lease_owner) if job.lease_owner else None
+        expired_at = job.lease_expires_at or EXPIRED
+        return owner is not None and expired_at > EXPIRED and owner.seen_at > expired_at - self._seconds / 2
+
+    def _close(
+        self,
+        session: Session,
+        job: JobRow,
+        outcome: AttemptOutcome,
+        error: dict[str, Any] | None,
+        now: float,
+        *,
+        permanent: bool = False,
+    ) -> Verdict:
+        """Close an attempt and count it if it failed; return the verdict on the job."""
+        _close_attempt(session, job, outcome, error, now)
+        before, status = FailureCount(job.failures, job.failed_step), JobStatus(job.status)
+        causes = _causes(session, job) or [cause_of(error)]
+        if causes[0] not in (Cause.JOB, Cause.DISPATCHER):
+            count(session, "sgsst_outages_total", f'cause="{causes[0]}"')
+        verdict = self._policy.after_attempt(outcome, status, before, job.saved_step, causes, permanent=permanent)
+        job.failures, job.failed_step = verdict.count.failures, verdict.count.failed_step
+        return verdict
+
+    # --- shared ----------------------------------------------------------------------------------------------------
+
+    def _leased_job(self, session: Session, lease: Lease) -> JobRow | None:
+        job = session.get(JobRow, lease.job_id, with_for_update=True)
+        return job if job is not None and _is_held(job, lease) else None
+
+    @contextmanager
+    def _held(self, lease: Lease) -> Iterator[tuple[Session, JobRow, float]]:
+        """Provide a transaction, the leased job and the time; raise `LeaseLostError` if the lease is lost."""
+        now = self._database.clock()
+        with self._database.writing() as session:
+            job = self._leased_job(session, lease)
+            if job is None:
+                raise _lost(lease)
+            yield session, job, now
+
+    @staticmethod
+    def _requeue(session: Session, job: JobRow, now: float, not_before: float) -> None:
+        job.not_before = not_before
+        job.lease_owner = job.lease_expires_at = None
+        move(session, job, Transition.REQUEUE, now)
+
+
+def _lost(lease: Lease) -> ServiceError:
+    return problems.LEASE_LOST(job_id=lease.job_id, epoch=lease.epoch, dispatcher=lease.dispatcher)
+
+
+def _is_held(job: JobRow, lease: Lease) -> bool:
+    return job.status in ACTIVE and job.lease_epoch == lease.epoch and job.lease_owner == lease.dispatcher
+
+
+def _publish(session: Session, job: JobRow, files: Sequence[Published], now: float) -> list[str]:
+    unused = []
+    for file in files:
+        if file.step is not None:
+            job.saved_step = max(job.saved_step or 0, file.step)
+        row = session.get(ArtifactRow, (job.id, file.name))
+        if row is None:
+            row = ArtifactRow(job_id=job.id, name=file.name)
+            session.add(row)
+        elif row.location != file.location:
+            unused.append(row.location)
+        row.location, row.size, row.sha256, row.created_at = file.location, file.size, file.sha256, now
+        if not file.name.startswith("."):
+            data = {"name": file.name, "size": file.size, "sha256": file.sha256}
+            add_event(session, job.id, "artifact", data, now)
+    return unused
+
+
+def _causes(session: Session, job: JobRow) -> list[Cause]:
+    """Return the causes of the ends of the latest attempts, newest first, back to the last one that made a step."""
+    attempts = select(AttemptRow.number, AttemptRow.error).where(AttemptRow.job_id == job.id)
+    progressed = session.scalar(
+        select(func.max(ProgressPointRow.attempt)).where(
+            ProgressPointRow.job_id == job.id, ProgressPointRow.attempt < job.attempt
+        )
+    )
+    newer = attempts.where(AttemptRow.number > (progressed or 0)).order_by(AttemptRow.number.desc())
+    return [cause_of(error) for _, error in session.execute(newer.limit(_MAX_CAUSES)).all()]
+
+
+def _count_gpus(session: Session, job: JobRow, attempt: AttemptRow, now: float) -> None:
+    if attempt.gpus and attempt.gpus_since is not None:
+        count_gpu_seconds(session, job.owner, attempt.gpus * max(0.0, now - attempt.gpus_since), now)
+
+
+def _close_attempt(
+    session: Session, job: JobRow, outcome: AttemptOutcome, error: dict[str, Any] | None, now: float
+) -> None:
+    attempt = session.get(AttemptRow, (job.id, job.attempt))
+    if attempt is not None:
+        attempt.finished_at, attempt.outcome, attempt.error = now, outcome, error
+        if outcome != AttemptOutcome.LOST:  # its working time is unknown, and the loss is not the owner's fault
+            _count_gpus(session, job, attempt, now)
+    count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')

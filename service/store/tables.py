@@ -42,7 +42,7 @@ class JobRow(Base):
     status: Mapped[str] = mapped_column(String(12))
     priority: Mapped[int] = mapped_column(Integer, default=0)
     parameters: Mapped[dict[str, Any]]
-    inputs: Mapped[list[Any]] = mapped_column(deferred=True)  # may be long; see `service.store.job_inputs`
+    inputs: Mapped[list[Any]] = mapped_column(deferred=True)  # may be long; see `service.store.jobs`
     created_at: Mapped[float] = mapped_column(Float)
     queued_at: Mapped[float] = mapped_column(Float)
     not_before: Mapped[float] = mapped_column(Float)
@@ -177,7 +177,7 @@ class BlobUseRow(Base):
 
 
 class UploadRow(Base):
-    """Multipart upload or receipt (`service.store.inputs`); `sha256` is set once an upload is complete."""
+    """Multipart upload or receipt (`service.store.files`); `sha256` is set once an upload is complete."""
 
     __tablename__ = "uploads"
 

@@ -26,10 +26,9 @@ from tests.small_scenes import ball, cameras, style, wall, write_files
 from worker.execute import execute
 from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume, SceneRequest
+from worker.options import StyleFile, region_options, region_requests
 from worker.prepare import Job, dry_run, prepare
-from worker.region_requests import region_options, region_requests
 from worker.run import Listener
-from worker.styles import StyleFile
 
 pytest.importorskip("triton")
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from service.optional import installed_extras, missing_extras
+from service.settings import installed_extras, missing_extras
 
 
 def test_missing_extra_is_not_offered_and_named_to_the_operator(monkeypatch: pytest.MonkeyPatch) -> None:

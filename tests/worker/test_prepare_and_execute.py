@@ -27,8 +27,7 @@ from tests.worker.ranks.faults import Fault, small_request
 from worker.execute import execute
 from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume
-from worker.prepare import Job, dry_run, prepare
-from worker.previews import Previews
+from worker.prepare import Job, Previews, dry_run, prepare
 from worker.run import Listener
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")

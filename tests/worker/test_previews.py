@@ -14,8 +14,8 @@ from sgsst_core.stylizing.color_transfer import warm_start
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, wall
-from worker import previews as previews_module
-from worker.previews import LiveColors, Previews
+from worker import prepare as previews_module
+from worker.prepare import LiveColors, Previews
 
 
 def test_first_preview_shows_warm_start_colors(

@@ -8,8 +8,16 @@ import pytest
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.settings import checked
-from worker.region_requests import MOST_REGIONS, REST, RegionOptions, parse_selection, region_options, region_requests
-from worker.styles import MOST_STYLE_IMAGES, StyleFile
+from worker.options import (
+    MOST_REGIONS,
+    MOST_STYLE_IMAGES,
+    REST,
+    RegionOptions,
+    StyleFile,
+    parse_selection,
+    region_options,
+    region_requests,
+)
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,8 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style
 from tests.small_scenes import cameras, wall, write_files
-from worker.inputs import load_styles
-from worker.region_requests import RegionRequest, parse_selection
-from worker.selecting import cropped, select, select_regions
+from worker.inputs import cropped, load_styles, select, select_regions
+from worker.options import RegionRequest, parse_selection
 
 
 def region(name: str, spec: str, **values: Any) -> RegionRequest:
@@ -147,7 +146,7 @@ def test_freezing_every_gaussian_is_refused(file: SceneFile) -> None:
 
 
 def test_region_styles_are_loaded(tmp_path: Path, file: SceneFile) -> None:
-    from worker.styles import StyleFile
+    from worker.options import StyleFile
 
     save_png(tmp_path / "s.png", torch.full((8, 8, 3), 0.5))
     request = region("a", "half-space=1,0,0,0", styles=(StyleFile(tmp_path / "s.png"),), weight=2.0)

@@ -8,7 +8,7 @@ from PIL import Image
 
 from sgsst_core.errors import SettingsError
 from worker.inputs import load_styles
-from worker.styles import MOST_STYLE_IMAGES, StyleFile, parse_style, parse_styles, split_weight
+from worker.options import MOST_STYLE_IMAGES, StyleFile, parse_style, parse_styles, split_weight
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 A local instance listens on loopback and requires a secret token. Its processes are ended and its files are deleted when
 it is closed, and also when the process that started it is killed.
+
+Estimates of the memory of ranks, from the size of their scene. Neither Ray nor PyTorch is imported.
 """
 
 from __future__ import annotations
@@ -26,10 +28,8 @@ import psutil
 
 from sgsst_core import container
 from sgsst_core.errors import ClusterAwayError, RanksFailedError, SettingsError
-from worker.processes import STOP_SIGNALS
-from worker.ranks import sweeper
-from worker.ranks.failure_policy import first_line
-from worker.ranks.memory import memory_beside_gpus
+from worker.job import memory_beside_gpus
+from worker.processes import STOP_SIGNALS, dismiss_sweeper, start_sweeper, sweep
 
 #: Size of Ray's object store in bytes. The default is 30 % of all memory, but the store holds almost nothing here:
 #: torch.distributed exchanges tensors, and scenes are read from files.
@@ -131,7 +131,7 @@ class Cluster:
         parent = tempfile.gettempdir()
         short = "/tmp" if len(parent) >= _LONGEST_PARENT else parent
         self._folder = Path(tempfile.mkdtemp(prefix="sgsst-ray-", dir=short))
-        self._sweeper = sweeper.beside(self._folder)
+        self._sweeper = start_sweeper(self._folder)
         earlier = set(psutil.Process().children())
         try:
             ray.init(
@@ -166,10 +166,10 @@ class Cluster:
         ray.shutdown()
         self._daemons = []
         if self._folder is not None:
-            sweeper.sweep(self._folder)
+            sweep(self._folder)
             self._folder = None
         if self._sweeper is not None:
-            sweeper.dismiss(self._sweeper)
+            dismiss_sweeper(self._sweeper)
             self._sweeper = None
 
 
@@ -220,6 +220,12 @@ NODE_LABEL = "ray.io/node-id"
 PLACE_SECONDS = 5.0
 #: Minimum time in seconds for each attempt, because Ray frees resources late on a busy machine.
 _LEAST_SECONDS = 3.0
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message without its full stop, or the error's type if it has no message."""
+    lines = str(error).strip().splitlines()
+    return lines[0].rstrip(".") if lines else type(error).__name__
 
 
 class NoCapacityError(Exception):

@@ -20,10 +20,10 @@ from api.http.schemas import ArtifactList, ArtifactView, BlendRequest, artifact_
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file, send_list
 from api.static_files import exported_viewer
 from service import problems
-from service.errors import LostFileError
-from service.files.artifacts import media_type
-from service.files.staging import RESULT
+from service.files.objects import media_type
+from service.inputs import RESULT
 from service.inspection.derived import PAGE, Blend
+from service.problems import LostFileError
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import EXTRA_FORMATS, DownloadName, by_name, listed, result_name
 from sgsst_core.files.formats.ply import PLY
@@ -71,7 +71,7 @@ async def list_artifacts(
     return await send_list("artifacts", read, cursor, limit, context.readers.of(caller.owner))
 
 
-#: Media types of results (`service.files.artifacts`), and how the content of each starts.
+#: Media types of results (`service.files.objects`), and how the content of each starts.
 _CONTENT = {
     "application/octet-stream": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
     "model/gltf-binary": "glTF\x02\0\0\0",

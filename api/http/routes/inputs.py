@@ -17,8 +17,8 @@ from api.http.routes.jobs import JobId, find
 from api.http.schemas import InputFileView, InputList, input_view
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file, send_list
 from service import problems
-from service.errors import LostFileError
 from service.files.blobs import BLOBS
+from service.problems import LostFileError
 from service.states import JobStatus
 from service.store.jobs import Jobs
 from service.store.tables import BlobRow, JobRow

@@ -27,11 +27,10 @@ from api.http.schemas import (
 )
 from api.http.sending import IfNoneMatch, names_etag, send_list
 from service import problems
-from service.files.staging import default_job_name
-from service.parameters import JobParameters, stored_parameters
+from service.inputs import JobParameters, default_job_name, stored_parameters
 from service.problems import JOB_ID
+from service.settings import check_weights
 from service.store.tables import JobRow
-from service.weights import check_weights
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

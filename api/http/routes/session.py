@@ -13,7 +13,7 @@ from api.http.documentation import headers, raises
 from api.http.multipart import json_body
 from api.http.schemas import SessionView, SignIn
 from service import problems
-from service.errors import ServiceError
+from service.problems import ServiceError
 
 router = APIRouter(prefix="/v1/session", tags=["session"])
 

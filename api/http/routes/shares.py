@@ -23,11 +23,10 @@ from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, shar
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file
 from api.http.static import PAGE_HEADERS, shared_page, shared_policy
 from service import problems
-from service.errors import NoJobError, NoShareError, ServiceError
-from service.files.artifacts import media_type
-from service.problems import SHARE_ID, SHARE_TOKEN
-from service.store.access import Shared
-from service.store.quotas import Quotas
+from service.files.objects import media_type
+from service.problems import SHARE_ID, SHARE_TOKEN, NoJobError, NoShareError, ServiceError
+from service.store.jobs import Shared
+from service.store.keys import Quotas
 from service.store.tables import ArtifactRow
 
 router = APIRouter(tags=["shares"])

@@ -27,16 +27,14 @@ from api.http.routes.uploads import IdempotencyHeader, uploaded_name
 from api.http.schemas import JobView, PlanView, job_view
 from service import problems
 from service.deadlines import suspended
-from service.errors import NoJobError
-from service.files.staging import MOST_STYLES, check_roles, default_job_name, staged_name
+from service.inputs import MOST_STYLES, JobParameters, check_roles, default_job_name, staged_name
 from service.inspection.inspector import Show
-from service.parameters import JobParameters
-from service.problems import UPLOAD_ID
+from service.problems import UPLOAD_ID, NoJobError
 from service.scheduling.webhooks import check_url
+from service.settings import check_weights
 from service.states import JobStatus, WebhookEvent
 from service.store.jobs import Idempotency, NewJob
 from service.store.tables import BlobRow, UploadRow
-from service.weights import check_weights
 from sgsst_core.files.formats import TITLES
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])

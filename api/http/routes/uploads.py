@@ -20,10 +20,9 @@ from api.http.documentation import headers, links, raises
 from api.http.multipart import body_blocks, check_media_type, media_type
 from api.http.schemas import UploadView, upload_view
 from service import problems
-from service.errors import ServiceError, StoreError
-from service.files.staging import staged_name
-from service.problems import UPLOAD_ID
-from service.store.inputs import check_offset
+from service.inputs import staged_name
+from service.problems import UPLOAD_ID, ServiceError, StoreError
+from service.store.files import check_offset
 from service.store.tables import UploadRow
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])

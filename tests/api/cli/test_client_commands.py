@@ -19,7 +19,7 @@ from PIL import Image
 from api.cli.main import main
 from api.client import Client
 from api.client.answers import RequestError
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import ROOT, Service

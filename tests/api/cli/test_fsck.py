@@ -15,16 +15,15 @@ import httpx2
 import pytest
 
 from api.cli.main import main
-from service import fsck
-from service.errors import LostFileError
-from service.files.artifacts import Artifacts
-from service.files.objects import ObjectStore
-from service.files.staging import CHECKPOINT
-from service.files.stored_blobs import open_blobs
+from service.files.blobs import open_blobs
+from service.files.objects import Artifacts, ObjectStore
+from service.inputs import CHECKPOINT
+from service.problems import LostFileError
+from service.scheduling import housekeeping as fsck
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
-from service.store.leases import Lease
+from service.store.queue import Lease
 from tests.service.files.s3 import environment_of, s3_server
 from tests.stores import new_store
 
@@ -217,11 +216,11 @@ def test_fsck_of_running_service_finds_nothing(service: Files, capsys: pytest.Ca
             lease = service.job(scene)
             for turn in range(3):
                 put = service.artifacts.put(lease.job_id, lease.epoch, "log.txt", service.file(b"%d" % turn))
-                for location in service.store.leases.publish(lease, [put]):
+                for location in service.store.queue.publish(lease, [put]):
                     service.artifacts.objects.remove(location)
             upload_id = service.upload(b"upload %d" % number, 7 + len(str(number))).split("/")[1].removesuffix(".part")
-            service.blobs.finish_upload(service.store.inputs.upload(upload_id, "me"), HOUR)
-            service.store.leases.succeed(lease, [], {})
+            service.blobs.finish_upload(service.store.files.upload(upload_id, "me"), HOUR)
+            service.store.queue.succeed(lease, [], {})
             if number % 2:
                 service.store.jobs.delete(lease.job_id, None)
                 service.artifacts.objects.remove_below(lease.job_id)

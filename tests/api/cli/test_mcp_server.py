@@ -20,7 +20,7 @@ from mcp_types import CallToolResult, ImageContent, TextContent
 from PIL import Image
 
 from api.client import AsyncClient
-from service.parameters import JobParameters
+from service.inputs import JobParameters
 from tests.api.service import ROOT, Service
 from tests.small_scenes import wall, write_files
 

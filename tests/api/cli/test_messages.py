@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from api.cli.main import main
-from service.startup import start
+from service.settings import start
 from tests.api.service import ROOT
 from tests.full_disk import full_disk
 from tests.small_scenes import wall, write_files

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from api.cli.main import app, main
 from api.cli.options import flags, help_text
 from api.cli.options_table import reference
-from service.parameters import JobParameters
+from service.inputs import JobParameters
 from sgsst_core.errors import SettingsError
 from sgsst_core.settings import Declared, Settings, checked, declared, make_settings, parse_seconds, parse_strength
 from worker.job import SceneRequest

@@ -25,7 +25,7 @@ from api.client import AsyncClient, Client, uploads
 from api.client.answers import ApiError, Event, Job, RequestError
 from api.client.inputs import camera_files, image_files
 from api.client.transport import TRIES
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store
 from sgsst_core.files.atomic import temporary_path

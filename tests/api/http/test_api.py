@@ -27,7 +27,7 @@ from api.cli.main import main
 from api.cli.options import kind_of
 from api.cli.supervisor import ServeError, serve
 from service.files.blobs import BlobFolder
-from service.parameters import JobParameters
+from service.inputs import JobParameters
 from service.settings import ServiceSettings
 from service.store import open_store
 from service.store.jobs import NewJob

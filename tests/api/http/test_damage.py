@@ -12,11 +12,11 @@ import httpx2
 import pytest
 
 from api.http.routes import artifacts as routes
-from service.errors import LostFileError, NotFoundError
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
+from service.problems import LostFileError, NotFoundError
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.leases import Lease
+from service.store.queue import Lease
 from tests.api.service import Service, check_documented
 from tests.small_scenes import wall, write_files
 

@@ -15,7 +15,7 @@ from openapi_spec_validator import validate
 from api.http.app import create_app
 from api.http.problems import MEDIA_TYPE
 from service import problems
-from service.errors import ProblemType
+from service.problems import ProblemType
 from service.settings import ServiceSettings
 from sgsst_core.files.formats import RESULT_FORMATS
 

@@ -18,9 +18,8 @@ from fastapi.responses import StreamingResponse
 
 from api.http.middleware import Deadlines
 from service import problems
-from service.deadlines import suspended
-from service.errors import StoreError
-from service.files.threads import FileThreads
+from service.deadlines import FileThreads, suspended
+from service.problems import StoreError
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.http.test_api import form

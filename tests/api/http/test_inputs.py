@@ -18,7 +18,7 @@ from api.http.context import Caller
 from api.http.routes.submission import _referred_input
 from api.http.schemas import MOST_POINTS
 from api.http.sending import disposition
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob

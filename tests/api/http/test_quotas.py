@@ -16,10 +16,10 @@ import pytest
 
 from api.http.limits import Rates
 from service import problems
-from service.errors import ServiceError
+from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import open_store
-from service.store.quotas import NO_QUOTAS, Quotas
+from service.store.keys import NO_QUOTAS, Quotas
 from tests.api.http.test_api import TUS, form, refused
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.postgres import fresh_database, is_installed, server

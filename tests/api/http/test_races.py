@@ -14,7 +14,7 @@ import httpx2
 import pytest
 from sqlalchemy import text
 
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.states import JobStatus, Published
 from service.store import Store, open_store

@@ -20,7 +20,7 @@ from schemathesis.generation.stateful.state_machine import StepInput, StepOutput
 from schemathesis.specs.openapi.checks import missing_required_header, negative_data_rejection
 
 from api.http.app import create_app
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store
 from tests.api.conftest import Services

@@ -13,11 +13,11 @@ import pytest
 
 from api.http.limits import MOST_FAILURES, WITHIN_SECONDS, SignIns
 from service import problems
-from service.scheduling.machine import Machine
+from service.scheduling.capacity import Machine
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.access import MOST_SESSIONS
 from service.store.jobs import NewJob
+from service.store.keys import MOST_SESSIONS
 from tests.api.conftest import KEYED, Services
 from tests.api.service import Service, check_documented
 from tests.raised import raises_problem

@@ -15,10 +15,10 @@ import pytest
 from sqlalchemy import update
 
 from api.client import Client
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.access import MOST_SHARES
+from service.store.jobs import MOST_SHARES
 from service.store.tables import ShareRow
 from tests.api.conftest import KEYED, Services
 from tests.api.http.test_hanging import MANY

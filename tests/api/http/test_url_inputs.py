@@ -25,15 +25,14 @@ from api.client.answers import RequestError
 from api.http.fetching import Fetcher, file_name
 from api.http.receipts import Receipt, Receipts
 from service import outgoing, problems
-from service.errors import ServiceError
-from service.files.artifacts import Artifacts
-from service.files.blobs import Blobs
-from service.files.stored_blobs import open_blobs
-from service.files.threads import FileThreads
+from service.deadlines import FileThreads
+from service.files.blobs import Blobs, open_blobs
+from service.files.objects import Artifacts
 from service.outgoing import parse_origins
+from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import Store, open_store
-from service.store.quotas import Quotas
+from service.store.keys import Quotas
 from tests.api.service import Service, check_documented
 from tests.http_servers import serve
 from tests.raised import raises_problem

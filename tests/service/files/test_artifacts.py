@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 
 
 @pytest.fixture(params=["file", "memory"])
@@ -45,7 +45,7 @@ def test_final_file_is_copied_without_hard_links(tmp_path: Path, monkeypatch: py
     def refuse(source: object, target: object) -> None:
         raise OSError(errno.EXDEV, "Invalid cross-device link")
 
-    monkeypatch.setattr("service.files.artifacts.os.link", refuse)
+    monkeypatch.setattr("service.files.objects.os.link", refuse)
     source = tmp_path / "stylized.ply"
     source.write_bytes(bytes(3_000_000))
     put = Artifacts(f"file://{tmp_path / 'results'}").put("job_1", 1, "stylized.ply", source, final=True)

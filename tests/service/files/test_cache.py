@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import DamagedFileError, LostFileError, NoSpaceError
-from service.files import cache as cache_module
-from service.files.cache import FileCache
+from service.files import objects as cache_module
+from service.files.objects import FileCache
+from service.problems import DamagedFileError, LostFileError, NoSpaceError
 
 
 def content(number: int, size: int = 1000) -> tuple[bytes, str]:

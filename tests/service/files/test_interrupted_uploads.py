@@ -15,11 +15,11 @@ import httpx2
 import pytest
 
 from service import problems
-from service.errors import StoreError
 from service.files.blobs import BlobFolder
+from service.problems import StoreError
 from service.settings import ServiceSettings
 from service.store import open_store
-from service.store.inputs import InputRows
+from service.store.files import InputRows
 from tests.api.service import Service
 from tests.raised import raises_problem
 from tests.small_scenes import wall, write_files

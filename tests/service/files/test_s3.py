@@ -14,9 +14,8 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from service.errors import StoreError
-from service.files.artifacts import Artifacts
-from service.files.objects import ObjectStore
+from service.files.objects import Artifacts, ObjectStore
+from service.problems import StoreError
 from tests.api.service import Service, undisturbed, wait_for
 from tests.service.files.s3 import environment_of, s3_server
 from tests.small_scenes import wall, write_files

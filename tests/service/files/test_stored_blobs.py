@@ -14,12 +14,10 @@ from types import SimpleNamespace
 import httpx2
 import pytest
 
-from service.errors import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
-from service.files import stored_blobs
-from service.files.artifacts import Artifacts
-from service.files.blobs import BlobFolder, Receiver, write_all
-from service.files.objects import ObjectStore
-from service.files.stored_blobs import StoredBlobs
+from service.files import blobs as stored_blobs
+from service.files.blobs import BlobFolder, Receiver, StoredBlobs, write_all
+from service.files.objects import Artifacts, ObjectStore
+from service.problems import ConflictError, DamagedFileError, LostFileError, NoSpaceError, NotFoundError, StoreError
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.tables import BlobRow, UploadRow

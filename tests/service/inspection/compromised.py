@@ -15,7 +15,7 @@ from typing import Any
 from service.inspection import process, sandbox
 from sgsst_core.errors import SceneError
 from sgsst_core.files.formats import read_scene_header
-from worker import inputs
+from worker import inputs as inputs
 
 
 def taken_over(path: Path) -> Any:

@@ -18,20 +18,17 @@ from scipy.spatial.transform import Rotation
 
 from api.static_files import exported_viewer
 from service import problems
-from service.files.artifacts import Artifacts
+from service.deadlines import FileThreads
 from service.files.blobs import BlobFolder
-from service.files.staging import RESULT, Staged
-from service.files.threads import FileThreads
+from service.files.objects import Artifacts
+from service.inputs import RESULT, JobParameters, Staged, WorkRequest, job_spec
 from service.inspection.derived import MOST_BLENDS, Blend, DerivedFiles
 from service.inspection.process import WORK
-from service.inspection.work import WorkRequest
-from service.parameters import JobParameters
-from service.request import job_spec
 from service.settings import ServiceSettings
 from service.states import Published
 from service.store import Store, open_store
 from service.store.jobs import NewJob
-from service.store.quotas import NO_QUOTAS, Quotas
+from service.store.keys import NO_QUOTAS, Quotas
 from service.store.tables import JobRow
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.ply import PLY
@@ -43,9 +40,9 @@ from tests.raised import raises_problem
 from tests.service.store.helpers import usage_of
 from tests.sgsst_core.orbit.objects import figure, joined, moved
 from tests.small_scenes import wall, write_files
+from worker.derived import video_cameras
 from worker.inputs import read_job_capture
 from worker.options import JobVideo
-from worker.video import video_cameras
 
 
 @dataclass

@@ -7,7 +7,7 @@ import random
 from collections import Counter
 
 from service import problems
-from service.inspection.lanes import MAX_WAITING, Lanes
+from service.inspection.inspector import MAX_WAITING, Lanes
 from tests.raised import raises_problem
 
 

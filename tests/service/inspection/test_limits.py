@@ -16,14 +16,12 @@ import psutil
 import pytest
 from PIL import Image
 
-from service.errors import ServiceError
+from service.deadlines import FileThreads
 from service.files.blobs import BlobFolder
-from service.files.staging import Staged
-from service.files.threads import FileThreads
+from service.inputs import JobParameters, Staged, WorkRequest
 from service.inspection.inspector import InspectionProcess, Inspector, Show
 from service.inspection.process import WORK, _memory_besides_reading
-from service.inspection.work import WorkRequest
-from service.parameters import JobParameters
+from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import open_store
 from sgsst_core.errors import CameraError

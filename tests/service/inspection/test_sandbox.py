@@ -18,12 +18,12 @@ from typing import Any
 import pytest
 
 import sgsst_core
-from service.errors import ServiceError
+from service.deadlines import FileThreads
 from service.files.blobs import BlobFolder
-from service.files.threads import FileThreads
 from service.inspection import inspector, sandbox
 from service.inspection.inspector import Inspector
 from service.inspection.process import MAX_REPORTS
+from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import PATIENCE

@@ -10,7 +10,7 @@ import pytest
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
-from service.store.leases import Lease
+from service.store.queue import Lease
 from tests.service.store.helpers import SHA
 from tests.stores import new_store
 

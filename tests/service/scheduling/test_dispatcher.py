@@ -14,20 +14,14 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 
-from service.files.artifacts import Artifacts
 from service.files.blobs import BlobFolder
+from service.files.objects import Artifacts
+from service.scheduling.capacity import Grant, Machine, is_dead, own_name
 from service.scheduling.dispatcher import Dispatcher
-from service.scheduling.endings import Report
-from service.scheduling.machine import Machine, is_dead, own_name
-from service.scheduling.packing import Grant, estimated_seconds
-from service.scheduling.running import RunningAttempt
-from service.scheduling.selection import Holding
-from service.scheduling.stager import Stager
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
-from service.store.leases import Lease
-from sgsst_core.progress import Progress
+from service.store.queue import Lease
 from tests.api.service import wait_for
 from tests.service.scheduling.conftest import new_lease
 from tests.stores import new_store
@@ -75,8 +69,8 @@ def test_attempt_whose_files_hang_ends_by_the_store(
     settings: ServiceSettings, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The input is a pipe, which cannot be opened before somebody writes to it."""
-    monkeypatch.setattr("service.scheduling.running._FILE_SECONDS", 0.3)
-    monkeypatch.setattr("service.scheduling.running._CANCEL_SECONDS", 0.1)
+    monkeypatch.setattr("service.scheduling.attempts._FILE_SECONDS", 0.3)
+    monkeypatch.setattr("service.scheduling.attempts._CANCEL_SECONDS", 0.1)
     pipe = settings.folder / "blobs" / "aa" / "blob"
     pipe.parent.mkdir(parents=True)
     os.mkfifo(pipe)
@@ -95,30 +89,6 @@ def test_attempt_whose_files_hang_ends_by_the_store(
     assert (ended.status, ended.failures) == ("queued", 0)
 
 
-def attempt_of(held: Lease, grant: Grant, settings: ServiceSettings, store: Store, folder: Path) -> RunningAttempt:
-    """Return an attempt that has not started."""
-    blobs = BlobFolder(settings.folder, store.inputs, 0)
-    artifacts = Artifacts(settings.artifacts_url)
-    stager = Stager(settings, store, blobs, artifacts, cluster=False)
-    return RunningAttempt(held, grant, folder, settings, store, artifacts, stager)
-
-
-def test_attempt_reports_its_expected_end(settings: ServiceSettings, store: Store, tmp_path: Path) -> None:
-    held = new_lease(store, "one")
-    attempt = attempt_of(held, Grant(1, ("0",)), settings, store, tmp_path)
-    for stage in ("planning", "preparing"):  # the remaining seconds of these stages are not the job's
-        attempt._handle(Report(progress=Progress(stage=stage, eta_s=3.0)))
-    assert attempt.holding == Holding(attempt.grant)
-    attempt._handle(Report(progress=Progress(stage="sos", step=1, total=2, loss=1.0, eta_s=1000.0)))
-    holding = attempt.holding
-    assert holding.until is not None
-    assert holding.until - store.database.clock() == pytest.approx(1000.0, abs=60.0)
-    estimated = estimated_seconds(held.job)
-    assert holding.pace == pytest.approx(1000.0 / estimated, rel=0.06)
-    held.job.attempt = 2  # the seconds may be those left after a checkpoint
-    assert attempt.holding.pace is None
-
-
 def test_job_with_unsupported_stored_parameters_fails_with_a_message(settings: ServiceSettings, store: Store) -> None:
     scene = {"role": "scene", "name": "scene.ply", "sha256": SHA, "size": 3}
     parameters = {"sharpness": 3, "workers": "many", "memory_limit": "all"}
@@ -133,7 +103,7 @@ def test_job_with_unsupported_stored_parameters_fails_with_a_message(settings: S
 
 
 def test_jobs_of_a_dead_dispatcher_are_taken_over_at_once(settings: ServiceSettings, store: Store) -> None:
-    script = "from service.scheduling.machine import own_name; print(own_name())"
+    script = "from service.scheduling.capacity import own_name; print(own_name())"
     dead = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
     assert is_dead(dead)
     assert not is_dead(own_name())
@@ -167,7 +137,7 @@ def test_attempt_is_abandoned_before_an_unrenewed_lease_expires(
         """Attempt that runs forever."""
 
         def __init__(self, lease: Lease, grant: Grant, *others: object) -> None:
-            self.lease, self.grant, self.holding = lease, grant, Holding(grant)
+            self.lease, self.grant = lease, grant
 
         alive = True
 

@@ -12,9 +12,9 @@ import pytest
 
 from service import problems
 from service.scheduling.attempt_process import failure
-from service.scheduling.endings import Ending, StopRequest, attempt_ending, cause_of_error, outage
+from service.scheduling.messages import Ending, StopRequest, attempt_ending, cause_of_error, outage
 from service.states import AttemptOutcome, Cause
-from service.store.retries import cause_of
+from service.store.queue import cause_of
 from sgsst_core.errors import (
     ClusterAwayError,
     ImageError,

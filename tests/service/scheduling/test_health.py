@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from service.errors import DatabaseUnavailableError
 from service.health import dispatcher_is_healthy
 from service.prepare import main as prepare
-from service.scheduling.machine import is_dead, is_of_this_machine, own_name
+from service.problems import DatabaseUnavailableError
+from service.scheduling.capacity import is_dead, is_of_this_machine, own_name
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 

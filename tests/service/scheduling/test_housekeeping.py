@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 from service.scheduling import housekeeping
 from service.settings import ServiceSettings
 from service.states import Published

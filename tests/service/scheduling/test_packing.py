@@ -12,13 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import event
 
-from service.scheduling.machine import Machine
-from service.scheduling.packing import Capacity, Grant
-from service.scheduling.selection import lease_next_job
+from service.scheduling.capacity import Capacity, Grant, Machine
+from service.scheduling.dispatcher import lease_next_job
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
-from service.store.leases import OVERTAKEN_SECONDS
+from service.store.queue import OVERTAKEN_SECONDS
 from service.store.tables import JobRow
 from tests.stores import new_store
 

@@ -8,8 +8,8 @@ import pytest
 
 from service.scheduling import attempt_process
 from service.scheduling.attempt_process import report_prepared, report_progress
-from service.scheduling.endings import Report
-from service.scheduling.running import progress_seconds
+from service.scheduling.attempts import progress_seconds
+from service.scheduling.messages import Report
 from sgsst_core.progress import Progress
 from worker.prepare import Prepared
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from service.errors import NoSpaceError
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
+from service.problems import NoSpaceError
 from service.scheduling.publishing import Outbox, Publisher
 from service.settings import ServiceSettings
 from service.store import Store
-from service.store.leases import Lease
+from service.store.queue import Lease
 
 
 @pytest.fixture

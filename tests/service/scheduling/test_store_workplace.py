@@ -19,11 +19,11 @@ import pytest
 from pydantic import TypeAdapter
 from safetensors.numpy import save_file
 
-from service.errors import LostFileError, StoreError
-from service.files.artifacts import Artifacts
-from service.files.staging import CHECKPOINT
+from service.files.objects import Artifacts
+from service.inputs import CHECKPOINT
+from service.problems import LostFileError, StoreError
 from service.scheduling import publishing, rank_folder
-from service.scheduling.store_workplace import StoredFile, StoreWorkplace
+from service.scheduling.messages import StoredFile, StoreWorkplace
 from service.states import Published
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.features.network_weights import load_network_weights

@@ -24,8 +24,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from sqlalchemy import select
 
-from service.errors import ServiceError
 from service.outgoing import is_public
+from service.problems import ServiceError
 from service.scheduling import webhooks
 from service.scheduling.webhooks import Deliverer, check_url
 from service.settings import ServiceSettings

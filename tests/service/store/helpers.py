@@ -8,8 +8,8 @@ from pathlib import Path
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.jobs import NewJob
-from service.store.leases import Lease
-from service.store.quotas import day_of, stored_bytes
+from service.store.keys import day_of, stored_bytes
+from service.store.queue import Lease
 from service.store.tables import UsageRow
 
 SHA = "a" * 64

@@ -8,7 +8,7 @@ import pytest
 
 from service.states import JobStatus
 from service.store import Store
-from service.store.leases import OVERTAKEN_SECONDS
+from service.store.queue import OVERTAKEN_SECONDS
 from service.store.tables import JobRow
 from tests.service.store.helpers import ATTEMPTS, LEASE, Clock, lease, queue
 

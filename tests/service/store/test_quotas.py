@@ -8,12 +8,12 @@ from collections.abc import Callable
 import pytest
 
 from service import problems
-from service.errors import ConflictError, NotFoundError, ServiceError
+from service.problems import ConflictError, NotFoundError, ServiceError
 from service.settings import ServiceSettings
 from service.states import Published
 from service.store import Store
-from service.store.inputs import GRACE_SECONDS
-from service.store.quotas import NO_QUOTAS, Quotas
+from service.store.files import GRACE_SECONDS
+from service.store.keys import NO_QUOTAS, Quotas
 from tests.raised import raises_problem
 from tests.service.store.helpers import LEASE, SHA, Clock, Used, lease, new_job, queue, usage_of
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.states import TRANSITIONS, AttemptOutcome, Cause, JobStatus, Transition
-from service.store.retries import MAX_LOSSES, MAX_RETRY_SECONDS, FailureCount, RetryPolicy, Verdict, cause_of
+from service.store.queue import MAX_LOSSES, MAX_RETRY_SECONDS, FailureCount, RetryPolicy, Verdict, cause_of
 
 POLICY = RetryPolicy(max_attempts=3, retry_seconds=5.0)
 FRESH = FailureCount(0, None)

@@ -18,15 +18,13 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from sqlalchemy import event, func, inspect, select
 
 from service import problems
-from service.errors import ConflictError, LeaseLostError, NotFoundError, ProblemType
+from service.problems import ConflictError, LeaseLostError, NotFoundError, ProblemType
 from service.states import ACTIVE, FINISHED, Published
 from service.store import Store, open_store
-from service.store.history import GROWTH, add_point
-from service.store.inputs import GRACE_SECONDS
-from service.store.jobs import Idempotency
-from service.store.leases import MAX_PROGRESS_EVENTS, Lease
-from service.store.outages import translated
-from service.store.retries import MAX_LOSSES
+from service.store.database import translated
+from service.store.files import GRACE_SECONDS
+from service.store.jobs import GROWTH, Idempotency, add_point
+from service.store.queue import MAX_LOSSES, MAX_PROGRESS_EVENTS, Lease
 from service.store.tables import Base, JobRow, ProgressPointRow, ShareRow
 from sgsst_core.progress import Progress
 from tests.raised import raises_problem
@@ -467,7 +465,7 @@ def test_loss_history_continues_across_attempts(store: Store, clock: Clock) -> N
 
 
 def test_long_loss_history_is_thinned(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.store.history.MOST_POINTS", 40)
+    monkeypatch.setattr("service.store.jobs.MOST_POINTS", 40)
     job_id = queue(store)
     for _ in range(12):
         held = lease(store)

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.ports import free_port
-from worker.ranks import cluster, sweeper
+from worker.processes import sweep
+from worker.ranks import cluster
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -48,4 +49,4 @@ def joined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     finally:
         head.terminate()
         head.wait(120)
-        sweeper.sweep(Path(folder))
+        sweep(Path(folder))

@@ -19,8 +19,8 @@ import psutil
 from sgsst_core.settings import make_settings
 from tests.small_scenes import wall, write_files
 from worker.job import JobSpec, SceneRequest
+from worker.options import StyleFile
 from worker.ranks.rank import OpenWorkplace, RankProcess, RankTask
-from worker.styles import StyleFile
 
 Place = Literal[
     "render",
@@ -174,7 +174,7 @@ def _places() -> dict[str, tuple[Any, str]]:
     from sgsst_core.stylizing import checkpoint
     from sgsst_core.stylizing.stylizer import ColorOptimizer
     from sgsst_core.stylizing.views import Views
-    from worker import execute
+    from worker import execute as execute
     from worker.ranks.process_group import ProcessGroupCollectives
 
     exchanges = ("split_group", "gather_parts", "reduce_parts", "all_reduce", "all_reduce_statistics", "all_gather")

@@ -23,8 +23,8 @@ from tests.worker.ranks.faults import Fault, FaultyRank, fired, folders, name_of
 from worker.execute import execute
 from worker.job import JobSpec
 from worker.prepare import Prepared, prepare
-from worker.ranks.attempts import stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.ranks.driver import stylize_on_ranks
 from worker.ranks.rank import WorkerOptions
 from worker.run import Ended, Listener
 

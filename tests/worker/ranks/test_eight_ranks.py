@@ -14,8 +14,8 @@ import pytest
 from tests.worker.ranks.faults import Fault, FaultyRank, fired, small_request
 from worker.execute import execute
 from worker.prepare import prepare
-from worker.ranks.attempts import stylize_on_ranks
 from worker.ranks.cluster import Cluster
+from worker.ranks.driver import stylize_on_ranks
 from worker.ranks.rank import WorkerOptions
 from worker.run import Listener
 

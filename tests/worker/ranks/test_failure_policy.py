@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 
 from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedError, SceneError
-from worker.ranks.failure_policy import MOST_ATTEMPTS, FailedAttempt, Failure, check_retry, failure_of, first_line
+from worker.ranks.driver import MOST_ATTEMPTS, FailedAttempt, Failure, check_retry, failure_of, first_line
 
 KILLED = Failure("loss", "Worker 1 on here was lost: its process was killed")
 

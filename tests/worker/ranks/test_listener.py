@@ -8,7 +8,7 @@ import pytest
 
 from sgsst_core.progress import Progress
 from worker.prepare import Prepared
-from worker.ranks.attempts import Relay
+from worker.ranks.driver import Relay
 from worker.ranks.rank import RankStatus
 from worker.run import Listener
 

@@ -23,7 +23,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.lens import Lens
 from worker.capture import Capture
 from worker.outputs import Outputs
-from worker.ranks.messages import decode, encode
+from worker.ranks.process_group import decode, encode
 
 VALUES = [
     None,
@@ -112,7 +112,7 @@ def message(value: Any) -> Tensor:
         {"error": ["builtins:eval", ["1"]]},
         {"error": ["os:system", ["true"]]},
         {"error": ["sgsst_core.scene.camera:Camera", []]},
-        {"error": ["worker.ranks.messages:import_module", ["antigravity"]]},
+        {"error": ["worker.ranks.process_group:import_module", ["antigravity"]]},
         {"error": ["worker.processes:kill", [[]]]},
         {"object": ["pathlib:Path", {}]},
         {"object": ["worker.ranks.rank:RankProcess", {}]},

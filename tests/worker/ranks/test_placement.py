@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 import pytest
 
+from worker.job import memory_beside_gpus, scene_bytes
 from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, reserve
-from worker.ranks.memory import memory_beside_gpus, scene_bytes
 
 GB = 1_000_000_000
 

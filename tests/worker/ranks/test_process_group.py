@@ -28,9 +28,9 @@ from tests.ports import free_port
 from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
+from worker.ranks.driver import LONG_WAIT, RankGroup, RankHandle, long_wait
 from worker.ranks.process_group import WAITING, _backend, _meet
 from worker.ranks.rank import Outcome, RankStatus
-from worker.ranks.rank_group import LONG_WAIT, RankGroup, RankHandle, long_wait
 
 HEIGHT = 70
 

@@ -28,8 +28,8 @@ from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from tests.small_scenes import wall
 from tests.worker.ranks.spawn import on_ranks
+from worker.inputs import read_shared_scene
 from worker.processes import home
-from worker.ranks.shared_scene import read_shared_scene
 
 linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory files are looked for in Linux's /proc")
 

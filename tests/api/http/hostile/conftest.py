@@ -13,7 +13,7 @@ import psutil
 import pytest
 import torch
 
-from service.files.artifacts import Artifacts
+from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store
 from sgsst_core.files.formats import EXTRA_FORMATS

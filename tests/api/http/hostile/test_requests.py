@@ -18,7 +18,7 @@ import pytest
 from annotated_types import Ge
 
 from api.cli.options import kind_of
-from service.parameters import JobParameters
+from service.inputs import JobParameters
 from service.problems import SHARE_ID, UPLOAD_ID
 from service.store import Store
 from service.store.jobs import NewJob

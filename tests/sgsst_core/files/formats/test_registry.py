@@ -43,7 +43,7 @@ from tests.sgsst_core.files.formats.samples import (
 )
 from tests.sgsst_core.splat_scenes import camera, cloud
 from tests.small_scenes import cameras, wall
-from worker.derive import blend, convert
+from worker.derived import blend, convert
 from worker.job import SceneRequest
 
 

@@ -34,7 +34,7 @@ from tests.sgsst_core.files.formats.samples import (
 )
 from tests.sgsst_core.splat_scenes import cloud
 from tests.small_scenes import wall
-from worker.derive import convert
+from worker.derived import convert
 from worker.job import SceneRequest
 
 #: Half a turn about x, from the axes of a PLY (RDF) to RUB.

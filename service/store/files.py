@@ -10,9 +10,8 @@ from sqlalchemy import bindparam, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
 from service import problems
-from service.store.changes import release_blobs
 from service.store.database import Database, idempotency_row, new_id, upsert
-from service.store.quotas import IS_RECEIPT, NO_QUOTAS, RECEIPT, Quotas, check_bytes, lock_owner
+from service.store.keys import IS_RECEIPT, NO_QUOTAS, RECEIPT, Quotas, check_bytes, lock_owner
 from service.store.tables import Base, BlobRow, BlobUseRow, InspectionRow, UploadPartRow, UploadRow
 
 #: Lifetime of an unreferenced blob in seconds: the request that uploaded it may not have created its job yet.
@@ -304,6 +303,27 @@ class InputRows:
             insert = upsert(session)(InspectionRow).values(key=key, result=result, created_at=now)
             session.execute(insert.on_conflict_do_nothing())
             session.execute(delete(InspectionRow).where(InspectionRow.created_at < now - _INSPECTION_SECONDS))
+
+
+def release_blobs(session: Session, holder: str) -> list[str]:
+    """Release a holder's blobs and delete the rows of those without other holders.
+
+    Returns:
+        Locations of the deleted blobs. The caller removes their files once the transaction is committed.
+    """
+    held = select(BlobUseRow.sha256).where(BlobUseRow.holder == holder)
+    # lock blobs in a fixed order before deleting their uses: of two concurrent releases, the second one then sees that
+    # no other use remains
+    rows = session.scalars(
+        select(BlobRow).where(BlobRow.sha256.in_(held)).order_by(BlobRow.sha256).with_for_update()
+    ).all()
+    session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder))
+    digests = [row.sha256 for row in rows]
+    used = set(session.scalars(select(BlobUseRow.sha256).where(BlobUseRow.sha256.in_(digests))))
+    unused = [row for row in rows if row.sha256 not in used]
+    for row in unused:
+        session.delete(row)
+    return [row.location for row in unused]
 
 
 def close_receipt(session: Session, receipt: str) -> None:

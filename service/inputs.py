@@ -1,4 +1,7 @@
-"""Staging of a job's inputs as `sgsst stylize` expects them: a folder of links to the blobs under the users' names."""
+"""What a job is made from: its parameters as JSON, and its files, staged as `sgsst stylize` expects them.
+
+The staging folder has links to the blobs under the users' names. PyTorch is not imported.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,93 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from service import problems
-from service.parameters import MAX_JOB_NAME
+from sgsst_core.errors import SettingsError
 from sgsst_core.files.advice import advice_for_name
 from sgsst_core.files.formats import format_of_name
-from worker.region_requests import MOST_REGIONS, RegionRequest
-from worker.styles import MOST_STYLE_IMAGES
+from sgsst_core.settings import Option, checked
+from worker.job import JobSpec, SceneRequest
+from worker.options import (
+    GROUPS,
+    MOST_REGIONS,
+    MOST_STYLE_IMAGES,
+    NO_CONTROLS,
+    RegionOptions,
+    RegionRequest,
+    StyleFile,
+    StylizeOptions,
+    region_requests,
+)
+
+#: Maximum number of characters of a job's name.
+MAX_JOB_NAME = 200
+JobName = Annotated[str, Field(max_length=MAX_JOB_NAME, pattern=NO_CONTROLS)]
+
+
+class JobParameters(StylizeOptions):
+    """Parameters of a job; omitted ones take the preset's values, as for `sgsst stylize`."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"preset": "preview", "resolution": 480}, {"orbit": 24, "steps_sos": 100}],
+            "x-groups": {title: [*names] for title, names in GROUPS.items()},
+        }
+    )
+
+    name: Annotated[JobName, Option(default="the names of scene and style")] = Field(
+        "", description="Display name; need not be unique."
+    )
+    style_weights: Annotated[
+        list[Annotated[float, Field(gt=0, allow_inf_nan=False)]] | None, Option(instead="--style FILE:WEIGHT")
+    ] = Field(
+        None,
+        min_length=1,
+        max_length=MOST_STYLE_IMAGES,
+        description="Weight of each style image that belongs to no region, in upload order: images are mixed in "
+        "proportion. Default: equal weights.",
+    )
+    regions: Annotated[list[RegionOptions] | None, Option(instead="--region NAME:SPEC")] = Field(
+        None,
+        max_length=MOST_REGIONS + 1,
+        description="Regions of the scene, each with its own style or frozen. Where regions overlap, the later one "
+        "wins.",
+    )
+
+    @property
+    def region_requests(self) -> tuple[RegionRequest, ...]:
+        """Return the requested regions.
+
+        Raises:
+            SettingsError: If the regions are inconsistent.
+        """
+        return region_requests(self.regions or (), exists=lambda path: False)
+
+    @property
+    def selects_by_images(self) -> bool:
+        """Whether a region is selected by masks of views, for which these views are rendered."""
+        return any(region.selection and region.selection.kind == "masks" for region in self.region_requests)
+
+
+def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
+    """Return the parameters of a stored job.
+
+    Raises:
+        SettingsError: If this version does not support them.
+    """
+    try:
+        return checked(JobParameters, values)
+    except SettingsError as error:
+        raise SettingsError(
+            f"{error} The job was stored by an earlier version that accepted this. Submit a new job without it."
+        ) from error
+
 
 #: Name of the stylized scene; the names of a job's other files are derived from it.
 RESULT = "stylized.ply"
@@ -258,3 +336,74 @@ def _camera_path(files: Sequence[Path]) -> Path | None:
     if len(jsons) == 1 or len(files) == 1:
         return (jsons or files)[0]
     return Path("cameras") if files else None
+
+
+def _regions(staged: Staged, parameters: JobParameters) -> tuple[RegionRequest, ...]:
+    """Return the regions with the paths of their staged styles and masks."""
+    paths = {path.name: path for path in staged.styles}
+
+    def staged_file(file: StyleFile) -> StyleFile:
+        return replace(file, path=paths[staged_name("style", str(file.path))])
+
+    def staged_region(region: RegionRequest) -> RegionRequest:
+        selection = region.selection and replace(region.selection, path=region_mask(region))
+        return replace(region, selection=selection, styles=tuple(map(staged_file, region.styles)))
+
+    return tuple(map(staged_region, parameters.region_requests))
+
+
+def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
+    """Return the specification of a job; its paths are relative to the staging folder."""
+    taken = region_styles(parameters.region_requests)
+    own = [path for path in staged.styles if path.name not in taken]
+    weights = parameters.style_weights or [1.0] * len(own)
+    return JobSpec(
+        source=SceneRequest.of(staged.scene, staged.cameras, parameters),
+        styles=tuple(StyleFile(path, weight) for path, weight in zip(own, weights, strict=True)),
+        images=staged.photos,
+        out=Path("out", RESULT),
+        settings=parameters.settings(),
+        backbone=parameters.backbone,
+        regions=_regions(staged, parameters),
+        colors=True,
+        style_background=parameters.style_background,
+        pad_sh=parameters.pad_sh,
+    )
+
+
+class WorkRequest(BaseModel):
+    """Request to read the files of a job.
+
+    Attributes:
+        work: Kind of work, from `process.WORK`.
+        staged: Paths of the files, relative to the folder; the scene is the job's result for work on that.
+        seconds: Limit of CPU time in seconds.
+        memory: Memory limit in bytes for reading.
+        limits: Limits of the service for a job's inputs; empty for work on results.
+        options: Values that only one kind of work needs.
+        output: Name and maximum bytes of the only file that may be written; None for none.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    work: str
+    folder: Path
+    staged: Staged
+    parameters: JobParameters
+    seconds: float
+    memory: int
+    limits: dict[str, int] = {}
+    options: dict[str, Any] = {}
+    output: tuple[str, int] | None = None
+    threads: int = 1
+
+    @property
+    def source(self) -> SceneRequest:
+        """Return the request for scene and cameras."""
+        return SceneRequest.of(self.staged.scene, self.staged.cameras, self.parameters)
+
+    @property
+    def output_file(self) -> Path:
+        """Return the file to write, relative to the folder."""
+        assert self.output is not None
+        return Path(self.output[0])

@@ -1,28 +1,95 @@
-"""Packing of jobs on a machine: pure functions that decide what capacity the next job gets, or that it has to wait.
+"""Capacity of this machine, and pure functions that decide what the next job gets of it, or that it has to wait.
 
 Jobs do not share GPUs. A job that does not specify `workers` gets a portion of the free GPUs: all of them if no other
-job waits, one if many do, but never more than its estimated duration justifies. The job's plan then
-decides from measured times how many of them make the job faster, and the others are released
-(`service.scheduling.running`). A job also waits if the running jobs leave too little of the machine's memory for its
-scene. On a Ray cluster, Ray tracks the memory per machine (`worker.ranks.cluster`).
+job waits, one if many do, but never more than its estimated duration justifies. A job also waits if the running jobs
+leave too little of the machine's memory for its scene. On a Ray cluster, Ray tracks the memory per machine.
 
 Without GPUs, slots stand for fractions of the CPU and of the memory. There is one slot unless the operator sets
 `parallel_jobs`, because a single job uses all cores well. A job that needs more memory than one slot has takes several
 slots.
+
+Names of dispatchers reveal whether one of this machine still runs. Neither PyTorch nor Ray is imported.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
+import socket
+import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from service.scheduling.machine import Machine
+from service.settings import ServiceSettings
 from service.store.tables import JobRow
+from sgsst_core import container
 from sgsst_core.errors import SettingsError
 from sgsst_core.scales import ScaleWeights, scale_count
 from sgsst_core.settings import Settings, make_settings
-from worker.ranks.memory import GAUSSIAN_BYTES, memory_beside_gpus, scene_bytes
+from worker.job import GAUSSIAN_BYTES, memory_beside_gpus, scene_bytes
+from worker.processes import ProcessId, home
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Hardware that a dispatcher assigns to jobs.
+
+    Attributes:
+        gpus: Names of GPUs for CUDA_VISIBLE_DEVICES; consecutive numbers on a cluster.
+        memory: Total memory in bytes.
+        cluster: Whether jobs run on a Ray cluster, which assigns its GPUs itself.
+    """
+
+    gpus: tuple[str, ...]
+    cores: int
+    memory: int
+    cluster: bool = False
+
+    @staticmethod
+    def find(settings: ServiceSettings) -> Machine:
+        """Return this machine, or the portion of the cluster at RAY_ADDRESS that the settings name."""
+        cluster = bool(os.environ.get("RAY_ADDRESS"))
+        gpus = tuple(str(number) for number in range(settings.cluster_gpus)) if cluster else _own_gpus()
+        return Machine(gpus, container.cores(), container.memory().total, cluster)
+
+
+def _own_gpus() -> tuple[str, ...]:
+    """Return the NVIDIA GPUs that this process may use; none without a driver."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:
+        return tuple(part.strip() for part in visible.split(",") if part.strip() not in ("", "-1"))
+    try:
+        listing = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=20, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ()
+    count = sum(line.startswith("GPU ") for line in listing.stdout.splitlines()) if listing.returncode == 0 else 0
+    return tuple(str(number) for number in range(count))
+
+
+def own_name() -> str:
+    """Return the unique name of this process: its host, its process id, and its start time."""
+    own = ProcessId.of_this()
+    return f"{socket.gethostname()[:40]}-{_home_digest()}-{own.number}-{int(own.started)}"
+
+
+def is_dead(name: str) -> bool:
+    """Return whether the dispatcher ran in this process' process namespace and has exited."""
+    parts = name.rsplit("-", 3)
+    if not is_of_this_machine(name) or not (parts[2] + parts[3]).isdigit():
+        return False
+    return ProcessId(home(), int(parts[2]), float(parts[3]) + 0.5).find() is None
+
+
+def is_of_this_machine(name: str) -> bool:
+    """Return whether the dispatcher runs or ran in this process' process namespace."""
+    parts = name.rsplit("-", 3)
+    return len(parts) == 4 and parts[1] == _home_digest()
+
+
+def _home_digest() -> str:
+    return hashlib.sha256(repr(home()).encode()).hexdigest()[:8]
+
 
 #: Maximum fractions of the machine's memory that all concurrent jobs together, and each of them, may plan with. The
 #: latter equals the default of a job that runs alone (`sgsst_core.budget`), so that both round in the same way.

@@ -1,24 +1,29 @@
-"""Quotas of keys: jobs and GPU seconds per day (UTC), and stored bytes; usage is counted as it occurs."""
+"""API keys, browser sessions and quotas; usage is counted as it occurs.
+
+A browser that has sent a key once need not send it again. Only the SHA-256 of each secret is stored.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import secrets
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
-from sqlalchemy import BindParameter, String, bindparam, func, or_, select, text, union
+from sqlalchemy import BindParameter, String, bindparam, delete, func, or_, select, text, union
 from sqlalchemy.orm import Session
 
 from service import problems
 from service.settings import ServiceSettings
-from service.store.database import upsert
-from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, UploadRow, UsageRow
+from service.store.database import Database, new_id, upsert
+from service.store.tables import ArtifactRow, Base, BlobRow, BlobUseRow, JobRow, KeyRow, SessionRow, UploadRow, UsageRow
 
 _DAY = 86_400
 
 _USAGE = Base.metadata.tables[UsageRow.__tablename__]
 #: Prefix of the ids of receipts, and the SQL condition for receipts. A receipt charges a key for the bytes of one
-#: request (`service.store.inputs`).
+#: request (`service.store.files`).
 RECEIPT = "rcp"
 IS_RECEIPT = UploadRow.id.startswith(f"{RECEIPT}_", autoescape=True)
 
@@ -141,3 +146,108 @@ _STORED = (
     select(func.sum(BlobRow.size)).where(BlobRow.sha256.in_(union(_OF_JOBS, _OF_UPLOADS))),
     select(func.sum(ArtifactRow.size)).join(JobRow, JobRow.id == ArtifactRow.job_id).where(JobRow.owner == _OWNER),
 )
+
+#: Prefix of all keys, by which secret scanners recognize a leaked key.
+KEY_PREFIX = "sgsst_"
+
+#: Maximum number of sessions per key; a new one replaces the oldest.
+MOST_SESSIONS = 100
+
+_KEYS, _SESSIONS = (Base.metadata.tables[name] for name in ("api_keys", "sessions"))
+_KEY = select(_KEYS).where(_KEYS.c.sha256 == bindparam("sha256"))
+_KEY_OF_SESSION = (
+    select(_KEYS)
+    .join(_SESSIONS, _SESSIONS.c.key_id == _KEYS.c.id)
+    .where(
+        _SESSIONS.c.sha256 == bindparam("sha256"),
+        _SESSIONS.c.expires_at > bindparam("now"),
+        _KEYS.c.revoked_at.is_(None),
+    )
+)
+
+
+def digest(key: str) -> str:
+    """Return the stored digest of a key; its 256 random bits make a salt or a slow hash unnecessary."""
+    return hashlib.sha256(key.encode()).hexdigest()
+
+
+class Keys:
+    """API keys; a key's id is the owner of everything created with it."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(self, name: str, priority: int = 0, quotas: Quotas = NO_QUOTAS) -> tuple[KeyRow, str]:
+        """Create a key; return its row and the only copy of its text.
+
+        Args:
+            quotas: Quotas of the key; the service's defaults apply where they are None.
+        """
+        text = KEY_PREFIX + secrets.token_urlsafe(32)
+        now = self._database.clock()
+        with self._database.writing() as session:
+            row = KeyRow(id=new_id("key", now), name=name, sha256=digest(text), priority=priority, created_at=now)
+            row.quotas = quotas.given() or None
+            session.add(row)
+        return row, text
+
+    def all(self) -> list[KeyRow]:
+        """Return all keys, oldest first."""
+        with self._database.reading() as session:
+            return list(session.scalars(select(KeyRow).order_by(KeyRow.id)))
+
+    def revoke(self, key_id: str) -> KeyRow:
+        """Revoke a key; objects created with it remain until they expire.
+
+        Raises:
+            NotFoundError: If there is no such key.
+        """
+        with self._database.writing() as session:
+            row = session.get(KeyRow, key_id, with_for_update=True)
+            if row is None:
+                raise problems.NOT_FOUND(f"There is no key {key_id}. `sgsst keys list` shows their ids.")
+            row.revoked_at = row.revoked_at or self._database.clock()
+            return row
+
+    def find(self, text: str) -> KeyRow | None:
+        """Return the key with this text; None if it is unknown or revoked."""
+        with self._database.reading_rows() as connection:
+            row = connection.execute(_KEY, {"sha256": digest(text)}).one_or_none()
+        return KeyRow(**row._mapping) if row is not None and row.revoked_at is None else None
+
+
+class Sessions:
+    """Browser sessions; a session's text is a secret of 256 random bits, and only its SHA-256 is stored.
+
+    Args:
+        seconds: Lifetime of a session.
+    """
+
+    def __init__(self, database: Database, seconds: float) -> None:
+        self._database = database
+        self.seconds = seconds
+
+    def create(self, key_id: str) -> str:
+        """Create a session of a key and return the only copy of its text; expired sessions are deleted."""
+        text, now = secrets.token_urlsafe(32), self._database.clock()
+        with self._database.writing() as session:
+            session.execute(delete(SessionRow).where(SessionRow.expires_at <= now))
+            of_key = select(SessionRow.sha256).where(SessionRow.key_id == key_id)
+            old = session.scalars(of_key.order_by(SessionRow.created_at.desc()).offset(MOST_SESSIONS - 1)).all()
+            session.execute(delete(SessionRow).where(SessionRow.sha256.in_(old)))
+            row = SessionRow(sha256=digest(text), key_id=key_id, created_at=now, expires_at=now + self.seconds)
+            session.add(row)
+        return text
+
+    def find(self, text: str) -> KeyRow | None:
+        """Return the key of a session; None if the session is unknown or expired, or the key was revoked."""
+        with self._database.reading_rows() as connection:
+            row = connection.execute(
+                _KEY_OF_SESSION, {"sha256": digest(text), "now": self._database.clock()}
+            ).one_or_none()
+        return KeyRow(**row._mapping) if row is not None else None
+
+    def end(self, text: str) -> None:
+        """End a session if it exists."""
+        with self._database.writing() as session:
+            session.execute(delete(SessionRow).where(SessionRow.sha256 == digest(text)))

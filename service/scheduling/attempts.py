@@ -5,8 +5,12 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import os
 import queue
 import shutil
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections import deque
@@ -18,23 +22,180 @@ from typing import Any, TypeVar
 
 from service import problems
 from service.deadlines import LEAST_RATE
-from service.errors import LeaseLostError, ServiceError, StoreError
-from service.files.artifacts import Artifacts
-from service.files.staging import layout
-from service.parameters import stored_parameters
-from service.request import job_spec
-from service.scheduling.child_process import ChildProcess
-from service.scheduling.endings import Ending, Report, StopRequest, attempt_ending, cause_of_error, outage
-from service.scheduling.packing import Grant
+from service.files.blobs import BLOBS, Blobs
+from service.files.objects import Artifacts
+from service.inputs import CHECKPOINT, PLAN, RESULT, job_spec, layout, stage, stored_parameters
+from service.inspection.inspector import stored_plan
+from service.problems import DamagedFileError, LeaseLostError, LostFileError, ServiceError, StoreError
+from service.scheduling.capacity import Grant
+from service.scheduling.messages import (
+    Ending,
+    Report,
+    StopRequest,
+    StoredFile,
+    StoreWorkplace,
+    Task,
+    attempt_ending,
+    cause_of_error,
+    outage,
+)
 from service.scheduling.publishing import PATIENCE_SECONDS, Publisher
-from service.scheduling.stager import Stager
+from service.scheduling.rank_folder import store_weights
 from service.settings import ServiceSettings
 from service.states import AttemptOutcome, Cause, JobStatus
 from service.store import Store
-from service.store.leases import Lease
-from service.store.retries import cause_of
+from service.store.queue import Lease, cause_of
+from service.store.tables import ArtifactRow, BlobRow
 from sgsst_core.errors import SettingsError
 from sgsst_core.progress import Progress
+from worker.job import JobSpec
+
+#: Variables that set a process' number of threads; values set by the operator take precedence.
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class ChildProcess:
+    """Running `service.scheduling.attempt_process`; it is started by the constructor.
+
+    Args:
+        cluster: Whether the attempt runs on a Ray cluster, which assigns GPUs itself.
+    """
+
+    def __init__(self, folder: Path, grant: Grant, *, cluster: bool) -> None:
+        # a process without assigned GPUs must not see any
+        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "" if cluster else ",".join(grant.gpus)}
+        if grant.threads is not None:
+            environment = dict.fromkeys(_THREADS, str(grant.threads)) | environment
+        with (folder / "log.txt").open("ab") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "service.scheduling.attempt_process", str(folder)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=environment,
+                start_new_session=True,
+            )
+        self._reports: queue.Queue[Report | None] = queue.Queue()
+        self._deadline: float | None = None
+        self._finishing = False
+        threading.Thread(target=self._listen, name=f"{folder.name}-out", daemon=True).start()
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            with contextlib.suppress(ValueError):
+                self._reports.put(Report.model_validate_json(line))
+        self._reports.put(None)
+
+    def receive(self, seconds: float) -> Report | None:
+        """Return the next report; None if the process has closed its output.
+
+        Raises:
+            queue.Empty: If no report arrives within this time.
+        """
+        return self._reports.get(timeout=seconds)
+
+    def finish(self) -> None:
+        """Ask the process to end its job after the current step, with the present colors as the result.
+
+        Call this only after the report `prepared`: earlier, the process may not handle the signal yet.
+        """
+        if not self._finishing:
+            self._finishing = True
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGUSR1)
+
+    def stop(self, patience: float) -> None:
+        """Ask the process to stop; calls after `patience` seconds kill it."""
+        if self._deadline is None:
+            self._deadline = time.monotonic() + patience
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGTERM)
+        elif time.monotonic() > self._deadline:
+            self._deadline = math.inf
+            self.kill()
+
+    def kill(self) -> None:
+        """Kill the process and all processes that it has started."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+    def wait(self) -> int:
+        """Wait for the process to exit, and return its exit code; negative for the signal that killed it."""
+        return self._process.wait()
+
+
+_log = logging.getLogger(__name__)
+
+
+class Stager:
+    """Preparer of the folders of a dispatcher's attempts.
+
+    Args:
+        cluster: Whether attempts run on a Ray cluster. If the file store is remote, ranks stage the files themselves.
+    """
+
+    def __init__(
+        self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts, *, cluster: bool
+    ) -> None:
+        self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
+        self.cluster = cluster
+
+    def prepare(self, folder: Path, lease: Lease, grant: Grant, spec: JobSpec) -> None:
+        """Create the folder of an attempt at a job.
+
+        Raises:
+            LostFileError, DamagedFileError: If an input cannot be used.
+            StoreError: If the file store does not respond.
+        """
+        (folder / "out").mkdir(parents=True)
+        job = lease.job
+        checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)
+        workplace = self._workplace(lease, checkpoint) if self.cluster and not self._artifacts.local else None
+        if workplace is None:
+            self._stage(folder, lease, checkpoint)
+        settings = spec.settings
+        if grant.memory is not None:
+            settings = settings.model_copy(update={"memory_limit": grant.memory})
+        task = Task(
+            spec=spec.model_copy(update={"settings": settings, "resume": checkpoint is not None}),
+            workers=grant.ranks,
+            cluster=self.cluster,
+            checkpoint_seconds=self._settings.checkpoint_seconds,
+            preview_seconds=self._settings.preview_seconds,
+            workplace=workplace,
+        )
+        (folder / "task.json").write_text(task.model_dump_json())
+
+    def _stage(self, folder: Path, lease: Lease, checkpoint: ArtifactRow | None) -> None:
+        """Stage the job's files in the attempt's folder."""
+        if checkpoint is not None:
+            target = folder / "out" / f"{Path(RESULT).stem}.checkpoint.safetensors"
+            try:
+                self._artifacts.fetch(checkpoint.location, target, checkpoint.sha256)
+            except (LostFileError, DamagedFileError) as error:
+                _log.warning("checkpoint not usable, job restarts: %s", error, extra=lease.log_fields)
+        job = lease.job
+        stage(folder, job.inputs, self._blobs.fetch(self._input_rows(lease), folder))
+        (folder / PLAN).symlink_to(
+            stored_plan(self._settings, job.owner, job.inputs, stored_parameters(job.parameters)).absolute()
+        )
+
+    def _input_rows(self, lease: Lease) -> dict[str, BlobRow]:
+        return self._store.inputs.blobs(sorted({entry["sha256"] for entry in lease.job.inputs}))
+
+    def _workplace(self, lease: Lease, checkpoint: ArtifactRow | None) -> StoreWorkplace:
+        """Return the description that ranks on other machines need to stage the job's files."""
+        files = [
+            StoredFile(f"{BLOBS}/{row.location}", row.sha256, row.size) for row in self._input_rows(lease).values()
+        ]
+        saved = StoredFile(checkpoint.location, checkpoint.sha256, checkpoint.size) if checkpoint is not None else None
+        objects, weights = self._artifacts.objects, store_weights(self._artifacts.objects)
+        return StoreWorkplace(
+            objects.url, lease.job_id, lease.epoch, tuple(lease.job.inputs), tuple(files), saved, weights
+        )
+
 
 #: Time that a canceled job has to finish its step, in seconds.
 _CANCEL_SECONDS = 8.0
@@ -51,8 +212,6 @@ _PROGRESS_SECONDS = (1.0, 5.0)
 _NOTIFIED_SECONDS = 5.0
 
 T = TypeVar("T")
-
-_log = logging.getLogger(__name__)
 
 
 class RunningAttempt:

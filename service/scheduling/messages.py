@@ -1,21 +1,110 @@
-"""Reports of an attempt's process, and pure functions that decide from them how the attempt ended."""
+"""What a dispatcher and the process of an attempt send each other: task, reports, and how the attempt ended."""
 
 from __future__ import annotations
 
 import errno
 import re
 import signal
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from service.errors import DatabaseUnavailableError, NoSpaceError, StoreError
+from service.inputs import CHECKPOINT
+from service.problems import DatabaseUnavailableError, NoSpaceError, StoreError
 from service.states import AttemptOutcome, Cause, Published
 from sgsst_core.errors import InfrastructureError, OutputError, WeightsError
 from sgsst_core.progress import Progress
-from worker.job import Result
+from worker.job import JobSpec, Result, scene_bytes
+from worker.ranks.rank import Stored
+
+if TYPE_CHECKING:
+    from service.scheduling.rank_folder import RankFolder
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """File in the store."""
+
+    name: str
+    sha256: str
+    size: int
+
+
+@dataclass(frozen=True)
+class StoreWorkplace:
+    """Description of a job's files for its ranks.
+
+    Attributes:
+        job_id, epoch: Prefix of the job's stored files.
+        inputs: `role`, `name`, `sha256` and `size` of each input, for `stage`.
+        checkpoint: Checkpoint to resume from; None for none.
+        weights: Feature network weights by file name; empty to use the machine's own.
+    """
+
+    url: str
+    job_id: str
+    epoch: int
+    inputs: tuple[dict[str, Any], ...]
+    files: tuple[StoredFile, ...]
+    checkpoint: StoredFile | None
+    weights: dict[str, StoredFile]
+
+    @property
+    def scene_bytes(self) -> int:
+        """Size of the scene in bytes, once it is read."""
+        files = [entry for entry in self.inputs if entry["role"] == "scene"]
+        return sum(scene_bytes(entry["name"], entry["size"]) for entry in files)
+
+    def open(self, rank: int, stored: Stored) -> RankFolder:
+        """Stage the job's files for a rank.
+
+        Missing files are fetched once into the machine's cache, which all its ranks share.
+
+        Raises:
+            InfrastructureError: If the store is unreachable or has lost a file, or the disk is full.
+        """
+        from service.scheduling.rank_folder import RankFolder
+
+        try:
+            return RankFolder(self, rank, stored)
+        except OSError as error:
+            raise InfrastructureError(f"The job's files cannot be staged here: {error}.") from error
+
+    def after(self, stored: Sequence[Published]) -> StoreWorkplace:
+        """Return a copy whose checkpoint is the last one among these files."""
+        saved = [file for file in stored if file.name == CHECKPOINT]
+        if not saved:
+            return self
+        return replace(self, checkpoint=StoredFile(saved[-1].location, saved[-1].sha256, saved[-1].size))
+
+    def tidy(self) -> None:
+        """Remove folders of dead ranks on this machine."""
+        from service.scheduling.rank_folder import remove_leftovers
+
+        remove_leftovers()
+
+
+class Task(BaseModel):
+    """Content of `task.json`.
+
+    Attributes:
+        spec: Specification of the job, with paths relative to the folder. Whether it resumes depends on a checkpoint,
+            which is in `out` or in the workplace and may turn out to be unusable.
+        workers: Maximum number of ranks; 1 runs the job in this process alone.
+        cluster: Whether to run even a single rank on the Ray cluster.
+        workplace: Description of the job's files for ranks on machines that share no folder with this one; None if all
+            ranks share the folder.
+    """
+
+    spec: JobSpec
+    workers: int
+    cluster: bool
+    checkpoint_seconds: float
+    preview_seconds: float
+    workplace: StoreWorkplace | None = None
 
 
 class StopRequest(StrEnum):

@@ -1,0 +1,441 @@
+"""Files derived from scenes, for the command line and, in confinement, for the service: conversions, blends, pages, videos."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import html
+import io
+import json
+import re
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from sgsst_core.errors import CameraError, OutputError, SceneError, SettingsError
+from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.blending import blend_scenes, check_same_shape, common_rests, encode_blend
+from sgsst_core.files.formats import format_of_name, read_scene_header, scene_path
+from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.scene_format import SceneFormat
+from sgsst_core.files.formats.sog import META_NAME, SOG
+from sgsst_core.files.formats.streamed_sog import INDEX_NAME, STREAMED_SOG
+from sgsst_core.files.images import Color
+from sgsst_core.files.library import load_scene
+from sgsst_core.files.scene_file import SceneFile, encode_scene, losses, read_scene, write_levels, write_sog_folder
+from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
+from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
+from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
+from sgsst_core.orbit.cameras import ELEVATION, turntable
+from sgsst_core.orbit.choice import find_upright_subject
+from sgsst_core.progress import Decision, warnings_of
+from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.report.video import Layer, write_frames
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.rendering import CLASSIC
+from sgsst_core.settings import Settings
+from worker.capture import Capture, about_notes, about_rendering, choose_axes, orbit_request, read_capture
+from worker.inputs import check_something_in_view, cropped, read_job_capture, read_requested
+from worker.job import JobSpec, SceneRequest, check_choice
+from worker.options import DEFAULT_SIDE, VideoOptions
+from worker.outputs import check_folder, check_is_not_input, result_format
+from worker.prepare import describe_scene
+
+#: Number of views of an orbit that a converted scene is compared in.
+_COMPARED_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Converted:
+    """Result of a conversion.
+
+    Attributes:
+        scene: Text about the scene, with contents that were not read, or not read as stored.
+        decisions: Decisions about the scene's axes and the cameras.
+        loss: Difference of the written scene; None if it was not measured.
+    """
+
+    scene: str
+    decisions: tuple[Decision, ...]
+    loss: CompressionLoss | None
+
+
+def convert(
+    source: SceneRequest,
+    out: Path,
+    *,
+    compare: bool,
+    images: Path | None = None,
+    settings: Settings | None = None,
+    levels_of: Path | None = None,
+    pad_sh: bool = False,
+    in_place: bool = False,
+) -> Converted:
+    """Write a scene in the format that the name of a file determines. Colors and order may change by its rounding.
+
+    Args:
+        source: Scene or checkpoint of a trainer, and cameras for the comparison; without cameras, views are those of an
+            orbit.
+        out: File to write: a scene, the meta.json of an unpacked SOG, the lod-meta.json or archive of a streamed SOG,
+            or a USD file, which cannot be compared.
+        compare: Whether to read the file back and compare renders.
+        images: Folder of photos, for cameras whose file states no sizes.
+        settings: Settings of a job, whose views and background the renders have; None for those of the cameras, on
+            black.
+        levels_of: Streamed SOG that the scene is the finest level of, with other colors; None for the scene itself.
+        pad_sh: Whether a PLY has spherical harmonics of degree 3 in any case.
+        in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
+
+    Raises:
+        InvalidInputError: If scene, cameras or output cannot be used.
+    """
+    is_usd = out.suffix.lower() in USD_SUFFIXES
+    streamed = out.name == INDEX_NAME or format_of_name(out.name) is STREAMED_SOG
+    if is_usd:
+        check_usd(out)
+        if compare:
+            raise OutputError(f"{out}: USD can only be written, so it cannot be compared. Omit --compare.")
+    elif streamed and not levels_of and read_scene_header(source.scene).format is not STREAMED_SOG:
+        raise OutputError(
+            f"{out}: needs the levels of a streamed SOG. Give the one that the scene is from: --levels-of."
+        )
+    elif levels_of and not streamed:
+        raise OutputError(f"{out}: has no levels of detail. Name a {INDEX_NAME} or a .zip, or omit --levels-of.")
+    elif out.name != META_NAME and not streamed:
+        result_format(out)
+    if pad_sh and format_of_name(out.name) is not PLY:
+        raise OutputError(f"{out}: only a PLY can be padded. Name a .ply, or omit --pad-sh.")
+    for path in filter(None, (source.scene, levels_of)):
+        check_is_not_input(out, scene_path(path))
+    if compare and source.cameras is None and source.orbit is None:
+        source = source.model_copy(update={"orbit": _COMPARED_VIEWS})
+    axes, decisions = choose_axes(source, images)
+    loaded = load_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+    file = loaded.scene_file() if isinstance(loaded, TrainerCheckpoint) else loaded
+    file = file.rendered(source.render_mode, source.eps2d)
+    scene, decisions = file.scene, [*about_notes(file), *decisions, *about_rendering(file)]
+    cameras: list[Camera] = []
+    if source.cameras or source.orbit:
+        capture = read_capture(source, scene, images)
+        capture = (capture.fitted(settings) if settings else capture).checked(scene, source.near)
+        cameras, decisions = capture.cameras, [*decisions, *capture.decisions]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    size = None
+    if streamed:
+        size = write_levels(out, scene, levels_of or source.scene)
+    elif out.name == META_NAME:
+        size = write_sog_folder(out.parent, scene)
+    elif is_usd:
+        write_usd(out, scene)
+    else:
+        with _written(out, in_place=in_place) as stream:
+            encode_scene(stream, scene, result_format(out), out, pad_sh=pad_sh, axes=file.axes)
+    stated = CLASSIC if is_usd else read_scene_header(out).tag.rendering
+    if stated != scene.rendering:
+        reason = f"its format cannot state {scene.rendering.text}"
+        decisions += [Decision("rendering", f"warning: {out.name} will be drawn {stated.text}", reason)]
+    decisions += [] if is_usd or compare else about_losses(scene, read_scene_header(out).format, out)
+    loss = None
+    if compare:
+        background = settings.background if settings else (0.0, 0.0, 0.0)
+        loss = measure_compression(out, scene, cameras, background=background, near=source.near, axes=file.axes)
+        loss = replace(loss, size=size or loss.size)
+    return Converted(describe_scene(file), tuple(decisions), loss)
+
+
+def about_losses(scene: Scene, format: SceneFormat, out: Path) -> list[Decision]:
+    """Return warnings about what a format cannot hold of a scene."""
+    return [Decision("scene", f"warning: {out.name} loses detail", note) for note in losses(scene, format)]
+
+
+def blend(parts: Sequence[tuple[SceneRequest, float]], out: Path, *, in_place: bool = False) -> list[Decision]:
+    """Write the weighted mean of scenes that differ only in color, and return warnings about what is lost.
+
+    Args:
+        parts: Scenes with their weights, which are divided by their sum. Cameras are not used.
+        out: Scene file to write.
+        in_place: See `convert`.
+
+    Raises:
+        InvalidInputError: If the weights, a scene or the output cannot be used.
+    """
+    format = result_format(out)
+    for source, _ in parts:
+        check_is_not_input(out, source.scene)
+    files = [
+        read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=source.spz_axes) for source, _ in parts
+    ]
+    blended = blend_scenes(files, [weight for _, weight in parts])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with _written(out, in_place=in_place) as stream:
+        encode_blend(stream, blended, format, out)
+    return about_losses(blended.scene, format, out)
+
+
+@contextmanager
+def _written(out: Path, *, in_place: bool) -> Iterator[BinaryIO]:
+    """Open a file to write, which replaces `out` at the end unless it is written in place."""
+    if in_place:
+        with out.open("wb") as stream:
+            yield stream
+        return
+    with atomic_path(out) as temporary, temporary.open("wb") as stream:
+        yield stream
+
+
+#: Largest relative difference of spherical harmonics that are those of the original times a factor.
+_TOLERANCE = 1e-3
+
+
+def write_page(
+    out: Path,
+    viewer: Mapping[str, str],
+    stylized: SceneFile,
+    original: SceneFile | None,
+    title: str,
+    *,
+    background: Color = (0.0, 0.0, 0.0),
+    up: list[float] | None = None,
+    in_place: bool = False,
+) -> None:
+    """Write a scene as an HTML file, atomically.
+
+    Args:
+        viewer: Sources of the viewer; see `api.static_files.exported_viewer`.
+        original: Scene of the same Gaussians to show beside it, with a wipe and a blend; None for none.
+        background: Color behind the scene, in 0..1.
+        up: Up direction; None to estimate it.
+        in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
+
+    Raises:
+        SceneError: If the scenes differ in more than their colors and an SH attenuation.
+        OutputError: If the file cannot be written.
+    """
+    shown = original or stylized
+    fade = 0.0 if original is None else _fade(stylized, original)
+    data = {name: gzip.compress(viewer[name].encode(), mtime=0) for name in ("page", "worker")}
+    data["scene"] = _sog(shown.scene, out)
+    data["colors"] = b"" if original is None else gzip.compress(_indexed_colors(stylized.scene, out), mtime=0)
+    upright = up or find_upright_subject(shown.scene, None)[1].direction.tolist()
+    sizes = {name: len(content) for name, content in data.items()}
+    sog = shown.format in (SOG.name, STREAMED_SOG.name)
+    facts = {"title": title, "up": upright, "fade": fade, "sog": sog, "background": background, "bytes": sizes}
+    about = json.dumps(facts).replace("<", "\\u003c")
+    values = {"title": html.escape(title), "style": viewer["style"], "about": about}
+    values |= {name: _base85(content) for name, content in data.items()}
+    page = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], viewer["document"])
+    with nullcontext(out) if in_place else atomic_path(out) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _fade(stylized: SceneFile, original: SceneFile) -> float:
+    """Return the fraction by which the harmonics of the stylized scene are smaller than those of the original."""
+    check_same_shape(original, stylized)
+    before, after = common_rests([original.scene, stylized.scene])
+    if torch.equal(before, after):
+        return 0.0
+    factor = float((before.double() * after.double()).sum() / before.double().square().sum())
+    if not torch.allclose(after, factor * before, rtol=0, atol=_TOLERANCE * float(before.abs().max())):
+        raise SceneError(
+            f"{stylized.path}: its view-dependent colors are not those of {original.path}. Give the scene that was "
+            "stylized, in the same format."
+        )
+    return 1 - factor
+
+
+def _sog(scene: Scene, out: Path) -> bytes:
+    stream = io.BytesIO()
+    encode_scene(stream, scene, SOG, out)
+    return stream.getvalue()
+
+
+def _indexed_colors(scene: Scene, out: Path) -> bytes:
+    """Return the codebook of a scene's colors as 256 halves, and 3 bytes for each Gaussian, in the order of its SOG."""
+    flat = replace(scene, sh_rest=torch.zeros(len(scene), 0, 3))  # harmonics would only take time
+    with zipfile.ZipFile(io.BytesIO(_sog(flat, out))) as archive:
+        meta: dict[str, Any] = json.loads(archive.read(META_NAME))
+        with Image.open(archive.open(meta["sh0"]["files"][0])) as image:
+            indices = np.asarray(image.convert("RGBA")).reshape(-1, 4)[: meta["count"], :3]
+    return np.array(meta["sh0"]["codebook"], "<f2").tobytes() + indices.tobytes()
+
+
+def _base85(data: bytes) -> str:
+    """Encode bytes so that they can stand in a script element: "<", which would end it, becomes a comma."""
+    return base64.b85encode(data, pad=True).decode().replace("<", ",")
+
+
+@dataclass(frozen=True)
+class VideoRequest:
+    """Request for a video of a scene.
+
+    Attributes:
+        source: Scene and cameras; its resolution is the longer side of the video.
+        out: Video, or images, to write; see `sgsst_core.files.video`.
+        background: Background color, in 0..1.
+        unstylized: Scene file at the start of a transition; None for no transition.
+        transparent: Whether to write an alpha channel instead of the background.
+        job: Job whose result the scene is, for a path through the job's own views; None for those of `source`.
+    """
+
+    source: SceneRequest
+    out: Path
+    options: VideoOptions
+    background: Color
+    unstylized: Path | None = None
+    transparent: bool = False
+    job: JobSpec | None = None
+
+    @property
+    def along_cameras(self) -> bool:
+        """Return whether the path leads through cameras rather than around the scene."""
+        path = self.options.path
+        return path == "cameras" or (path == "auto" and self.source.cameras is not None)
+
+
+def check_video_request(request: VideoRequest) -> None:
+    """Check a request as far as possible without reading the scene.
+
+    Raises:
+        InvalidInputError: If options contradict each other, or the video cannot be written.
+        ModuleNotFoundError: If the extra `video` is required but not installed.
+    """
+    source, out = request.source, request.out
+    check_video_path(out, alpha=request.transparent)
+    if request.along_cameras:
+        check_choice(source)
+    elif source.orbit is not None:
+        raise SettingsError(
+            "--orbit creates single views, but a turntable has a view per frame. Omit it, or add --path cameras for a "
+            "path through these views."
+        )
+    for scene in (source.scene, request.unstylized):
+        if scene is not None:
+            check_is_not_input(out, scene)
+    check_folder(frames_folder(out))
+
+
+def render_video(
+    request: VideoRequest,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    warn: Callable[[str], None] = lambda line: None,
+    *,
+    in_place: bool = False,
+) -> list[Camera]:
+    """Render a requested video on the CPU, and return its cameras. All inputs are checked first.
+
+    Args:
+        request: Request that `check_video_request` accepts.
+        progress: Callback that receives the numbers of completed and of all frames.
+        warn: Callback for warnings about scene and cameras.
+        in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
+
+    Raises:
+        InvalidInputError: If an input cannot be used, or the video cannot be written.
+    """
+    source = request.source
+    file, decisions = read_requested(source)
+    scene, before = file.scene, None
+    if request.unstylized is not None:
+        before = read_requested(source.model_copy(update={"scene": request.unstylized}))[0].scene
+    through = remaining = None
+    if request.along_cameras:
+        capture = _read_views(request, file).checked(scene, source.near)
+        through, decisions = capture.cameras, [*decisions, *capture.decisions]
+    elif request.job is not None and request.job.regions:
+        file, _ = read_requested(request.job.source)  # regions select its Gaussians, which may have been split since
+        remaining = cropped(request.job.regions, file, source.near)
+    even, side = is_encoded(request.out), source.resolution
+    cameras = video_cameras(file.scene, source, through, request.options, side, remaining, even=even)
+    check_something_in_view(scene, cameras, source.near)
+    for line in warnings_of(decisions):
+        warn(line)
+    background = (0.0, 0.0, 0.0) if request.transparent else request.background
+
+    def layer(shown: Scene) -> Layer:
+        # the intersections of the current frame alone are cached
+        return Layer(shown, make_rasterizer("cpu", shown, background=background, near=source.near, memory=0))
+
+    after = layer(scene)
+    unstylized = None
+    if before is not None:
+        shape = ("means", "quats", "scales", "opacities")
+        same = all(torch.equal(getattr(before, name), getattr(scene, name)) for name in shape)
+        same = same and before.rendering == scene.rendering
+        unstylized = Layer(before, after.rasterizer) if same else layer(before)
+    request.out.parent.mkdir(parents=True, exist_ok=True)
+    write_to, first, options = encoder if in_place else video_writer, cameras[0], request.options
+    with write_to(request.out, first.width, first.height, options.fps, alpha=request.transparent) as write:
+        write_frames(
+            write,
+            after,
+            cameras,
+            unstylized=unstylized,
+            transition=options.transition,
+            alpha=request.transparent,
+            progress=progress,
+        )
+    return cameras
+
+
+def video_cameras(
+    scene: Scene,
+    source: SceneRequest,
+    through: Sequence[Camera] | None,
+    options: VideoOptions,
+    side: int | None,
+    remaining: Tensor | None = None,
+    *,
+    even: bool,
+) -> list[Camera]:
+    """Return the cameras of a video, one per frame.
+
+    Args:
+        scene: Scene that a turntable surrounds.
+        source: Up direction, elevation, radius and near plane of a turntable.
+        through: Cameras that the path leads through; None for a turntable.
+        side: Longer side in pixels; None for the cameras' own, but at most `DEFAULT_SIDE`.
+        remaining: [N] bool, Gaussians of a cropped scene that a turntable surrounds; None for all.
+        even: Whether sides must be even.
+
+    Raises:
+        SettingsError: If there are no cameras, or an option of the turntable is out of range.
+    """
+    if through is not None:
+        if not through:
+            raise CameraError("A camera path needs at least one camera. Give some, or use the path orbit.")
+        path = CameraPath(in_path_order(through)).evenly(options.frames)
+        side = side or min(DEFAULT_SIDE, max(path[0].width, path[0].height))
+        return [framed(camera, side, even=even) for camera in path]
+    request = orbit_request(source)
+    subject, up = find_upright_subject(scene, request.up, remaining)
+    cameras = turntable(
+        subject,
+        options.frames,
+        up=up.direction.tolist(),
+        elevation=ELEVATION if request.elevation is None else request.elevation,
+        radius=request.radius,
+        side=side or DEFAULT_SIDE,
+        near=request.near,
+    )
+    return [framed(camera, None, even=even) for camera in cameras]
+
+
+def _read_views(request: VideoRequest, file: SceneFile) -> Capture:
+    """Read or generate the views that a path leads through, given the scene of the video."""
+    job = request.job
+    if job is None:
+        return read_capture(request.source, file.scene)
+    if job.source.cameras is None:  # an orbit depends on the job's scene, whose Gaussians may have been split since
+        file, _ = read_requested(job.source)
+    return read_job_capture(job, file)
