@@ -1,4 +1,4 @@
-"""Files derived from scenes, for the command line and, in confinement, for the service: conversions, blends, pages, videos."""
+"""Files derived from scenes, for the command line and, confined, for the service: conversions, pages, videos."""
 
 from __future__ import annotations
 

@@ -59,13 +59,14 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         results = Artifacts(settings.artifacts_url)
         blobs = open_blobs(settings, store.inputs, results)
         threads = FileThreads(_FILES_FRACTION * settings.answer_seconds)
+        inspector = Inspector(settings, store, blobs, threads)
         context = Context(
             settings=settings,
             store=store,
             blobs=blobs,
             artifacts=results,
-            inspector=Inspector(settings, store, blobs, threads),
-            derived=DerivedFiles(settings, store, blobs, results, threads),
+            inspector=inspector,
+            derived=DerivedFiles(settings, store, blobs, results, threads, inspector.processes),
             hub=Hub(store),
             sign_ins=SignIns(),
             rates=Rates(),
@@ -94,8 +95,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         yield
         context.receipts.close()
         await context.hub.close()
-        await context.inspector.close()
-        await context.derived.close()
+        await context.inspector.processes.close()
         context.readiness.close()
         threads.close()
         store.close()

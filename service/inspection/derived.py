@@ -24,10 +24,10 @@ from service.inputs import RESULT, Staged, WorkRequest, stage, stored_parameters
 from service.inspection.inspector import (
     MEMORY_PER_BYTE,
     InspectionProcess,
-    Lanes,
+    Kind,
+    Processes,
     Show,
     findings_of,
-    threads_of_a_job,
     working_folder,
 )
 from service.problems import LostFileError
@@ -116,11 +116,16 @@ class DerivedFiles:
     """
 
     def __init__(
-        self, settings: ServiceSettings, store: Store, blobs: Blobs, artifacts: Artifacts, threads: FileThreads
+        self,
+        settings: ServiceSettings,
+        store: Store,
+        blobs: Blobs,
+        artifacts: Artifacts,
+        threads: FileThreads,
+        processes: Processes,
     ) -> None:
         self._settings, self._store, self._blobs, self._artifacts = settings, store, blobs, artifacts
-        self._threads = threads
-        self._files, self._videos = (Lanes([InspectionProcess(count)]) for count in (1, threads_of_a_job(settings)))
+        self._threads, self._processes = threads, processes
         self._making: dict[tuple[str, str], _Making] = {}
         self._folder = working_folder(settings, "packing")
 
@@ -213,7 +218,7 @@ class DerivedFiles:
 
     async def _compress(self, job: JobRow, name: str, quotas: Quotas) -> None:
         """Compress the result, store the files, and make them visible."""
-        async with self._turn(self._files, job) as (process, folder, result):
+        async with self._turn("file", job) as (process, folder, result):
             await self._threads.run(job.owner, self._blobs.ensure_space, 3 * result.size)
             staged = await self._stage(folder, job, [result])
             request = self._request(
@@ -233,7 +238,7 @@ class DerivedFiles:
 
     async def _blend(self, job: JobRow, blend: Blend, quotas: Quotas) -> None:
         """Blend the results, store the file, and make it visible."""
-        async with self._turn(self._files, job) as (process, folder, result):
+        async with self._turn("file", job) as (process, folder, result):
             artifacts = await asyncio.to_thread(self._store.jobs.artifacts, job.id)
             if sum(row.name.startswith(_BLENDS) for row in artifacts) >= MOST_BLENDS:
                 raise problems.TOO_MANY_BLENDS(job_id=job.id, limit=MOST_BLENDS)
@@ -259,7 +264,7 @@ class DerivedFiles:
 
     async def _write_page(self, job: JobRow, viewer: dict[str, str], quotas: Quotas) -> None:
         """Write the page, store it, and make it visible."""
-        async with self._turn(self._files, job) as (process, folder, result):
+        async with self._turn("file", job) as (process, folder, result):
             scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
             size = result.size + (scene["size"] if scene else 0)
             most = _PAGE_SIZE * result.size + _HEADER_BYTES
@@ -284,7 +289,7 @@ class DerivedFiles:
         pixels = side * side * options.frames * (2 if options.compare else 1)
         most = round(_VIDEO_BYTES_PER_PIXEL * pixels) + _HEADER_BYTES
         await self._threads.run(job.owner, self._blobs.ensure_space, 2 * size + round(_USUAL_BYTES * most))
-        async with self._turn(self._videos, job) as (process, folder, result):
+        async with self._turn("video", job) as (process, folder, result):
             staged = await self._stage(folder, job, [result])
             request = self._request(
                 "video",
@@ -301,11 +306,9 @@ class DerivedFiles:
             await self._threads.run(job.owner, publish, job, result, {VIDEO: folder / VIDEO}, quotas, size=most)
 
     @asynccontextmanager
-    async def _turn(
-        self, lanes: Lanes[InspectionProcess], job: JobRow
-    ) -> AsyncIterator[tuple[InspectionProcess, Path, ArtifactRow]]:
+    async def _turn(self, kind: Kind, job: JobRow) -> AsyncIterator[tuple[InspectionProcess, Path, ArtifactRow]]:
         """Wait for the owner's turn, and provide the process, an empty folder, and the job's result."""
-        async with lanes.turn(job.owner) as process:
+        async with self._processes.turn(job.owner, kind) as process:
             result = await asyncio.to_thread(self._result, job.id)  # the job may have been deleted meanwhile
             async with self._threads.folder(job.owner, self._folder) as folder:
                 yield process, folder, result
@@ -378,11 +381,6 @@ class DerivedFiles:
                 store.inputs.end_receipt(receipt)
             for location in [file.location for file in put] if unused is None else unused:
                 artifacts.objects.remove(location)
-
-    async def close(self) -> None:
-        """Stop the processes, which also aborts any work in progress."""
-        for process in (*self._files.slots, *self._videos.slots):
-            await process.close()
 
 
 def _staged_name(job: JobRow, result: ArtifactRow) -> str:

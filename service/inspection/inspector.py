@@ -15,7 +15,7 @@ from collections import OrderedDict, deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Literal
 
 from service import problems
 from service.deadlines import FileThreads, suspended
@@ -31,31 +31,28 @@ from sgsst_core.errors import WeightsError
 #: Maximum number of waiting requests per owner; further ones are rejected with `BUSY`.
 MAX_WAITING = 64
 
-Slot = TypeVar("Slot")
 
-
-class Lanes(Generic[Slot]):
-    """Slots that owners take turns on; each owner occupies at most one at a time.
+class Lanes:
+    """Fair scheduling of owners: an owner with many requests delays only their own.
 
     Args:
-        slots: Slots; the first free one is assigned.
+        count: Number of requests at a time, at most one of each owner.
     """
 
-    def __init__(self, slots: Sequence[Slot]) -> None:
-        self.slots = tuple(slots)
-        self._free = list(slots)
+    def __init__(self, count: int) -> None:
+        self._free = count
         self._active: set[str] = set()
         # owners in the order of their turns; the owner of a finished turn moves to the end
-        self._waiting: OrderedDict[str, deque[asyncio.Future[Slot]]] = OrderedDict()
+        self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
 
     @property
     def full(self) -> bool:
-        """Whether no slot is free."""
+        """Whether a request would have to wait."""
         return not self._free
 
     @asynccontextmanager
-    async def turn(self, owner: str) -> AsyncIterator[Slot]:
-        """Wait for the owner's turn and occupy a slot for the duration of the block.
+    async def turn(self, owner: str) -> AsyncIterator[None]:
+        """Wait for the owner's turn, which lasts for the duration of the block.
 
         Raises:
             BUSY: If too many requests of this owner wait already.
@@ -63,7 +60,7 @@ class Lanes(Generic[Slot]):
         queue = self._waiting.setdefault(owner, deque())
         if len(queue) >= MAX_WAITING:
             raise problems.BUSY("Too many files of this key are being checked. Try again later.")
-        granted: asyncio.Future[Slot] = asyncio.get_running_loop().create_future()
+        granted: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         queue.append(granted)
         self._grant_turns()
         try:
@@ -76,15 +73,16 @@ class Lanes(Generic[Slot]):
             while queue and queue[0].cancelled():
                 queue.popleft()
             if queue and self._free and owner not in self._active:
-                queue.popleft().set_result(self._free.pop(0))
+                queue.popleft().set_result(None)
+                self._free -= 1
                 self._active.add(owner)
             if not queue:
                 del self._waiting[owner]
 
-    def _end_turn(self, owner: str, granted: asyncio.Future[Slot]) -> None:
+    def _end_turn(self, owner: str, granted: asyncio.Future[None]) -> None:
         queue = self._waiting.get(owner, deque())
         if not granted.cancelled():
-            self._free.insert(0, granted.result())
+            self._free += 1
             self._active.discard(owner)
             if queue:
                 self._waiting.move_to_end(owner)
@@ -99,8 +97,10 @@ _log = logging.getLogger(__name__)
 Work = Literal["validate", "plan"]
 #: Version of the validation; raising it invalidates stored findings.
 _VERSION = "7"
-#: Maximum number of requests that wait for the inspecting process; further ones are rejected with `BUSY`.
-_MAX_WAITING = 64
+#: Number of requests of each kind at a time: checks of small and large jobs, so that small ones do not wait; plans;
+#: files derived from results; and videos. Two owners check at once: the files of one may take the full time limit.
+Kind = Literal["validate", "large", "plan", "file", "video"]
+_AT_ONCE: dict[Kind, int] = {"validate": 2, "large": 1, "plan": 1, "file": 1, "video": 1}
 _MAX_ANSWER = 64 << 20
 _LEFTOVER_SECONDS = 3600.0
 #: Additions to the limits of an inspection per byte of its files. CPU seconds: the slowest readers (text, images) read
@@ -114,7 +114,7 @@ _MEMORY_FRACTION = 0.8
 #: Maximum size of the file of a plan, in bytes per Gaussian of the refined scene and besides, and number of plans that
 #: are stored.
 _PLAN_BYTES_PER_GAUSSIAN, _PLAN_BYTES, _MAX_PLANS = 32, 1 << 20, 16
-#: Total size in bytes above which a job's files are checked in a separate process, so that small jobs do not wait.
+#: Total size in bytes above which a job is large.
 _LARGE_BYTES = 64 << 20
 
 #: Environment variables passed to the inspecting process: locations of code, weights and kernels, and memory
@@ -131,13 +131,16 @@ Show = Callable[[dict[str, Any]], None]
 
 
 class InspectionProcess:
-    """Inspecting process that handles one request at a time; it is started on first use and restarted after it dies."""
+    """Inspecting process that handles one request at a time; it is started on first use and restarted after it dies.
+
+    Args:
+        threads: Maximum number of threads of a request.
+    """
 
     def __init__(self, threads: int = 1) -> None:
-        self._threads = threads
+        self.threads = threads
         self._process: asyncio.subprocess.Process | None = None
-        self._lock = asyncio.Lock()
-        self._waiting = 0
+        self._starting = asyncio.Lock()
 
     async def ask(
         self, request: WorkRequest, show: Show = lambda now: None, checked: Show = lambda findings: None
@@ -148,42 +151,31 @@ class InspectionProcess:
             checked: Callback for the findings about the inputs of a job that is then planned.
 
         Raises:
-            BUSY: If too many requests wait already, or the process died twice.
+            BUSY: If the process died twice.
         """
-        if self._waiting >= _MAX_WAITING:
-            raise problems.BUSY()
-        self._waiting += 1
-        try:
-            async with self._lock:
-                for _ in range(2):
-                    line = request.model_copy(update={"threads": self._threads}).model_dump_json().encode() + b"\n"
-                    answer = await self._exchange(line, show, checked)
-                    if answer is not None:
-                        return answer
-        finally:
-            self._waiting -= 1
+        line = request.model_copy(update={"threads": self.threads}).model_dump_json().encode() + b"\n"
+        for _ in range(2):
+            answer = await self._exchange(line, show, checked)
+            if answer is not None:
+                return answer
         raise problems.BUSY("Files cannot be checked at the moment. Try again later.")
 
-    async def warm(self) -> None:
-        """Start the process in advance, so that the first request does not wait for it."""
-        if not self._lock.locked():
-            async with self._lock:
-                await self._started()
-
-    async def _started(self) -> asyncio.subprocess.Process:
-        if self._process is None or self._process.returncode is not None:
-            self._process = await asyncio.create_subprocess_exec(
-                *COMMAND,
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.PIPE,
-                limit=_MAX_ANSWER,
-                env=self._environment(),
-                start_new_session=True,
-            )
-        return self._process
+    async def start(self) -> asyncio.subprocess.Process:
+        """Return the process, after starting it if it does not run."""
+        async with self._starting:
+            if self._process is None or self._process.returncode is not None:
+                self._process = await asyncio.create_subprocess_exec(
+                    *COMMAND,
+                    stdin=asyncio.subprocess.PIPE,
+                    stdout=asyncio.subprocess.PIPE,
+                    limit=_MAX_ANSWER,
+                    env=self._environment(),
+                    start_new_session=True,
+                )
+            return self._process
 
     async def _exchange(self, line: bytes, show: Show, checked: Show) -> dict[str, Any] | None:
-        process = await self._started()
+        process = await self.start()
         assert process.stdin is not None
         assert process.stdout is not None
         try:
@@ -215,7 +207,7 @@ class InspectionProcess:
         import, because the process forks.
         """
         inherited = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self._threads))
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), str(self.threads))
         return {**inherited, **threads, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
 
     async def close(self) -> None:
@@ -225,6 +217,54 @@ class InspectionProcess:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
+
+
+class Processes:
+    """Inspecting processes, which are started when all others are busy; owners take turns on each kind of work."""
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self._threads = {"plan": _threads_of_a_job(settings), "video": _threads_of_a_job(settings)}
+        self._lanes = {kind: Lanes(count) for kind, count in _AT_ONCE.items()}
+        self._all: list[InspectionProcess] = []
+        self._idle: list[InspectionProcess] = []
+
+    @asynccontextmanager
+    async def turn(self, owner: str, kind: Kind) -> AsyncIterator[InspectionProcess]:
+        """Wait for the owner's turn, and provide a process for the duration of the block.
+
+        Raises:
+            BUSY: If too many requests of this owner wait already.
+        """
+        async with self._lanes[kind].turn(owner):
+            process = self._take(self._threads.get(kind, 1))
+            try:
+                yield process
+            finally:
+                self._idle.append(process)
+
+    def _take(self, threads: int) -> InspectionProcess:
+        for process in self._idle:
+            if process.threads == threads:
+                self._idle.remove(process)
+                return process
+        self._all.append(InspectionProcess(threads))
+        return self._all[-1]
+
+    def is_busy(self, kind: Kind) -> bool:
+        """Return whether work of this kind would have to wait."""
+        return self._lanes[kind].full
+
+    async def warm(self) -> None:
+        """Start a process that checks jobs in advance: its imports take seconds."""
+        process = self._take(1)
+        self._idle.append(process)
+        with contextlib.suppress(OSError):  # the next request starts it, or tells why it cannot
+            await process.start()
+
+    async def close(self) -> None:
+        """Stop all processes, which also aborts any work in progress."""
+        for process in self._all:
+            await process.close()
 
 
 def working_folder(settings: ServiceSettings, name: str) -> Path:
@@ -243,24 +283,11 @@ class Inspector:
     def __init__(self, settings: ServiceSettings, store: Store, blobs: Blobs, threads: FileThreads) -> None:
         self._settings = settings
         self._store, self._blobs, self._threads = store, blobs, threads
-        # two lanes: if one owner's files occupy a lane for the full time limit, the other lane serves all other owners
-        self._validating = Lanes([InspectionProcess(), InspectionProcess()])
+        self.processes = Processes(settings)
         self._warming: asyncio.Task[None] | None = None
-        self._validating_large = Lanes([InspectionProcess()])
-        self._planning = Lanes([InspectionProcess(threads_of_a_job(settings))])
         self._folder = working_folder(settings, "inspections")
         for feature in missing():
             _log.warning("confinement incomplete: missing %s", feature)
-
-    async def warm(self) -> None:
-        """Start the process that checks the next job in advance: its imports take seconds."""
-        with contextlib.suppress(OSError):  # the next job starts it, or tells why it cannot
-            await self._validating.slots[0].warm()
-
-    @property
-    def is_planning(self) -> bool:
-        """Whether a plan would have to wait for another one."""
-        return self._planning.full
 
     def recall(
         self, work: Work, owner: str, inputs: Sequence[Mapping[str, Any]], parameters: JobParameters
@@ -302,11 +329,11 @@ class Inspector:
         if recalled is not None:
             checked()
             return recalled
-        if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
-            self._warming = asyncio.create_task(self._validating.slots[1].warm())
+        kind: Kind = "plan" if work == "plan" else "large" if _size(inputs) > _LARGE_BYTES else "validate"
         with suspended():  # the process has its own limits
-            validating = self._validating_large if _size(inputs) > _LARGE_BYTES else self._validating
-            async with (self._planning if work == "plan" else validating).turn(owner) as process:
+            async with self.processes.turn(owner, kind) as process:
+                if self._settings.keys_required and self._warming is None:  # without keys there is only one owner
+                    self._warming = asyncio.create_task(self.processes.warm())
                 answer = await self._ask_process(process, work, owner, inputs, rows, parameters, show, checked)
         transient = answer.get("error", {}).get("code") in (problems.INSPECTION_LIMIT.code, WeightsError.code)
         if not transient:  # a later check may succeed
@@ -366,12 +393,6 @@ class Inspector:
         maximum = max(minimum, int(_MEMORY_FRACTION * container.memory().total))
         return min(minimum + MEMORY_PER_BYTE * size, maximum)
 
-    async def close(self) -> None:
-        """Stop all processes."""
-        for lanes in (self._validating, self._validating_large, self._planning):
-            for process in lanes.slots:
-                await process.close()
-
 
 def _limits(settings: ServiceSettings) -> dict[str, int]:
     """Return the limits of a job's inputs."""
@@ -420,8 +441,8 @@ def _size(inputs: Sequence[Mapping[str, Any]]) -> int:
     return sum(entry["size"] for entry in inputs)
 
 
-def threads_of_a_job(settings: ServiceSettings) -> int:
-    """Return a job's number of threads on this machine; planning uses as many, so that its timings are valid."""
+def _threads_of_a_job(settings: ServiceSettings) -> int:
+    """Return a job's number of threads on this machine; planning and rendering videos use as many."""
     threads = os.environ.get("OMP_NUM_THREADS", "")
     return (
         int(threads)

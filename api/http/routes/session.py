@@ -64,7 +64,7 @@ async def get_session(request: Request, context: ContextDep, response: Response)
     key = await asyncio.to_thread(context.store.sessions.find, cookie) if cookie else None
     within = await asyncio.to_thread(lambda: context.usual_budget)
     if key is not None or not context.settings.keys_required:
-        await context.inspector.warm()  # whoever opens the page may create a job soon
+        await context.inspector.processes.warm()  # whoever opens the page may create a job soon
     return SessionView(keys_needed=context.settings.keys_required, signed_in=key is not None, within=within)
 
 

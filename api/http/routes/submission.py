@@ -193,7 +193,8 @@ async def create_job(
         if findings is None:
             for entry in inputs:
                 check_size(entry["role"], entry["name"], entry["size"])
-            if not dry_run or context.inspector.is_planning:  # else the files are checked and planned in one reading
+            # a dry run's files are checked and planned in one reading, if that can start now
+            if not dry_run or context.inspector.processes.is_busy("plan"):
                 findings = await context.inspector.inspect("validate", caller.owner, inputs, rows, parameters)
         if not dry_run:
             up, foreign = (findings["up"], findings["foreign"]) if sure_up and findings else (None, None)

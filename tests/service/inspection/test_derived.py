@@ -6,7 +6,8 @@ import asyncio
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,6 +24,7 @@ from service.files.blobs import BlobFolder
 from service.files.objects import Artifacts
 from service.inputs import RESULT, JobParameters, Staged, WorkRequest, job_spec
 from service.inspection.derived import MOST_BLENDS, Blend, DerivedFiles
+from service.inspection.inspector import Processes
 from service.inspection.process import WORK
 from service.settings import ServiceSettings
 from service.states import Published
@@ -70,8 +72,13 @@ class Stored:
         self.store.leases.succeed(lease, [result], {})
         return self.store.jobs.get(job.id, owner)
 
-    def derived(self) -> DerivedFiles:
-        return DerivedFiles(self.settings, self.store, self.blobs, self.artifacts, FileThreads(PATIENCE))
+    @asynccontextmanager
+    async def derived(self) -> AsyncIterator[DerivedFiles]:
+        processes, threads = Processes(self.settings), FileThreads(PATIENCE)
+        try:
+            yield DerivedFiles(self.settings, self.store, self.blobs, self.artifacts, threads, processes)
+        finally:
+            await processes.close()
 
 
 @pytest.fixture
@@ -92,13 +99,10 @@ def test_blends_of_one_key_do_not_delay_another_key(stored: Stored, tmp_path: Pa
         order.append(job.owner)
 
     async def blend_all() -> None:
-        derived = stored.derived()
-        try:
+        async with stored.derived() as derived:
             waiting = [asyncio.create_task(blend(derived, one, weight / 10)) for weight in range(1, 9)]
             await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
             await asyncio.gather(*waiting, blend(derived, other, 0.5))
-        finally:
-            await derived.close()
 
     asyncio.run(blend_all())
     assert order[-1] == "one"
@@ -113,12 +117,9 @@ def test_parallel_blends_cannot_pass_their_limit(stored: Stored, tmp_path: Path)
     stored.store.jobs.add_derived(source, existing, "one")
 
     async def blend_all() -> list[object]:
-        derived = stored.derived()
-        blends = [derived.blended(job, Blend(weight / 10, {}, PLY), NO_QUOTAS) for weight in range(1, 5)]
-        try:
+        async with stored.derived() as derived:
+            blends = [derived.blended(job, Blend(weight / 10, {}, PLY), NO_QUOTAS) for weight in range(1, 5)]
             return await asyncio.gather(*blends, return_exceptions=True)
-        finally:
-            await derived.close()
 
     outcomes = asyncio.run(blend_all())
     assert sum(getattr(outcome, "problem", None) is problems.TOO_MANY_BLENDS for outcome in outcomes) == 3
@@ -132,11 +133,8 @@ def test_compressed_results_count_toward_the_quota(stored: Stored, tmp_path: Pat
     objects, used = set(stored.artifacts.objects.below("")), usage_of(stored.store, "one").stored_bytes
 
     async def compress(quotas: Quotas) -> None:
-        derived = stored.derived()
-        try:
+        async with stored.derived() as derived:
             await derived.compressed(job, by_name("spz"), quotas)
-        finally:
-            await derived.close()
 
     with raises_problem(problems.QUOTA_EXCEEDED):
         asyncio.run(compress(Quotas(stored_bytes=used)))

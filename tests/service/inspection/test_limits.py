@@ -19,7 +19,7 @@ from PIL import Image
 from service.deadlines import FileThreads
 from service.files.blobs import BlobFolder
 from service.inputs import JobParameters, Staged, WorkRequest
-from service.inspection.inspector import InspectionProcess, Inspector, Show
+from service.inspection.inspector import InspectionProcess, Inspector, Processes, Show
 from service.inspection.process import WORK, _memory_besides_reading
 from service.problems import ServiceError
 from service.settings import ServiceSettings
@@ -62,25 +62,22 @@ def inspecting(folder: Path, **limits: Any) -> Iterator[Inspect]:
         try:
             yield inspect
         finally:
-            runner.run(inspector.close())
+            runner.run(inspector.processes.close())
             store.close()
 
 
 def test_process_is_started_once_in_advance(tmp_path: Path) -> None:
-    settings = ServiceSettings(data=tmp_path)
-    store = open_store(settings)
-    inspector = Inspector(settings, store, BlobFolder(tmp_path, store.inputs, 0), FileThreads(PATIENCE))
+    processes = Processes(ServiceSettings(data=tmp_path))
 
     async def started() -> int:
         before = psutil.Process().children()
         try:
-            await asyncio.gather(inspector.warm(), inspector.warm())
+            await asyncio.gather(processes.warm(), processes.warm())
             return len(set(psutil.Process().children()) - set(before))
         finally:
-            await inspector.close()
+            await processes.close()
 
     assert asyncio.run(started()) == 1
-    store.close()
 
 
 def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, Any]:
