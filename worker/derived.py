@@ -1,4 +1,4 @@
-"""Files derived from scenes, for the command line and, confined, for the service: conversions, pages, videos."""
+"""Files derived from scenes, for the command line and, confined, for the service: scenes, blends, pages, videos."""
 
 from __future__ import annotations
 

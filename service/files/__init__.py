@@ -1,1 +1,1 @@
-"""Files of jobs: inputs stored by digest, result files, and the folder in which a job's inputs are staged."""
+"""Files of jobs: inputs stored by digest (`blobs`), and results in the file store (`objects`)."""

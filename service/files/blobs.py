@@ -33,7 +33,7 @@ from service.store.tables import BlobRow, UploadPartRow, UploadRow
 from sgsst_core.files.atomic import file_digest
 
 #: Age in seconds at which files without a database row are removed; younger files may not have their row yet.
-_ORPHAN_SECONDS = 3600.0
+ORPHAN_SECONDS = 3600.0
 #: Folders of inputs and of unfinished uploads, in the file store (in the data folder if the file store is local). All
 #: other folders of the file store belong to jobs.
 BLOBS, UPLOADS = "blobs", "uploads"
@@ -218,7 +218,7 @@ class Blobs(ABC):
         unused = self._inputs.collect()
         self.remove(unused)
         removed = len(unused) + self._collect_orphans()
-        before = time.time() - _ORPHAN_SECONDS
+        before = time.time() - ORPHAN_SECONDS
         for path in self.incoming.iterdir():
             if _older(path, before):
                 if path.is_dir() and not path.is_symlink():
@@ -316,7 +316,7 @@ class BlobFolder(Blobs):
         self.upload_path(upload_id).unlink(missing_ok=True)
 
     def _collect_orphans(self) -> int:
-        known, before, removed = self._inputs.locations(), time.time() - _ORPHAN_SECONDS, 0
+        known, before, removed = self._inputs.locations(), time.time() - ORPHAN_SECONDS, 0
         for path in self._blobs.glob("*/*"):
             if _older(path, before) and f"{path.parent.name}/{path.name}" not in known:
                 path.unlink(missing_ok=True)
@@ -441,7 +441,7 @@ def _older(path: Path, before: float) -> bool:
 
 
 #: Age in seconds at which objects without a database row are removed; younger objects may not have their row yet.
-_REMOTE_ORPHAN_SECONDS = 6 * 3600.0
+REMOTE_ORPHAN_SECONDS = 6 * 3600.0
 #: Interval between searches of the store for objects without a database row, in seconds.
 _SEARCH_SECONDS = 3600.0
 
@@ -611,7 +611,7 @@ class StoredBlobs(Blobs):
             return 0
         self._searched_at = time.monotonic()
         self._take_over()
-        before = time.time() - _REMOTE_ORPHAN_SECONDS
+        before = time.time() - REMOTE_ORPHAN_SECONDS
         old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
         known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
         orphans = [name for name in old if name not in known]

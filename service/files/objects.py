@@ -354,7 +354,12 @@ Fetch = Callable[[Path], None]
 
 
 class FileCache:
-    """Cache in a folder.
+    """Cache of stored files on one host, verified by their SHA-256 and limited in total size.
+
+    Each file is fetched once and named by its digest. Callers get a hard link to the file in their own folder, which
+    must be on the same file system. A file with more than one link is in use and is not evicted. Any number of
+    processes may share a cache: files appear atomically by renaming, each digest is fetched under a lock, and evicting
+    a file leaves the callers' links intact.
 
     Args:
         folder: Folder of the cache; created if missing.

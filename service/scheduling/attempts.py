@@ -228,7 +228,6 @@ class RunningAttempt:
         stager: Stager,
     ) -> None:
         self.lease = lease
-        #: Capacity of the attempt; it is reduced if the plan needs less.
         self.grant = grant
         self._folder, self._settings, self._store, self._stager = folder, settings, store, stager
         self._process: ChildProcess | None = None

@@ -19,7 +19,7 @@ from typing import Literal, TypeVar
 from sqlalchemy import Select, delete, exists, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute
 
-from service.files.blobs import BLOBS, UPLOADS, Blobs, open_blobs
+from service.files.blobs import BLOBS, ORPHAN_SECONDS, REMOTE_ORPHAN_SECONDS, UPLOADS, Blobs, open_blobs
 from service.files.objects import Artifacts, ObjectStore
 from service.inputs import CHECKPOINT
 from service.problems import NotFoundError
@@ -33,8 +33,6 @@ from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadPartRow
 _ROUND_SECONDS, _STRAY_SEARCH_SECONDS = 60.0, 3600.0
 #: Maximum number of jobs whose leftover files are removed per round.
 _MAX_SWEEPS = 20
-#: Minimum age of a stray file in seconds; younger files may not have their database row yet.
-_STRAY_SECONDS = 6 * 3600.0
 _JOB_PREFIX = "job_"
 #: Time to wait for the thread when it is stopped, in seconds.
 _JOIN_SECONDS = 5.0
@@ -81,7 +79,7 @@ class Housekeeper:
 
 def remove_strays(store: Store, artifacts: Artifacts) -> int:
     """Delete stray files and return their number."""
-    before = time.time() - _STRAY_SECONDS
+    before = time.time() - REMOTE_ORPHAN_SECONDS
     old: dict[str, list[str]] = {}
     for name, changed in artifacts.objects.below("").items():
         job_id = name.partition("/")[0]
@@ -111,9 +109,6 @@ def strays_of_job(store: Store, job_id: str, names: list[str]) -> list[str]:
 
 #: Rows per query, and number of files that are read concurrently.
 _PAGE, _AT_A_TIME = 500, 4
-#: Minimum age of an orphan in seconds; younger files may not have their database row yet. The limit for remote file
-#: stores is longer, because their clocks may differ from this machine's.
-_ORPHAN_SECONDS, _REMOTE_ORPHAN_SECONDS = 3600.0, 6 * 3600.0
 #: Folder of a file store to which damaged files are moved.
 QUARANTINE = "quarantine"
 
@@ -334,5 +329,5 @@ class FileCheck:
             yield from ((objects, "result", name) for name in strays_of_job(self._store, job_id, names))
 
     def _old(self, objects: ObjectStore, folder: str) -> list[str]:
-        before = time.time() - (_ORPHAN_SECONDS if objects.local else _REMOTE_ORPHAN_SECONDS)
+        before = time.time() - (ORPHAN_SECONDS if objects.local else REMOTE_ORPHAN_SECONDS)
         return sorted(name for name, changed in objects.below(folder).items() if changed < before)

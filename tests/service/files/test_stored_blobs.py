@@ -181,7 +181,7 @@ def test_unused_blobs_are_collected(fleet: Fleet, monkeypatch: pytest.MonkeyPatc
     fleet.objects.put(_file(fleet.folder, b"x"), "uploads/upl_1/orphan")
     host.collect()
     assert len(fleet.names()) == 3, "the rows may still be on their way"
-    monkeypatch.setattr(stored_blobs, "_ORPHAN_SECONDS", -HOUR)
+    monkeypatch.setattr(stored_blobs, "REMOTE_ORPHAN_SECONDS", -HOUR)
     fleet.store.inputs.database.clock = lambda: 10**11
     fleet.host("two").collect()
     assert fleet.names() == []

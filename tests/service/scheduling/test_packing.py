@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -71,16 +70,12 @@ def eight(tmp_path: Path) -> Iterator[Queue]:
     queue.store.close()
 
 
-def test_single_job_gets_all_gpus_and_releases_unused_ones(eight: Queue) -> None:
+def test_single_job_gets_all_gpus(eight: Queue) -> None:
     big = eight.add()
     assert eight.start() == [big]
     assert eight.ranks() == [8]
-    second = eight.add()
+    eight.add()
     assert eight.start() == []
-    used = eight.held[big].gpus[:3]
-    eight.held[big] = replace(eight.held[big], ranks=3, gpus=used)
-    assert eight.start() == [second]
-    assert eight.ranks() == [3, 5]
 
 
 @pytest.mark.parametrize(("jobs", "ranks"), [(2, [4, 4]), (3, [2, 3, 3]), (8, [1] * 8), (20, [1] * 8)])
@@ -170,8 +165,6 @@ def test_gpu_jobs_wait_for_host_memory() -> None:
     second = capacity.grant(job(10 * GB, workers=1), [first], 9)
     assert second is not None
     assert second.gpus == ("gpu4",)
-    fewer = replace(first, ranks=1, gpus=first.gpus[:1])
-    assert fewer.host_bytes == 3 * GB + 40 * GB, "what the plan does without counts no more"
 
 
 @given(st.lists(st.tuples(st.integers(1, 60 * GB), st.integers(1, 8)), max_size=12))
