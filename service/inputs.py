@@ -1,4 +1,4 @@
-"""What a job is made from: its parameters as JSON, and its files, staged as `sgsst stylize` expects them.
+"""Inputs of a job: its parameters as JSON, and its files, staged as `sgsst stylize` expects them.
 
 The staging folder has links to the blobs under the users' names. PyTorch is not imported.
 """

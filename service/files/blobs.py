@@ -466,7 +466,6 @@ class StoredBlobs(Blobs):
     def __init__(self, settings: ServiceSettings, inputs: InputRows, objects: ObjectStore) -> None:
         super().__init__(settings.folder, inputs, settings.min_free_bytes, objects)
         self._cache = open_cache(settings)
-        self._local = settings.folder / "blobs"  # inputs from a time when the file store was local
         self._searched_at = float("-inf")
 
     def ensure_space(self, size: int) -> None:
@@ -610,7 +609,6 @@ class StoredBlobs(Blobs):
         if time.monotonic() - self._searched_at <= _SEARCH_SECONDS:
             return 0
         self._searched_at = time.monotonic()
-        self._take_over()
         before = time.time() - REMOTE_ORPHAN_SECONDS
         old = [name for name, changed in self.objects.below(BLOBS).items() if changed < before]
         known = {f"{BLOBS}/{location}" for location in self._inputs.locations()} if old else set()
@@ -621,15 +619,6 @@ class StoredBlobs(Blobs):
         for name in orphans:
             self.objects.remove(name)
         return len(orphans) + self.objects.abort_old_parts(before)
-
-    def _take_over(self) -> None:
-        """Upload inputs that remain from a time when the file store was a local folder."""
-        known = self._inputs.locations() if self._local.is_dir() else set()
-        for path in self._local.glob("*/*"):
-            location = f"{path.parent.name}/{path.name}"
-            if location in known:
-                self.objects.put(path, f"{BLOBS}/{location}")
-            path.unlink()
 
 
 class _ObjectWriter:

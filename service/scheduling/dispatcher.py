@@ -14,7 +14,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 
 from service.files.blobs import open_blobs
@@ -32,8 +32,8 @@ from service.store.tables import JobRow
 #: Fractions of a lease's duration: the age at which a lease is renewed, and the age at which its job is killed if
 #: renewing has failed. The latter is below 1, because other dispatchers may take an expired lease and clocks differ.
 RENEW_FRACTION, _ABANDON_FRACTION = 1 / 3, 3 / 4
-#: Time to wait for the thread when it is stopped, in seconds.
-_JOIN_SECONDS = 5.0
+#: Fraction of a lease's duration between checks whether it has been renewed.
+_CHECK_FRACTION = RENEW_FRACTION * (1 - _ABANDON_FRACTION)
 
 _log = logging.getLogger(__name__)
 
@@ -49,17 +49,6 @@ class LeaseKeeper:
     def __init__(self, store: Store, seconds: float, running: Mapping[str, RunningAttempt]) -> None:
         self._store, self._seconds, self._running = store, seconds, running
         self._renewed_at = float("-inf")
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._abandon_late, name="lease-keeper", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread that abandons attempts whose leases could not be renewed."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop the thread."""
-        self._stop.set()
-        self._thread.join(_JOIN_SECONDS)
 
     def update(self) -> None:
         """Renew all leases if that is due, and pass the statuses of the jobs to their attempts; abandon lost jobs."""
@@ -80,19 +69,17 @@ class LeaseKeeper:
             elif attempt.alive:
                 attempt.abandon()
 
-    def _abandon_late(self) -> None:
+    def abandon_late(self) -> None:
         """Abandon jobs whose leases could not be renewed, before the leases expire.
 
-        This runs in a thread of its own, because the thread that renews leases may wait for a database that does not
+        A thread of its own calls this, because the thread that renews leases may wait for a database that does not
         respond.
         """
-        limit = _ABANDON_FRACTION * self._seconds
-        while not self._stop.wait(RENEW_FRACTION * (self._seconds - limit)):
-            late = time.monotonic() - self._renewed_at
-            if late > limit:
-                for attempt in [each for each in dict(self._running).values() if not each.abandoned]:
-                    _log.error("attempt abandoned: lease not renewed for %.0f s", late, extra=attempt.lease.log_fields)
-                    attempt.abandon()
+        late = time.monotonic() - self._renewed_at
+        if late > _ABANDON_FRACTION * self._seconds:
+            for attempt in [each for each in dict(self._running).values() if not each.abandoned]:
+                _log.error("attempt abandoned: lease not renewed for %.0f s", late, extra=attempt.lease.log_fields)
+                attempt.abandon()
 
 
 def lease_next_job(
@@ -120,6 +107,8 @@ def lease_next_job(
     return (lease, grants[lease.job_id]) if lease is not None else None
 
 
+#: Intervals between rounds of housekeeping, and of sending webhooks, in seconds.
+_HOUSEKEEPING_SECONDS, _WEBHOOK_SECONDS = 60.0, 2.0
 #: Delay before the next pass after one has failed, in seconds.
 _OUTAGE_SECONDS = 2.0
 #: Interval between checks of ending attempts during the shutdown, in seconds.
@@ -142,11 +131,22 @@ class Dispatcher:
         self._work = settings.folder / "work" / self.name
         self._running: dict[str, RunningAttempt] = {}
         self._announced_at = float("-inf")
-        self._stop = threading.Event()
+        self._stop, self._ended = threading.Event(), threading.Event()
         blobs = open_blobs(settings, store.inputs, self._artifacts)
         self._stager = Stager(settings, store, blobs, self._artifacts, cluster=machine.cluster)
         self._lease_keeper = LeaseKeeper(store, settings.lease_seconds, self._running)
-        self._helpers = Deliverer(settings, store), Housekeeper(store, self._artifacts, blobs)
+        #: Periodic work in threads of its own, because it may wait for the database, files or receivers: name,
+        #: interval in seconds, and function.
+        self._helpers = [
+            (
+                "lease-keeper",
+                _CHECK_FRACTION * settings.lease_seconds,
+                self._lease_keeper.abandon_late,
+            ),
+            ("housekeeper", _HOUSEKEEPING_SECONDS, Housekeeper(store, self._artifacts, blobs).clean_up),
+        ]
+        if settings.webhooks:
+            self._helpers.append(("webhooks", _WEBHOOK_SECONDS, Deliverer(settings, store).deliver_due))
 
     def stop(self) -> None:
         """Make `run` return: running jobs save their state and return to the queue."""
@@ -155,8 +155,8 @@ class Dispatcher:
     def run(self) -> None:
         """Run jobs until `stop`."""
         self._work.mkdir(parents=True, exist_ok=True)
-        for helper in (self._lease_keeper, *self._helpers):
-            helper.start()
+        for name, seconds, function in self._helpers:
+            threading.Thread(target=self._repeat, args=(seconds, function), name=name, daemon=True).start()
         _log.info("dispatcher started: name=%s capacity=%d", self.name, self._capacity.size)
         work = self._take_over_from_the_dead
         while not self._stop.is_set():
@@ -169,6 +169,16 @@ class Dispatcher:
                 self._stop.wait(_OUTAGE_SECONDS)
             self._stop.wait(self._settings.poll_seconds)
         self._shut_down()
+
+    def _repeat(self, seconds: float, work: Callable[[], None]) -> None:
+        """Call some work periodically until the dispatcher has ended, whatever errors it raises."""
+        while True:
+            try:
+                work()
+            except Exception:
+                _log.exception("periodic work failed, retrying: seconds=%.0f", seconds)
+            if self._ended.wait(seconds):
+                return
 
     def _take_over_from_the_dead(self) -> None:
         """Expire the leases of dead dispatchers of this machine at once, and delete their work folders."""
@@ -217,8 +227,7 @@ class Dispatcher:
             with contextlib.suppress(Exception):
                 self._lease_keeper.update()
             time.sleep(_SHUTDOWN_SECONDS)
-        for helper in (self._lease_keeper, *self._helpers):
-            helper.stop()
+        self._ended.set()
         shutil.rmtree(self._work, ignore_errors=True)
 
 

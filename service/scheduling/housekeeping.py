@@ -6,9 +6,7 @@ file after the job had already ended elsewhere. Both are safe while the service 
 
 from __future__ import annotations
 
-import logging
 import secrets
-import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -29,44 +27,22 @@ from service.states import UNFINISHED
 from service.store import Store
 from service.store.tables import ArtifactRow, BlobRow, BlobUseRow, UploadPartRow, UploadRow
 
-#: Interval between rounds of housekeeping, and between searches for stray files, in seconds.
-_ROUND_SECONDS, _STRAY_SEARCH_SECONDS = 60.0, 3600.0
+#: Interval between searches for stray files, in seconds.
+_STRAY_SEARCH_SECONDS = 3600.0
 #: Maximum number of jobs whose leftover files are removed per round.
 _MAX_SWEEPS = 20
 _JOB_PREFIX = "job_"
-#: Time to wait for the thread when it is stopped, in seconds.
-_JOIN_SECONDS = 5.0
-
-_log = logging.getLogger(__name__)
 
 
 class Housekeeper:
-    """Periodic housekeeping in its own thread, so that a slow file store does not delay renewing leases."""
+    """Periodic housekeeping by a dispatcher."""
 
     def __init__(self, store: Store, artifacts: Artifacts, blobs: Blobs) -> None:
         self._store, self._artifacts, self._blobs = store, artifacts, blobs
         self._searched_at = float("-inf")
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="housekeeper", daemon=True)
 
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop the thread."""
-        self._stop.set()
-        self._thread.join(_JOIN_SECONDS)
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            try:
-                self._clean_up()
-            except Exception:  # file stores raise arbitrary errors; running jobs must not suffer
-                _log.exception("housekeeping failed, retrying: seconds=%.0f", _ROUND_SECONDS)
-            self._stop.wait(_ROUND_SECONDS)
-
-    def _clean_up(self) -> None:
+    def clean_up(self) -> None:
+        """Delete what has expired, and from time to time stray files."""
         for job_id in self._store.retention.expire():
             self._artifacts.objects.remove_below(job_id)
         for job_id, epoch in self._store.retention.unswept(_MAX_SWEEPS):

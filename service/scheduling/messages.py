@@ -1,4 +1,4 @@
-"""What a dispatcher and the process of an attempt send each other: task, reports, and how the attempt ended."""
+"""Messages between a dispatcher and the process of an attempt: task, reports, and how the attempt ended."""
 
 from __future__ import annotations
 

@@ -13,7 +13,6 @@ import hmac
 import json
 import logging
 import ssl
-import threading
 import time
 from functools import cached_property
 
@@ -62,7 +61,7 @@ def check_url(url: str, settings: ServiceSettings) -> None:
 
 
 class Deliverer:
-    """Sender of due messages, with its own thread.
+    """Sender of due messages.
 
     Args:
         tls: SSL context for verifying receivers; None for the public certificate authorities.
@@ -71,24 +70,6 @@ class Deliverer:
     def __init__(self, settings: ServiceSettings, store: Store, tls: ssl.SSLContext | None = None) -> None:
         self._settings, self._store = settings, store
         self._tls = tls
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="webhooks", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread if webhooks are switched on."""
-        if self._settings.webhooks:
-            self._thread.start()
-
-    def stop(self) -> None:
-        """Stop soon; undelivered messages stay due."""
-        self._stop.set()
-
-    def _run(self) -> None:
-        while not self._stop.wait(_ROUND_SECONDS):
-            try:
-                self.deliver_due()
-            except Exception:  # the database may be down; the thread must continue
-                _log.exception("delivery of webhooks failed, retrying")
 
     def deliver_due(self) -> None:
         """Send due messages until none is due or being sent."""
@@ -96,7 +77,7 @@ class Deliverer:
 
     async def _deliver_due(self) -> None:
         sending: dict[asyncio.Task[None], Delivery] = {}
-        while not self._stop.is_set():
+        while True:
             limits = {"total": _MAX_TOTAL, "per_owner": _MAX_PER_OWNER, "per_url": _MAX_PER_URL}
             due = self._store.operations.due_deliveries
             for delivery in await asyncio.to_thread(due, _HOLD_SECONDS, list(sending.values()), **limits):

@@ -1,11 +1,13 @@
-"""Tests of the table of job states: each combination of state and transition, compared with the documented behavior."""
+"""Tests of the table of job states, and of features that need an extra."""
 
 from __future__ import annotations
 
+import sys
 from itertools import product
 
 import pytest
 
+from service.settings import installed_extras, missing_extras
 from service.states import (
     ACTIONS,
     ACTIVE,
@@ -95,3 +97,11 @@ def test_states_are_plain_strings() -> None:
     """The database and the API use plain strings."""
     assert [str(status) for status in JobStatus] == [status.value for status in JobStatus]
     assert next_status("queued", Transition.TAKE) == "starting"
+
+
+def test_missing_extra_is_not_offered_and_named_to_the_operator(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert installed_extras() == {"video": True, "heif": True}
+    assert missing_extras() == []
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert installed_extras() == {"video": False, "heif": True}
+    assert missing_extras() == ["Videos are not offered. To add them: pip install 'sgsst-service[video]'"]

@@ -14,20 +14,27 @@ import torch
 from PIL import Image
 
 from sgsst_core.errors import CheckpointError
+from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.formats import by_name
+from sgsst_core.files.images import save_jpg
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.planning.plan import Plan
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import drawing_problem
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint, save_plan
+from sgsst_core.stylizing.color_transfer import warm_start
+from sgsst_core.stylizing.loop import Callbacks, run
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.stylizing.test_refining import large_wall
-from tests.small_scenes import wall
+from tests.small_scenes import cameras, wall
 from tests.worker.ranks.faults import Fault, small_request
+from worker import prepare as previews_module
 from worker.execute import execute
 from worker.inputs import read_inputs
 from worker.job import JobSpec, Result, Resume
-from worker.prepare import Job, Previews, dry_run, prepare
+from worker.prepare import Job, LiveColors, Previews, dry_run, prepare
 from worker.run import Listener
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -357,3 +364,86 @@ def test_colors_file_is_omitted_if_more_than_colors_change(tmp_path: Path, why: 
     assert result.report_error is None
     assert request.out.exists()
     assert not request.out.with_name("s.colors.f16").exists()
+
+
+def test_first_preview_shows_warm_start_colors(
+    tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(previews_module, "_FIRST_SECONDS", 3600)
+    settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
+    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.5, 0.1])
+    scene = wall()
+    stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
+    missing: list[str] = []
+    previews = Previews(tmp_path / "previews", 3600, missing.append)
+    run(stylizer, Callbacks(preview=previews, preview_seconds=0))
+    assert stylizer.step == 2
+    (written,) = (tmp_path / "previews").iterdir()
+    assert written.name == "step_0000000.jpg", "and none before the hour is over"
+    assert not missing
+
+    index = stylizer.job.evaluation_views[0]
+    wanted = warm_start(scene.sh_dc, stylizer.job.plan.survey.total_blend_weights, stylizer.job.style)[
+        stylizer.job.plan.seen
+    ]
+    views = stylizer.job.views
+    save_jpg(tmp_path / "wanted.jpg", views.rasterizer.render(views.colors(index, wanted), views.cameras[index]))
+    actual, expected = (np.asarray(Image.open(path)) for path in (written, tmp_path / "wanted.jpg"))
+    np.testing.assert_array_equal(actual, expected)
+    assert actual.std() > 1
+
+
+def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(
+    tiny_weights: BackboneWeights, tmp_path: Path
+) -> None:
+    settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
+    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    stylizer = Stylizer.planned(wall(), cameras(), style, settings, weights=tiny_weights)
+    run(stylizer)
+    missing: list[str] = []
+    Previews(tmp_path, 3600, missing.append).finish(stylizer)
+    assert not missing
+    (written,) = tmp_path.iterdir()
+    assert written.name == "thumbnail.jpg"
+    assert written.name > "step_9999999.jpg", "clients show the last preview by name"
+
+    views, index = stylizer.job.views, stylizer.job.evaluation_views[0]
+    thumbnail = np.asarray(Image.open(written), dtype=np.float64)
+    middle = thumbnail.shape[1] // 2
+    for part, colors in ((np.s_[:, :middle], views.scene.sh_dc), (np.s_[:, middle:], stylizer.shown())):
+        with torch.no_grad():
+            image = views.rasterizer.render(views.colors(index, colors), views.cameras[index])
+        wanted = (image.clamp(0, 1) * 255).numpy()[part]
+        assert np.abs(thumbnail[part] - wanted).mean() < 5  # JPEG
+
+
+def test_live_colors_are_those_of_the_step(
+    tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("_COLOR_SECONDS", "_COLOR_SHARE"):
+        monkeypatch.setattr(previews_module, name, 0)
+    monkeypatch.setattr(previews_module, "_COST_SHARE", 1e9)
+    settings = make_settings("standard", steps_coarse=0, steps_sos=3, coarsest_side=24)
+    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    scene = wall()
+    scene.means[:5] += 1000  # no view shows them
+    stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
+    missing: list[str] = []
+    colors, by_step = LiveColors(tmp_path / "live", missing.append), {}
+
+    def preview(stylizer: Stylizer) -> None:
+        colors(stylizer)
+        if not stylizer.step:
+            return
+        seen = stylizer.job.plan.seen
+        wanted = stylizer.job.scene.sh_dc.clone()
+        wanted[seen] = stylizer.shown().cpu()
+        assert not seen[:5].any()
+        by_step[stylizer.step] = np.fromfile(tmp_path / "live" / "colors.f16", "<f2").reshape(-1, 3)
+        np.testing.assert_array_equal(by_step[stylizer.step], wanted.numpy().astype("<f2"))
+
+    run(stylizer, Callbacks(preview=preview, preview_seconds=0))
+    assert by_step.keys() == {1, 2, 3}
+    assert not np.array_equal(by_step[1], by_step[2])
+    assert not missing
+    assert [path.name for path in (tmp_path / "live").iterdir()] == ["colors.f16"]

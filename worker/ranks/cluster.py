@@ -39,8 +39,8 @@ OBJECT_STORE_BYTES = 512 << 20
 _LONGEST_PARENT = 24
 #: Token of every Ray instance that this process starts. Ray reads the token only once.
 _SECRET = secrets.token_hex(32)
-#: Seconds in which a cluster must answer, and type of the frame that starts every HTTP/2 connection.
-_ANSWER_SECONDS, _SETTINGS = 10.0, 4
+#: Seconds in which a cluster must accept a connection.
+_ANSWER_SECONDS = 10.0
 #: Ray processes without which a local instance does not work.
 _DAEMONS = ("raylet", "gcs_server")
 
@@ -174,16 +174,10 @@ class Cluster:
 
 
 def _check_answers(address: str) -> None:
-    """Raise an OSError if nothing speaks HTTP/2, as Ray does, at HOST:PORT. Ray itself would wait for minutes."""
+    """Raise an OSError if nothing listens at HOST:PORT. Ray itself would wait for minutes."""
     host, _, port = address.rpartition("//")[2].rpartition(":")
-    if not port.isdecimal():  # "auto", which Ray looks up
-        return
-    with socket.create_connection((host.strip("[]"), int(port)), _ANSWER_SECONDS) as connection:
-        if os.environ.get("RAY_USE_TLS", "0") != "0":
-            return
-        connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, _SETTINGS, 0, 0, 0, 0, 0]))
-        if connection.recv(4)[3:] != bytes([_SETTINGS]):
-            raise ConnectionError("what listens there is not Ray")
+    if port.isdecimal():  # else "auto", which Ray looks up
+        socket.create_connection((host.strip("[]"), int(port)), _ANSWER_SECONDS).close()
 
 
 def _is_daemon(process: psutil.Process) -> bool:

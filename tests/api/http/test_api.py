@@ -503,7 +503,7 @@ def test_partial_files_of_dead_process_are_removed(tmp_path: Path, monkeypatch: 
     blobs.collect()
     assert half.exists(), "it may still be written to"
     monkeypatch.setattr(
-        "service.files.blobs._ORPHAN_SECONDS", -1.0
+        "service.files.blobs.ORPHAN_SECONDS", -1.0
     )  # no file's age can be made up: it is that of its name
     blobs.collect()
     assert not half.exists()

@@ -28,7 +28,7 @@ from service.settings import ServiceSettings
 from service.store import open_store
 from tests.api.service import PATIENCE
 from tests.service.inspection import attack
-from tests.service.inspection.test_limits import Inspect, inspecting
+from tests.service.inspection.test_inspector import Inspect, inspecting
 from tests.small_scenes import wall, write_files
 
 COMPROMISED = Path(__file__).with_name("compromised.py")

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import socket
-import threading
-import time
 from pathlib import Path
 
 import pytest
 
 from service.health import dispatcher_is_healthy
 from service.prepare import main as prepare
-from service.problems import DatabaseUnavailableError
 from service.scheduling.capacity import is_dead, is_of_this_machine, own_name
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -42,30 +38,6 @@ def test_dispatcher_names_identify_the_machine() -> None:
     for name in ("", "host", "host-01234567-1-1", "a-b-c-d-e"):
         assert not is_of_this_machine(name)
         assert not is_dead(name)
-
-
-def test_unavailable_database_is_retried_for_the_given_time() -> None:
-    pytest.importorskip("psycopg", reason="psycopg is not installed: see the extra [postgresql]")
-    asked: list[float] = []
-    with socket.create_server(("127.0.0.1", 0)) as server:
-
-        def refuse() -> None:
-            while True:
-                try:
-                    connection, _ = server.accept()
-                except OSError:
-                    return
-                asked.append(time.monotonic())
-                connection.close()
-
-        threading.Thread(target=refuse, daemon=True).start()
-        url = f"postgresql+psycopg://nobody@127.0.0.1:{server.getsockname()[1]}/none"
-        with pytest.raises(DatabaseUnavailableError):
-            open_store(ServiceSettings(database=url))
-        once = len(asked)
-        with pytest.raises(DatabaseUnavailableError):
-            open_store(ServiceSettings(database=url), patience=2.5)
-        assert len(asked) >= 3 * once
 
 
 def test_prepare_creates_the_tables_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,6 @@ import logging
 import socket
 import ssl
 import threading
-import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -361,7 +360,6 @@ def test_slow_receivers_do_not_delay_other_messages(tmp_path: Path, store: Store
         assert received.acquire(timeout=PATIENCE)
         assert len(slow.received) <= webhooks._MAX_PER_URL + webhooks._MAX_PER_OWNER
     finally:
-        deliverer.stop()
         release.set()
         thread.join(PATIENCE)
 
@@ -541,14 +539,3 @@ def test_valid_urls_are_accepted(url: str, tmp_path: Path) -> None:
     check_url(url, _settings(tmp_path))
     with pytest.raises(ServiceError, match="switched off"):
         check_url(url, ServiceSettings(data=tmp_path))
-
-
-def test_thread_delivers_until_it_is_stopped(tmp_path: Path, store: Store, receiver: Receiver) -> None:
-    deliverer = Deliverer(_settings(tmp_path), store)
-    deliverer.start()
-    _end_job(store, receiver.url)
-    deadline = time.monotonic() + PATIENCE
-    while _tries(store) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    deliverer.stop()
-    assert len(receiver.received) == 1

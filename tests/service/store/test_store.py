@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -176,14 +175,6 @@ def test_queue_order_is_priority_then_turn_then_age(store: Store, clock: Clock) 
     assert [job.id for job in taken if job.owner == "a"] == order[:3]
 
 
-def test_large_job_is_not_overtaken_forever(store: Store, clock: Clock) -> None:
-    big = queue(store)
-    clock.now += 1
-    queue(store)
-    assert store.leases.take("one", lambda job: job.id != big) is None
-    assert lease(store).job_id == big
-
-
 def test_lost_lease_cannot_write(store: Store, clock: Clock) -> None:
     queue(store)
     late = lease(store, "late")
@@ -315,16 +306,6 @@ def test_job_that_fails_at_the_same_step_is_given_up(store: Store, clock: Clock)
     assert store.jobs.get(job_id, "local").status == "failed"
     store.jobs.retry(job_id, "local", limit=1)
     assert [fail_at(store, clock, 90) for _ in range(ATTEMPTS)] == [True, True, False]
-
-
-def test_checkpoint_before_a_shutdown_counts_as_progress(store: Store, clock: Clock) -> None:
-    queue(store)
-    assert [fail_at(store, clock, None) for _ in range(ATTEMPTS - 1)] == [True, True]
-    clock.now += 1000
-    held = lease(store)
-    store.leases.publish(held, [Published(".checkpoint", "x", 1, SHA, step=5)])
-    store.leases.release(held)
-    assert [fail_at(store, clock, None) for _ in range(ATTEMPTS + 1)] == [True, True, True, False]
 
 
 def test_ended_jobs_are_swept_once(store: Store, clock: Clock) -> None:
@@ -543,19 +524,6 @@ def test_expired_job_is_deleted_after_its_results(store: Store, clock: Clock) ->
     store.retention.expire()
     with pytest.raises(NotFoundError):
         store.jobs.get(job_id, "local")
-
-
-def test_retention_does_not_depend_on_the_outcome(store: Store, clock: Clock) -> None:
-    ends: dict[str, Callable[[], Any]] = {
-        "succeeded": lambda: store.leases.succeed(lease(store), [], {}),
-        "failed": lambda: store.leases.fail(lease(store), {"code": "x", "message": "x"}, permanent=True),
-        "canceled": lambda: store.jobs.cancel(job_id, "local"),
-    }
-    for status, end in ends.items():
-        job_id = queue(store)
-        end()
-        job = store.jobs.get(job_id, "local")
-        assert (job.status, job.expires_at) == (status, pytest.approx(clock.now + RETENTION))
 
 
 def test_revoked_key_is_rejected(store: Store) -> None:

@@ -1,36 +1,43 @@
-"""Tests of the collectives over torch.distributed against their definitions."""
+"""Tests of collectives against their definitions, and of messages, of which hostile ones are refused."""
 
 from __future__ import annotations
 
-import threading
-import time
+import json
+import math
+import struct
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
+from safetensors.torch import save
 from torch import Tensor
 
 from sgsst_core.errors import RanksDriftedError, SceneError
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
-from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, same_on_all
-from sgsst_core.progress import Progress
+from sgsst_core.files.photos import Photo
+from sgsst_core.loss.terms import LossTerms
+from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, Team, same_on_all
+from sgsst_core.planning.facts import Machine
+from sgsst_core.progress import Decision
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.lens import Lens
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
-from tests.api.service import wait_for
 from tests.networks import tiny_weights
 from tests.ports import free_port
 from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
-from worker.ranks.driver import LONG_WAIT, RankGroup, RankHandle, long_wait
-from worker.ranks.process_group import WAITING, _backend, _meet
-from worker.ranks.rank import Outcome, RankStatus
+from worker.capture import Capture
+from worker.outputs import Outputs
+from worker.ranks.process_group import _backend, _meet, decode, encode
 
 HEIGHT = 70
 
@@ -194,51 +201,6 @@ def test_collectives_and_groups_follow_their_definitions(groups: int) -> None:
         assert result["group"] == (rank % each, each, list(range(first, first + each)))
 
 
-def wait_for_first(collectives: Collectives, seen: Path) -> bool:
-    """Exchange a value once a thread of rank 1 has seen that it waits for rank 0; return whether it still does."""
-
-    def watch() -> None:
-        wait_for(lambda: WAITING.seconds > 0, "rank 1 to wait")
-        seen.touch()
-
-    if collectives.rank == 1:
-        threading.Thread(target=watch, daemon=True).start()
-    else:
-        wait_for(seen.exists, "rank 1 to wait")
-    collectives.all_gather(None)
-    return WAITING.seconds > 0
-
-
-def test_wait_for_another_rank_is_visible(tmp_path: Path) -> None:
-    assert on_ranks(2, wait_for_first, tmp_path / "seen") == [False, False]
-
-
-def rank_handle(waiting: float, stage: str | None = None, kind: Literal["failed"] | None = None) -> RankHandle:
-    status = RankStatus(
-        waiting=waiting, progress=Progress(stage=stage) if stage else None, outcome=kind and Outcome(kind)
-    )
-    return RankHandle(None, None, status=status)
-
-
-@pytest.mark.parametrize(
-    ("handles", "said"),
-    [
-        ([rank_handle(0.0), rank_handle(LONG_WAIT - 1)], None),
-        (
-            [rank_handle(LONG_WAIT + 1, "planning"), rank_handle(0.0), rank_handle(2.0, "planning")],
-            "Worker 0. Still at work: Worker 1 (reading), Worker 2 (planning).",
-        ),
-        (
-            [rank_handle(LONG_WAIT + 1), rank_handle(0.0, kind="failed"), rank_handle(LONG_WAIT + 9)],
-            "Worker 0, Worker 2. All wait for each other's messages: check the network between their machines.",
-        ),
-    ],
-)
-def test_long_wait_names_the_late_ranks(handles: list[RankHandle], said: str | None) -> None:
-    line = long_wait(RankGroup(handles))
-    assert line == (said and f"Waiting for more than 60 s: {said}")
-
-
 def fail_on_first(collectives: Collectives) -> str:
     def make() -> str:
         raise SceneError("scene.ply: is empty.")
@@ -282,23 +244,121 @@ def test_single_rank_collectives_return_their_input() -> None:
     assert ALONE.all_gather("a") == ["a"]
 
 
-def keep_waiting(collectives: Collectives, expected: float | None) -> bool:
-    """Return whether rank 1, with a timeout of one second, waits for rank 0, which is six seconds late."""
-    collectives.all_gather(None)
-    if expected is not None:
-        collectives.set_timeout_for(expected)
-    if collectives.rank == 0:
-        time.sleep(6)
-    try:
-        collectives.all_gather(None)
-    except RuntimeError:
-        return False
-    return True
+VALUES = [
+    None,
+    True,
+    -(2**70),
+    "",
+    "line\n\udcff \u2028",  # file names that are not UTF-8 contain such characters
+    0.1 + 0.2,
+    5e-324,
+    -0.0,
+    math.inf,
+    b"ply\r\n\x00\xff",
+    [1, (2, [3]), ()],
+    {3: "three", "4": 4, (5, 6): {"tuple": [1]}},
+    Path("inputs/scene.ply"),
+    LossTerms(gram=1 / 3, content=2.0),
+    Decision("ranks", "2", "measured", bytes=3),
+    Outputs(Path("out/s.ply")),
+    Capture(
+        [],
+        None,
+        ("a",),
+        [(640, 480)],
+        [Photo(Path("a.jpg"), (640, 480), oriented=True)],
+        (Decision("axes", "rub", "seen"),),
+    ),
+    Lens.of("OPENCV", (0.1, -0.02), (640, 480), (500.0, 500.0, 320.0, 240.0)),
+    Machine("cpu", 3, problems={"triton": "no GPU"}),
+]
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
+def test_values_round_trip(value: Any) -> None:
+    decoded = decode(encode(value))
+    assert decoded == value
+    assert repr(decoded) == repr(value)  # distinguishes -0.0 from 0.0, tuples from lists, and True from 1
+
+
+def test_nan_round_trips() -> None:
+    assert math.isnan(decode(encode(math.nan)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.int64, torch.uint8, torch.bool])
+@pytest.mark.parametrize("shape", [(), (0, 3), (5, 3)])
+def test_tensors_round_trip_bit_identical(dtype: torch.dtype, shape: tuple[int, ...]) -> None:
+    tensor = (torch.randn(shape, generator=torch.Generator().manual_seed(0)) * 100).to(dtype)
+    decoded = decode(encode({"tensor": tensor, "part": tensor.expand(2, *shape)}))
+    for name, expected in (("tensor", tensor), ("part", tensor.expand(2, *shape))):
+        assert decoded[name].dtype == dtype
+        assert decoded[name].shape == expected.shape
+        assert torch.equal(decoded[name], expected)
+
+
+def test_arrays_and_dataclasses_of_tensors_round_trip() -> None:
+    camera = Camera("a.jpg", 8, 6, 5.0, 5.0, 4.0, 3.0, torch.eye(4, dtype=torch.float64))
+    decoded_camera, decoded_flags = decode(encode((camera, np.array([True, False]))))
+    assert isinstance(decoded_camera, Camera)
+    assert torch.equal(decoded_camera.world_to_camera, camera.world_to_camera)
+    assert decoded_flags.dtype == np.bool_
+    assert decoded_flags.tolist() == [True, False]
+
+
+def test_errors_keep_their_type() -> None:
+    decoded = decode(encode(SceneError("scene.ply: is empty.")))
+    assert type(decoded) is SceneError
+    assert decoded.args == ("scene.ply: is empty.",)
+
+
 @pytest.mark.parametrize(
-    ("expected", "patient"), [(None, True), (20.0, True), (0.1, False)], ids=["preparing", "slow", "quick"]
+    "value", [object(), {1}, ValueError("no"), Path, len, np.float32(1)], ids=lambda value: type(value).__name__
 )
-def test_timeout_follows_expected_iteration_time(expected: float | None, patient: bool) -> None:
-    assert on_ranks(2, keep_waiting, expected, timeout=1.0)[1] is patient
+def test_unsupported_values_are_refused(value: Any) -> None:
+    with pytest.raises(TypeError, match=r"A message between ranks cannot hold a|is not a class of"):
+        encode(value)
+
+
+def message(value: Any) -> Tensor:
+    """Encode any JSON-serializable value as a message."""
+    text = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
+    return torch.frombuffer(bytearray(save({"json": text})), dtype=torch.uint8)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"error": ["builtins:eval", ["1"]]},
+        {"error": ["os:system", ["true"]]},
+        {"error": ["sgsst_core.scene.camera:Camera", []]},
+        {"error": ["worker.ranks.process_group:import_module", ["antigravity"]]},
+        {"error": ["worker.processes:kill", [[]]]},
+        {"object": ["pathlib:Path", {}]},
+        {"object": ["worker.ranks.rank:RankProcess", {}]},
+        {"object": ["sgsst_core.planning.plan:Decision", {"__class__": 1}]},
+        {"object": ["sgsst_core.planning.plan:Decision.__init__", {}]},
+        {"call": ["os.system", "true"]},
+        {"tensor": ["7", "cpu"]},
+        {"tuple": [], "list": []},
+        {},
+    ],
+    ids=str,
+)
+def test_messages_cannot_name_other_classes_or_functions(value: Any) -> None:
+    with pytest.raises(ValueError, match="not a message of this program"):
+        decode(message(value))
+
+
+@pytest.mark.parametrize("data", [b"", b"\x80\x05N.", struct.pack("<Q", 2**60) + b"{}", b"\x00" * 64])
+def test_invalid_bytes_are_refused(data: bytes) -> None:
+    with pytest.raises(ValueError, match="not a message of this program"):
+        decode(torch.tensor(list(data), dtype=torch.uint8))
+
+
+def group_of_rank(collectives: Collectives) -> tuple[int, int, int]:
+    team = Team(make_settings(views_per_step=2), collectives)
+    return team.everybody.size, team.groups, team.own_group
+
+
+def test_ranks_form_groups() -> None:
+    assert on_ranks(4, group_of_rank) == [(4, 2, 0), (4, 2, 0), (4, 2, 1), (4, 2, 1)]

@@ -9,12 +9,10 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sqlalchemy import event
 
 from service.scheduling.capacity import Capacity, Grant, Machine
 from service.scheduling.dispatcher import lease_next_job
 from service.settings import ServiceSettings
-from service.store import Store
 from service.store.jobs import NewJob
 from service.store.queue import OVERTAKEN_SECONDS
 from service.store.tables import JobRow
@@ -90,16 +88,6 @@ def test_small_job_gets_only_the_gpus_it_is_worth(eight: Queue) -> None:
     large = eight.add()
     assert eight.start() == [*small, large]
     assert eight.ranks() == [1, 1, 6]
-
-
-def test_dispatcher_without_capacity_sends_no_query(eight: Queue) -> None:
-    eight.add()
-    eight.start()
-    eight.add()
-    asked: list[str] = []
-    event.listen(eight.store.database.engine, "before_cursor_execute", lambda *args: asked.append(args[2]))
-    assert eight.start() == []
-    assert not asked
 
 
 def test_requested_workers_are_granted(eight: Queue) -> None:
@@ -280,23 +268,3 @@ def test_machine_lists_its_own_gpus_or_those_of_the_cluster(monkeypatch: pytest.
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
     machine = Machine.find(ServiceSettings(cluster_gpus=3))
     assert (len(machine.gpus), machine.cluster) == (3, True)
-
-
-def test_waiting_counts_jobs_that_can_be_leased_now(eight: Queue) -> None:
-    store: Store = eight.store
-    assert store.leases.waiting() == 0
-    eight.add()
-    second = eight.add()
-    assert store.leases.waiting() == 2
-    lease = store.leases.take("one")
-    assert lease is not None
-    assert store.leases.waiting() == 1
-    store.leases.fail(lease, {"code": "x", "message": "x"}, permanent=False)
-    assert store.leases.waiting() == 1, "the other one has to wait for its second attempt"
-    store.jobs.cancel(second, "local")
-    assert store.leases.waiting() == 0
-    eight.now += 100
-    assert store.leases.take("one") is not None
-    assert store.leases.waiting() == 0
-    eight.now += 100
-    assert store.leases.waiting() == 1, "nobody renewed its lease"

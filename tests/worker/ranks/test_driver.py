@@ -1,0 +1,260 @@
+"""Tests of the driver of ranks: retries, relayed events, requested resources, and clusters that do not answer."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Literal
+
+import pytest
+
+from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedError, SceneError
+from sgsst_core.progress import Progress
+from worker.job import memory_beside_gpus, scene_bytes
+from worker.prepare import Prepared
+from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, reserve
+from worker.ranks.driver import MOST_ATTEMPTS, FailedAttempt, Failure, Relay, check_retry, failure_of, first_line
+from worker.ranks.rank import RankStatus
+from worker.run import Listener
+
+KILLED = Failure("loss", "Worker 1 on here was lost: its process was killed")
+
+
+def failed(failure: Failure = KILLED, last_step: int = 0, *, progressed: bool = False) -> FailedAttempt:
+    return FailedAttempt(failure, last_step, progressed)
+
+
+def raised(error: Exception) -> Failure:
+    return failure_of(error, "Worker 0 on here")
+
+
+def test_job_error_is_raised_at_once() -> None:
+    error = SceneError("scene.ply: is truncated.")
+    for attempts in ([failed(raised(error))], [failed(), failed(raised(error), 7, progressed=True)]):
+        with pytest.raises(SceneError) as info:
+            check_retry(attempts)
+        assert info.value is error
+
+
+def test_drifted_ranks_are_retried() -> None:
+    failure = raised(RanksDriftedError("Rank 1 has other colors."))
+    assert failure.kind == "loss"
+    assert check_retry([failed(failure, 5)]) == "Worker 0 on here failed: Rank 1 has other colors, after step 5."
+
+
+@pytest.mark.parametrize("progressed", [True, False])
+def test_first_lost_rank_is_retried(progressed: bool) -> None:
+    expected = "Worker 1 on here was lost: its process was killed, after step 8."
+    assert check_retry([failed(last_step=8, progressed=progressed)]) == expected
+
+
+def test_lost_ranks_are_retried_while_attempts_progress() -> None:
+    attempts = [failed(last_step=step, progressed=True) for step in range(0, 200, 10)]
+    in_vain = [failed(last_step=190)] * (MOST_ATTEMPTS - 1)
+    for more in ([], in_vain, [*in_vain, failed(last_step=200, progressed=True)]):
+        assert check_retry([*attempts, *more])
+
+
+@pytest.mark.parametrize(("kind", "error"), [("loss", RanksFailedError), ("machine", ClusterAwayError)])
+def test_too_many_attempts_without_progress_give_up(kind: Literal["loss", "machine"], error: type[Exception]) -> None:
+    attempts = [failed(last_step=30, progressed=True), *[failed(replace(KILLED, kind=kind), 20)] * MOST_ATTEMPTS]
+    with pytest.raises(error) as info:
+        check_retry(attempts)
+    assert str(info.value) == (
+        "3 attempts in a row came no further than step 30. The last one: Worker 1 on here was lost: its process was "
+        "killed."
+    )
+
+
+def twice(error: Exception, second: Exception | None = None, steps: tuple[int, int] = (4, 4)) -> str:
+    """Check two attempts that made no progress and ended with these errors."""
+    return check_retry([failed(raised(error), steps[0]), failed(raised(second or error), steps[1])])
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("CUDA error"), MemoryError("can't allocate"), RanksDriftedError("Rank 1 drifted.")]
+)
+def test_repeated_error_at_same_step_is_raised(error: Exception) -> None:
+    with pytest.raises(type(error)) as info:
+        twice(error)
+    assert info.value is error
+
+
+def test_repeated_error_of_other_type_gives_up_with_a_sentence() -> None:
+    with pytest.raises(RanksFailedError) as info:
+        twice(KeyError("a"))
+    assert str(info.value) == "Worker 0 on here failed: 'a'; the same happened twice at step 4."
+
+
+def test_different_error_step_or_progress_is_retried() -> None:
+    error = RuntimeError("CUDA error")
+    assert twice(error, RuntimeError("NCCL error"))
+    assert twice(error, steps=(4, 5))
+    assert check_retry([failed(raised(error), 4, progressed=True)] * 2)
+
+
+def test_lost_ranks_without_an_error_are_retried() -> None:
+    assert check_retry([failed(), failed()])
+
+
+def test_error_summary_is_first_line_or_type() -> None:
+    assert first_line(RuntimeError("  It broke.\nAt length.")) == "It broke"
+    assert first_line(RuntimeError()) == "RuntimeError"
+
+
+class EventRecorder:
+    """Recorder of all events of a listener, in order."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, object]] = []
+        self.relay = Relay(
+            Listener(
+                prepared=lambda plan: self.events.append(("prepared", plan.step)),
+                progress=lambda now: self.events.append((now.stage, now.step)),
+                warn=lambda line: self.events.append(("warning", line)),
+            ),
+            lambda: self.events.append(("resumed", None)),
+        )
+        self.relay.begin_attempt()
+
+    def after(self, *statuses: RankStatus) -> list[tuple[str, object]]:
+        """Pass these status responses of rank 0 to the relay, and return the resulting events."""
+        known = len(self.events)
+        for status in statuses:
+            self.relay.pass_on(status)
+        return self.events[known:]
+
+
+def planned(done: int) -> RankStatus:
+    return RankStatus(progress=Progress(stage="planning", step=done, total=4, eta_s=1.0))
+
+
+def step(number: int) -> Progress:
+    return Progress(stage="sos", step=number, total=10, loss=1.0)
+
+
+def test_planning_progress_is_relayed_until_prepared() -> None:
+    recorder = EventRecorder()
+    assert recorder.after(RankStatus(), planned(0), planned(1), planned(1), planned(4)) == [
+        ("planning", 0),
+        ("planning", 1),
+        ("planning", 4),
+    ]
+    done = replace(planned(4), prepared=Prepared([], 0, 10))
+    assert recorder.after(done, done, replace(done, progress=step(1))) == [
+        ("prepared", 0),
+        ("resumed", None),
+        ("sos", 1),
+    ]
+
+
+def test_views_of_a_quality_check_are_relayed() -> None:
+    recorder = EventRecorder()
+    done = RankStatus(prepared=Prepared([], 0, 10), progress=step(10))
+    checked = [step(10).model_copy(update={"views_checked": view, "views_to_check": 2}) for view in (0, 0, 1)]
+    checks = [replace(done, progress=each) for each in checked]
+    assert recorder.after(done, *checks)[1:] == [("resumed", None), ("sos", 10), ("sos", 10), ("sos", 10)]
+
+
+def test_new_attempt_relays_planning_again() -> None:
+    recorder = EventRecorder()
+    recorder.after(planned(3))
+    recorder.relay.begin_attempt()
+    assert recorder.after(planned(3)) == [("planning", 3)]
+
+
+def test_resumed_attempt_relays_no_preparation() -> None:
+    recorder = EventRecorder()
+    recorder.after(RankStatus(prepared=Prepared([], 0, 10), progress=step(5), saved=4))
+    assert recorder.relay.farthest == (5, 4)
+    recorder.relay.begin_attempt()
+    assert (recorder.relay.first_step, recorder.relay.last_step) == (None, 4)
+    again = RankStatus(prepared=Prepared([], 4, 10))
+    assert recorder.after(again, replace(again, progress=step(5))) == [("resumed", None), ("sos", 5)]
+    assert recorder.relay.first_step == 4
+    assert recorder.relay.farthest == (5, 4)
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_warnings_are_relayed_once_per_attempt(again: bool) -> None:
+    recorder = EventRecorder()
+    first = RankStatus(warnings=("a",))
+    recorder.after(first)
+    status = replace(first, warnings=("a", "b"))
+    if again:
+        recorder.relay.begin_attempt()  # its ranks report all events again
+        assert len(recorder.after(status)) == 2
+    else:
+        assert recorder.after(status) == [("warning", "b")]
+
+
+GB = 1_000_000_000
+
+
+def test_scene_memory_is_its_decompressed_size() -> None:
+    assert scene_bytes("room.ply", GB) == GB
+    assert scene_bytes("ROOM.SPZ", 25_000_000) == 248_000_000
+    assert scene_bytes("room.compressed.ply", 61_000_000) == 248_000_000
+    assert memory_beside_gpus(4, 5 * GB) == 22 * GB, "ranks of a machine share the scene"
+
+
+def test_ranks_of_a_machine_request_memory_for_a_shared_scene() -> None:
+    nodes = [{"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}, {"CPU": 64.0, "memory": 500.0 * GB}]
+    assert _bundle(nodes, 1, 8, 5 * GB) == {"CPU": 8, "GPU": 1, "memory": 13 * GB}
+    assert _bundle(nodes, 2, 8, 5 * GB) == {"CPU": 8, "GPU": 1, "memory": 8 * GB}
+    assert _bundle([*nodes, nodes[0]], 8, 8, 5 * GB)["memory"] == 5.5 * GB, "four on each machine"
+
+
+def test_oversized_scene_requests_a_whole_machines_memory() -> None:
+    nodes = [{"CPU": 32.0, "GPU": 4.0, "memory": 100.0 * GB}]
+    assert _bundle(nodes, 1, 8, 200 * GB)["memory"] == 100 * GB
+    assert _bundle(nodes, 4, 8, 200 * GB)["memory"] == 25 * GB
+
+
+def test_only_cores_are_requested_without_gpus() -> None:
+    """Without GPUs, plans already limit their memory to a fraction of the machine's, so only cores are requested."""
+    assert _bundle([{"CPU": 32.0, "memory": 100.0 * GB}], 2, 8, 5 * GB) == {"CPU": 8}
+    assert _bundle([{"CPU": 32.0, "GPU": 4.0}], 2, 8, 5 * GB) == {"CPU": 8, "GPU": 1}, "Ray knows of no memory"
+
+
+@contextmanager
+def taken(memory: int) -> Iterator[None]:
+    """Reserve memory of the cluster within the block, as another job would."""
+    from ray.util import placement_group, remove_placement_group
+
+    group = placement_group([{"memory": memory}])
+    assert group.wait(120)
+    yield
+    remove_placement_group(group)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux ends processes with their parent")
+@pytest.mark.usefixtures("joined")
+def test_ray_grants_no_gpus_without_free_memory() -> None:
+    """The cluster has two GPUs and 10 GB; a scene of 2 GB needs 10 GB with two ranks and 7 GB with one."""
+    with Cluster(2):
+        reserved = reserve(2, 2 * GB)
+        assert len(reserved.groups) == 2
+        reserved.release()
+        with taken(3 * GB):
+            fewer = reserve(2, 2 * GB)
+            assert (len(fewer.groups), fewer.gpus) == (1, 1)
+            fewer.release()
+        with taken(4 * GB), pytest.raises(NoCapacityError, match=r"needs a core, a GPU and 7\.0 GB of memory"):
+            reserve(2, 2 * GB)
+        again = reserve(2, 2 * GB)
+        assert len(again.groups) == 2, "what was waited for in vain is not asked for any more"
+        again.release()
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:{port}", "ray://127.0.0.1:{port}", "127.0.0.1:99999", "a..b:6379"])
+def test_cluster_that_is_not_there_is_reported_at_once(address: str) -> None:
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        address = address.format(port=closed.getsockname()[1])
+        with pytest.raises(ClusterAwayError, match=f"{address} cannot be reached: .* Check RAY_ADDRESS"):
+            Cluster(1, address).open()
