@@ -216,11 +216,11 @@ def test_fsck_of_running_service_finds_nothing(service: Files, capsys: pytest.Ca
             lease = service.job(scene)
             for turn in range(3):
                 put = service.artifacts.put(lease.job_id, lease.epoch, "log.txt", service.file(b"%d" % turn))
-                for location in service.store.leases.publish(lease, [put]):
+                for location in service.store.queue.publish(lease, [put]):
                     service.artifacts.objects.remove(location)
             upload_id = service.upload(b"upload %d" % number, 7 + len(str(number))).split("/")[1].removesuffix(".part")
-            service.blobs.finish_upload(service.store.inputs.upload(upload_id, "me"), HOUR)
-            service.store.leases.succeed(lease, [], {})
+            service.blobs.finish_upload(service.store.files.upload(upload_id, "me"), HOUR)
+            service.store.queue.succeed(lease, [], {})
             if number % 2:
                 service.store.jobs.delete(lease.job_id, None)
                 service.artifacts.objects.remove_below(lease.job_id)
