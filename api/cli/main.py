@@ -48,6 +48,7 @@ _SUMMARIES: dict[str, dict[str, str]] = {
         "blend": "Blend scenes that differ only in color: a scene and its results, or several results.",
         "view": "Write a scene as one HTML file, which shows it in 3D in a browser, without a server.",
     },
+    "paint_command": {"paint": "Paint one view or several, and the scene follows."},
     "machine_commands": {
         "doctor": "Examine this machine: GPU, driver, precision, memory, weights, caches, and correct results.",
         "weights": "Weights of the feature network.",

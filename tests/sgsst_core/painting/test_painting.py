@@ -1,0 +1,116 @@
+"""Tests of painted views: the solver against dense float64 least squares, and what spreads to the other Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from sgsst_core.constants import COLOR_OFFSET, SH_C0
+from sgsst_core.errors import CameraError
+from sgsst_core.orbit.cameras import orbit
+from sgsst_core.painting import solver
+from sgsst_core.painting.solver import PaintedColors, PaintedView, paint
+from sgsst_core.painting.spreading import Spreading
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import rest_colors, scene_colors
+from tests.small_scenes import wall
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Return the wall with mid-range colors, so that nothing is clamped."""
+    base = wall(sh_degree=1)
+    generator = torch.Generator().manual_seed(2)
+    return replace(base, sh_dc=0.3 * torch.rand(len(base), 3, generator=generator), sh_rest=0.02 * base.sh_rest.sign())
+
+
+def cameras_of(scene: Scene) -> list[Camera]:
+    return orbit(scene, 6, width=40, height=30)
+
+
+def full(camera: Camera, image: Tensor) -> PaintedView:
+    return PaintedView(camera, image, torch.ones(image.shape[:2]))
+
+
+def blend_weights(scene: Scene, camera: Camera) -> Tensor:
+    """Return W [h w, N] in float64, a column for each Gaussian."""
+    rasterizer, columns = make_rasterizer("cpu", scene), []
+    for index in range(len(scene)):
+        one = torch.zeros(len(scene), 3)
+        one[index] = 1
+        columns.append(rasterizer.render(one, camera)[:, :, 0].flatten())
+    return torch.stack(columns, dim=1).double()
+
+
+def test_colors_are_those_of_dense_least_squares(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solver, "ITERATIONS", 200)
+    scene = scene.subset(torch.arange(0, len(scene), max(len(scene) // 60, 1)))
+    camera = cameras_of(scene)[0]
+    image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(5)) * 0.2 + 0.4
+    problem = PaintedColors(scene, [full(camera, image)], make_rasterizer("cpu", scene))
+    solved = problem.solve(problem.original, bounded=False)
+    weights, rest = blend_weights(scene, camera), rest_colors(scene.sh_rest, scene.means, camera).double()
+    ridge = solver.RELATIVE_RIDGE * weights.sum(dim=0) + solver.RIDGE
+    original = COLOR_OFFSET + SH_C0 * scene.sh_dc.double()
+    right = weights.T @ (image.double().flatten(0, 1) - weights @ rest) + ridge[:, None] * original
+    wanted = torch.linalg.solve(weights.T @ weights + ridge.diag(), right)
+    assert torch.allclose(solved.colors.double(), wanted, atol=2e-4)
+    assert solved.residual < 1e-4
+
+
+def test_unchanged_picture_changes_nothing(scene: Scene) -> None:
+    cameras, rasterizer = cameras_of(scene), make_rasterizer("cpu", scene)
+    view = full(cameras[0], rasterizer.render(scene_colors(scene, cameras[0]), cameras[0]))
+    painted = paint(scene, [view], rasterizer, others=cameras)
+    assert torch.allclose(painted.sh_dc, scene.sh_dc, atol=1e-4)
+
+
+def test_darkness_spreads_to_gaussians_that_no_picture_shows(scene: Scene) -> None:
+    cameras, rasterizer = cameras_of(scene), make_rasterizer("cpu", scene)
+    image = 0.5 * rasterizer.render(scene_colors(scene, cameras[0]), cameras[0])
+    painted = paint(scene, [full(cameras[0], image)], rasterizer, others=cameras)
+    assert painted.psnr_after > painted.psnr_before + 10
+    unseen = rasterizer.survey(cameras[0])[1] == 0
+    before, after = (COLOR_OFFSET + SH_C0 * colors[unseen].mean() for colors in (scene.sh_dc, painted.sh_dc))
+    assert not unseen.any() or after < 0.75 * before
+    assert torch.equal(paint(scene, [full(cameras[0], image)], rasterizer, others=cameras).sh_dc, painted.sh_dc)
+
+
+def test_transparent_pixels_stay(scene: Scene) -> None:
+    camera, rasterizer = cameras_of(scene)[0], make_rasterizer("cpu", scene)
+    before = rasterizer.render(scene_colors(scene, camera), camera)
+    alpha = torch.zeros(camera.height, camera.width)
+    alpha[:, : camera.width // 2] = 1
+    painted = paint(scene, [PaintedView(camera, torch.zeros_like(before), alpha)], rasterizer)
+    after = rasterizer.render(scene_colors(replace(scene, sh_dc=painted.sh_dc), camera), camera)
+    far = camera.width * 3 // 4
+    assert (after - before)[:, far:].abs().mean() < 0.02
+    assert after[:, : camera.width // 4].mean() < 0.5 * before[:, : camera.width // 4].mean()
+
+
+def test_clamped_colors_can_rise(scene: Scene) -> None:
+    black = replace(scene, sh_dc=torch.full_like(scene.sh_dc, -5.0))
+    camera, rasterizer = cameras_of(scene)[0], make_rasterizer("cpu", scene)
+    problem = PaintedColors(black, [full(camera, torch.full((camera.height, camera.width, 3), 0.4))], rasterizer)
+    assert problem.psnr(problem.solve(problem.original).colors) > problem.psnr(problem.original) + 3
+
+
+def test_view_of_nothing_is_refused(scene: Scene) -> None:
+    camera = cameras_of(scene)[0]
+    away = replace(camera, world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1]).double()) @ camera.world_to_camera)
+    with pytest.raises(CameraError, match="show nothing"):
+        paint(scene, [full(away, torch.zeros(30, 40, 3))], make_rasterizer("cpu", scene))
+
+
+def test_map_of_colors_reaches_everywhere() -> None:
+    generator = torch.Generator().manual_seed(0)
+    means, colors = torch.rand(4000, 3, generator=generator), torch.rand(4000, 3, generator=generator)
+    confidence = (means[:, 0] < 0.3).float()
+    change = -0.5 * colors
+    spread = Spreading(means, colors, confidence)(torch.where(confidence[:, None] > 0, change, 0.0))
+    assert (spread - change).abs().mean() < 0.02

@@ -1,0 +1,79 @@
+"""Tests of `sgsst paint`: pictures of views, painted scenes, and pictures that cannot be used."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from api.cli.console import BAD_INPUT
+from api.cli.main import main
+from sgsst_core.files.scene_file import read_scene, write_scene
+from tests.small_scenes import wall
+
+OPTIONS = ("--orbit", "6", "--resolution", "96")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a scene and the picture of its first view."""
+    folder = tmp_path_factory.mktemp("painting")
+    write_scene(folder / "scene.ply", wall(sh_degree=1))
+    assert (
+        main(
+            ["paint", str(folder / "scene.ply"), *OPTIONS, "--export", "orbit_0000", "--out", str(folder / "view.png")]
+        )
+        == 0
+    )
+    return folder
+
+
+def paint(folder: Path, name: str, view: str = "orbit_0000") -> int:
+    out = str(folder / "painted.ply")
+    return main(["paint", str(folder / "scene.ply"), *OPTIONS, "--view", f"{view}={folder / name}", "--out", out])
+
+
+def test_scene_follows_a_painted_picture(folder: Path) -> None:
+    with Image.open(folder / "view.png") as image:
+        image.point(lambda value: value // 2).save(folder / "dark.png")
+    assert paint(folder, "dark.png") == 0
+    before, after = (read_scene(folder / name).scene for name in ("scene.ply", "painted.ply"))
+    assert after.sh_dc.mean() < before.sh_dc.mean()
+    assert after.means.equal(before.means)
+    report = json.loads((folder / "painted.report.json").read_text())
+    assert report["psnr_after"] > report["psnr_before"]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("larger.png", lambda image: image.resize((192, image.height * 2)), "Export and paint in one size"),
+        ("crop.png", lambda image: image.crop((0, 0, 96, 20)), "another aspect ratio"),
+        ("empty.png", lambda image: Image.new("RGBA", image.size), "transparent everywhere"),
+        ("nan.tiff", lambda image: Image.fromarray(np.full(image.size[::-1], np.nan, np.float32)), "NaN"),
+    ],
+)
+def test_unusable_pictures_are_refused(
+    folder: Path,
+    name: str,
+    change: Callable[[Image.Image], Image.Image],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (folder / "painted.ply").unlink(missing_ok=True)
+    with Image.open(folder / "view.png") as image:
+        change(image).save(folder / name)
+    assert paint(folder, name) == BAD_INPUT
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not (folder / "painted.ply").exists()
+
+
+def test_picture_of_another_view_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert paint(folder, "view.png", "orbit_0003") == BAD_INPUT
+    assert "is a picture of the view orbit_0000" in " ".join(capsys.readouterr().err.split())
+    assert paint(folder, "view.png", "front") == BAD_INPUT
+    assert "No view is called front" in " ".join(capsys.readouterr().err.split())
