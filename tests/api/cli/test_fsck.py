@@ -206,7 +206,7 @@ def test_mend_repairs_all_findings(
 
 def test_fsck_of_running_service_finds_nothing(service: Files, capsys: pytest.CaptureFixture[str]) -> None:
     """Files that are added, replaced or deleted during the check are not reported as missing or orphaned."""
-    stop = threading.Event()
+    stop, store = threading.Event(), service.store
 
     def work() -> None:
         number = 0
@@ -216,13 +216,13 @@ def test_fsck_of_running_service_finds_nothing(service: Files, capsys: pytest.Ca
             lease = service.job(scene)
             for turn in range(3):
                 put = service.artifacts.put(lease.job_id, lease.epoch, "log.txt", service.file(b"%d" % turn))
-                for location in service.store.queue.publish(lease, [put]):
+                for location in store.leases.publish(lease, [put]):
                     service.artifacts.objects.remove(location)
             upload_id = service.upload(b"upload %d" % number, 7 + len(str(number))).split("/")[1].removesuffix(".part")
-            service.blobs.finish_upload(service.store.files.upload(upload_id, "me"), HOUR)
-            service.store.queue.succeed(lease, [], {})
+            service.blobs.finish_upload(store.inputs.upload(upload_id, "me"), HOUR)
+            store.leases.succeed(lease, [], {})
             if number % 2:
-                service.store.jobs.delete(lease.job_id, None)
+                store.jobs.delete(lease.job_id, None)
                 service.artifacts.objects.remove_below(lease.job_id)
 
     with ThreadPoolExecutor(1) as pool:
