@@ -29,6 +29,8 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.weight_files import damaged_weights
 from sgsst_core.settings import reason
 
+_log = logging.getLogger(__name__)
+
 GB = 1_000_000_000
 #: Maximum number of characters of a path at which a proxy offers the service.
 _MAX_SUBPATH = 200
@@ -244,9 +246,6 @@ def missing_extras() -> list[str]:
 def install_command(extra: str) -> str:
     """Return the command that installs an extra."""
     return f"pip install 'sgsst-service[{extra}]'"
-
-
-_log = logging.getLogger(__name__)
 
 
 def check_weights() -> None:

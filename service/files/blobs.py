@@ -32,6 +32,8 @@ from service.store.files import InputRows, check_offset
 from service.store.tables import BlobRow, UploadPartRow, UploadRow
 from sgsst_core.files.atomic import file_digest
 
+_log = logging.getLogger(__name__)
+
 #: Age in seconds at which files without a database row are removed; younger files may not have their row yet.
 ORPHAN_SECONDS = 3600.0
 #: Folders of inputs and of unfinished uploads, in the file store (in the data folder if the file store is local). All
@@ -444,8 +446,6 @@ def _older(path: Path, before: float) -> bool:
 REMOTE_ORPHAN_SECONDS = 6 * 3600.0
 #: Interval between searches of the store for objects without a database row, in seconds.
 _SEARCH_SECONDS = 3600.0
-
-_log = logging.getLogger(__name__)
 
 
 def open_blobs(settings: ServiceSettings, inputs: InputRows, artifacts: Artifacts) -> Blobs:

@@ -28,6 +28,8 @@ from service.store.tables import BlobRow
 from sgsst_core import container
 from sgsst_core.errors import WeightsError
 
+_log = logging.getLogger(__name__)
+
 #: Maximum number of waiting requests per owner; further ones are rejected with `BUSY`.
 MAX_WAITING = 64
 
@@ -90,8 +92,6 @@ class Lanes:
             queue.remove(granted)
         self._grant_turns()
 
-
-_log = logging.getLogger(__name__)
 
 #: Task of the inspecting process: validate a job's inputs, or plan the job as well.
 Work = Literal["validate", "plan"]

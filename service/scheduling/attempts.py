@@ -50,6 +50,8 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.progress import Progress
 from worker.job import JobSpec
 
+_log = logging.getLogger(__name__)
+
 #: Variables that set a process' number of threads; values set by the operator take precedence.
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -124,9 +126,6 @@ class ChildProcess:
     def wait(self) -> int:
         """Wait for the process to exit, and return its exit code; negative for the signal that killed it."""
         return self._process.wait()
-
-
-_log = logging.getLogger(__name__)
 
 
 class Stager:

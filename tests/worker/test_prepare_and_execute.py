@@ -20,7 +20,6 @@ from sgsst_core.files.images import save_jpg
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.planning.plan import Plan
 from sgsst_core.progress import Progress
-from sgsst_core.rasterizer import drawing_problem
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint, save_plan
@@ -281,24 +280,6 @@ def test_damaged_checkpoint_falls_back_to_previous(request_: JobSpec) -> None:
     assert "not a readable checkpoint" in warnings[0]
 
 
-@pytest.mark.slow
-def test_unusable_rasterizer_in_checkpoint_is_replanned(request_: JobSpec) -> None:
-    """The checkpoint is that of a machine with a GPU."""
-    if drawing_problem("triton", "cuda") is None:
-        pytest.skip("it works")
-    job = prepare(request_)
-    run_job(job, steps=3)
-    path = request_.out.with_name("s.checkpoint.safetensors")
-    saved = load_checkpoint(path, job.fingerprint)
-    unusable = replace(saved.plan, rasterizer="triton", uncached="triton")
-    Checkpoints(path).save(replace(saved, plan=unusable), job.fingerprint)
-    again = prepare(request_, resume=Resume(True))
-    assert again.resumed is not None
-    assert again.resumed.plan.rasterizer == "triton"
-    assert again.stylizer.job.plan.rasterizer == saved.plan.rasterizer
-    assert run_job(again).stopped == "finished"
-
-
 def test_optional_resume_starts_without_checkpoint(request_: JobSpec) -> None:
     with pytest.raises(CheckpointError, match="no checkpoint to resume from"):
         prepare(request_, resume=Resume(True))
@@ -346,24 +327,6 @@ def test_colors_file_matches_the_result(request_: JobSpec, tmp_path: Path) -> No
             colors = np.fromfile(alone, "<f2").reshape(-1, 3)
             assert colors.shape == exact.shape
             assert np.array_equal(colors, exact.numpy().astype(np.float16))
-
-
-@pytest.mark.parametrize(
-    "why", ["split", *(pytest.param(each, marks=pytest.mark.slow) for each in ("dropped", "attenuated"))]
-)
-def test_colors_file_is_omitted_if_more_than_colors_change(tmp_path: Path, why: str) -> None:
-    if why == "split":
-        request = with_scene(small_request(tmp_path, 1, refine=3.0), large_wall())
-    elif why == "dropped":
-        scene = wall(sh_degree=1)
-        scene.opacities[5] = torch.nan
-        request = with_scene(small_request(tmp_path, 1), scene, drop_invalid=True)
-    else:
-        request = with_scene(small_request(tmp_path, 1, sh_attenuation=0.5), wall(sh_degree=1))
-    result = run_job(prepare(request))
-    assert result.report_error is None
-    assert request.out.exists()
-    assert not request.out.with_name("s.colors.f16").exists()
 
 
 def test_first_preview_shows_warm_start_colors(

@@ -350,39 +350,3 @@ def test_api_and_dispatcher_share_a_bucket_and_no_folder(
         assert client.get(f"{where}/remote/stylized.ply").status_code == 404
     listing = httpx2.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "service/job_"})
     assert "<Key>" not in listing.text
-
-
-@pytest.mark.slow
-def test_parts_of_an_upload_go_to_any_api_process(environment: dict[str, str], tmp_path: Path) -> None:
-    shared = {"SGSST_ARTIFACTS": "s3://results/uploads", "SGSST_DATABASE": f"sqlite:///{tmp_path / 'shared.db'}"}
-    content = os.urandom(SIZE + 1000)
-    tus = {"Tus-Resumable": "1.0.0", "Content-Type": "application/offset+octet-stream"}
-    with (
-        Service(tmp_path / "one", alone=True, **shared) as one,
-        Service(tmp_path / "two", alone=True, **shared) as two,
-        one.client() as first,
-        two.client() as second,
-    ):
-        where = first.post("/v1/uploads", headers={**tus, "Upload-Length": str(len(content))}).headers["location"]
-
-        def send(client: httpx2.Client, start: int, stop: int) -> httpx2.Response:
-            return client.patch(where, content=content[start:stop], headers={**tus, "Upload-Offset": str(start)})
-
-        assert send(first, 0, SIZE).status_code == 204
-        assert second.head(where, headers=tus).headers["upload-offset"] == str(SIZE)
-        assert send(first, 0, 10).status_code == 409
-        assert send(second, SIZE, SIZE + 100).status_code == 204
-        assert send(first, SIZE + 100, len(content)).status_code == 204
-        for client in (first, second):
-            shown = client.get(where).json()
-            assert (shown["complete"], shown["sha256"]) == (True, hashlib.sha256(content).hexdigest())
-        listing = httpx2.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "uploads/"}).text
-        assert listing.count("<Key>") == 1
-        assert "<Key>uploads/blobs/" in listing
-        given_up = first.post("/v1/uploads", headers={**tus, "Upload-Length": "100"}).headers["location"]
-        headers = {**tus, "Upload-Offset": "0"}
-        assert first.patch(given_up, content=bytes(60), headers=headers).status_code == 204
-        assert second.delete(given_up, headers=tus).status_code == 204
-        assert first.get(given_up).status_code == 404
-        listing = httpx2.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "uploads/"}).text
-        assert listing.count("<Key>") == 1

@@ -81,24 +81,6 @@ def test_owners_take_turns_on_one_slot() -> None:
     assert asyncio.run(run()) == ["a1", "b1", "c1", "a2", "b2", "a3"]
 
 
-def test_owner_never_occupies_two_slots() -> None:
-    async def run() -> None:
-        work = Work(Lanes(2))
-        tasks = await start(work, *(f"a{number}" for number in range(5)))
-        assert list(work.at_work) == ["a0"], "the other place stays free for others"
-        tasks += await start(work, "b0", "c0")
-        assert sorted(work.at_work) == ["a0", "b0"]
-        await work.end("b0")
-        assert sorted(work.at_work) == ["a0", "c0"]
-        await work.end("a0")
-        assert sorted(work.at_work) == ["a1", "c0"]
-        while work.at_work:
-            await work.end(next(iter(work.at_work)))
-        await asyncio.gather(*tasks)
-
-    asyncio.run(run())
-
-
 def test_queue_limit_applies_per_owner() -> None:
     async def run() -> None:
         work = Work(Lanes(2))

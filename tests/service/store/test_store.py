@@ -165,16 +165,6 @@ def _at_once(work: Callable[[], None], count: int) -> None:
         thread.join()
 
 
-def test_queue_order_is_priority_then_turn_then_age(store: Store, clock: Clock) -> None:
-    order = []
-    for owner, priority in (("a", 0), ("a", 0), ("a", 0), ("b", 0), ("c", 1)):
-        order.append(queue(store, owner, priority))
-        clock.now += 1
-    taken = [lease(store).job for _ in order]
-    assert [job.owner for job in taken] == ["c", "a", "b", "a", "a"]
-    assert [job.id for job in taken if job.owner == "a"] == order[:3]
-
-
 def test_lost_lease_cannot_write(store: Store, clock: Clock) -> None:
     queue(store)
     late = lease(store, "late")
@@ -353,13 +343,6 @@ def test_dispatchers_are_alive_while_they_send_heartbeats(store: Store, clock: C
     store.retention.expire()
     with store.database.reading() as session:
         assert session.connection().exec_driver_sql("SELECT name FROM dispatchers").scalars().all() == ["three"]
-
-
-def test_release_is_not_a_failure(store: Store) -> None:
-    queue(store)
-    for _ in range(2 * ATTEMPTS):
-        store.leases.release(lease(store))
-    assert lease(store).job.failures == 0
 
 
 def test_job_of_another_owner_is_not_found(store: Store) -> None:

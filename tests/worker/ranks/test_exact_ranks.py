@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +17,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import TERMS, layers_of
-from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, Traffic
+from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.parallel.division import Divider, Piece, Shares, Tiling, divide
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
@@ -290,22 +289,6 @@ def test_jobs_of_any_shape_match_one_rank(ranks: int) -> None:
             assert relative_error(actual["exact"], expected["exact"]) < BOUNDS[torch.float64]
 
 
-def test_ranks_use_the_same_background_colors() -> None:
-    """Background colors equal those of a run on one rank, however the ranks are grouped."""
-    values = {
-        "steps_coarse": 2,
-        "steps_sos": 3,
-        "views_per_step": 2,
-        "learning_rate": 0.01,
-        "training_background": "palette",
-    }
-    expected = stylize(ALONE, ball(), 3, values)
-    for result in on_ranks(3, stylize, ball(), 3, values):
-        assert result["losses"] == pytest.approx(expected["losses"], rel=1e-4)
-        assert relative_error(result["colors"], expected["colors"]) < 1e-3
-    assert expected["losses"] != stylize(ALONE, ball(), 3, {**values, "training_background": "random"})["losses"]
-
-
 def mean_gradient_by_hand(views: list[int]) -> Tensor:
     scene = wall()
     settings = make_settings("standard", steps_coarse=0, steps_sos=1, coarsest_side=40)
@@ -465,34 +448,6 @@ def test_whole_gradient_is_sent_if_nearly_all_is_shown() -> None:
         for whole, packed in zip(result["whole"], result["shown"], strict=True):
             assert torch.equal(whole, packed)
         assert [sent["gradient"] for sent in result["bytes shown"]] == [13 * len(scene), 12 * len(scene)]
-
-
-def quarters() -> list[Rectangle]:
-    return [Rectangle(top, 0, top + 24, WIDTH) for top in range(0, HEIGHT, 24)]
-
-
-def windows() -> list[Rectangle]:
-    """Return the windows of four ranks: the whole image, nothing, the two lower quarters, and nothing."""
-    nothing = Rectangle(0, 0, 0, 0)
-    return [Rectangle(0, 0, HEIGHT, WIDTH), nothing, Rectangle(48, 0, HEIGHT, WIDTH), nothing]
-
-
-def exchange_everything(collectives: Collectives) -> Mapping[Traffic, int]:
-    exchange, own = ImageExchange(quarters(), windows()), windows()[collectives.rank]
-    collectives.gather_parts([exchange], [torch.zeros(24, WIDTH, 3)], [torch.zeros(*own.shape, 3)])
-    collectives.reduce_parts([exchange], [torch.zeros(*own.shape, 3)])
-    collectives.all_reduce(torch.zeros(1000, 3))
-    collectives.union(torch.zeros(300, dtype=torch.bool))
-    pair = collectives.split_group(collectives.size // 2)
-    pair.all_reduce(torch.zeros(500), "statistics")
-    return dict(collectives.sent)
-
-
-def test_sent_bytes_follow_ring_algorithms() -> None:
-    """Parts are sent directly to the two ranks that need them, and their gradients back."""
-    for sent, quarters_sent in zip(on_ranks(4, exchange_everything), (0 + 3, 1 + 0, 1 + 1, 2 + 0), strict=True):
-        image = 12 * WIDTH * 24 * quarters_sent
-        assert sent == {"image": image, "gradient": 6 * (12_000 + 300) // 4, "statistics": 2000}
 
 
 def test_one_rank_sends_nothing() -> None:

@@ -11,9 +11,6 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from sgsst_core.planning.facts import make_network
-from sgsst_core.settings import make_settings
-from tests.networks import tiny_weights
 from worker.ranks.process_group import with_index
 from worker.ranks.rank import _failure
 
@@ -61,14 +58,3 @@ def test_store_error_is_an_echo_of_a_lost_rank() -> None:
     """Such an error occurs if a rank is lost while the other ranks form their process group."""
     assert _failure(dist.DistStoreError("wait timeout")).echo
     assert not _failure(RuntimeError("wait timeout")).echo
-
-
-def test_float32_is_not_rounded_to_tf32() -> None:
-    before = torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
-    try:
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = True
-        make_network(tiny_weights(), make_settings(), "float32", "cpu")
-        assert not torch.backends.cudnn.allow_tf32
-        assert not torch.backends.cuda.matmul.allow_tf32
-    finally:
-        torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32 = before

@@ -9,7 +9,6 @@ from torch import Tensor
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
 
-from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -48,22 +47,3 @@ def test_two_ranks_match_one_and_synchronize_once_per_step() -> None:
     assert first[3] == second[3] == "cuda triton"
     assert first[1] == pytest.approx(losses, rel=1e-4)
     assert relative_error(first[0], expected.double()) < 1e-3
-
-
-def merge_three(collectives: Collectives) -> list[tuple[Tensor, Tensor]]:
-    own = torch.randn(9 + collectives.rank, 7, 16, generator=torch.Generator().manual_seed(collectives.rank))
-    part = layer_statistics(own.to("cuda"))
-    numbers = torch.ones(1, dtype=torch.float64, device="cuda")
-    merged, added = collectives.all_reduce_statistics([part] * 3, numbers * torch.arange(3, device="cuda"))
-    return [(statistics.gram().cpu(), number) for statistics, number in zip(merged, added.cpu(), strict=True)]
-
-
-def test_statistics_merge_on_a_gpu() -> None:
-    every = torch.cat(
-        [torch.randn(9 + rank, 7, 16, generator=torch.Generator().manual_seed(rank)) for rank in range(2)]
-    )
-    expected = layer_statistics_reference(every).gram()
-    for result in on_ranks(2, merge_three, device="cuda"):
-        for turn, (gram, added) in enumerate(result):
-            assert relative_error(gram, expected) < 1e-6
-            assert float(added) == 2 * turn
