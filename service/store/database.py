@@ -113,7 +113,7 @@ def _refusal(error: Exception) -> ServiceError | None:
     return problems.DATABASE_UNAVAILABLE() if away or getattr(error, "connection_invalidated", False) else None
 
 
-def impatient_connection(seconds: float) -> Any:
+def _impatient_connection(seconds: float) -> Any:
     """Return a subclass of psycopg's connection that bounds each wait for the server.
 
     A stopped server or a frozen machine still acknowledges packets, so no TCP timeout detects it.
@@ -343,7 +343,7 @@ class Database:
 
 def _connect(_dialect: Any, _record: Any, arguments: Any, options: Any, *, seconds: float) -> Any:
     """Connect to PostgreSQL with bounded waits."""
-    return impatient_connection(seconds).connect(*arguments, **options)
+    return _impatient_connection(seconds).connect(*arguments, **options)
 
 
 def _set_pragmas(connection: Any, _record: Any, *, busy_seconds: float) -> None:

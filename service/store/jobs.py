@@ -189,7 +189,7 @@ def _halve(session: Session, job_id: str) -> None:
     session.execute(one, [{"job_id": job_id, "attempt": attempt, "at": step} for attempt, step in steps[1::2]])
 
 
-def points(connection: Connection, job_id: str, current: dict[str, Any] | None, most: int) -> list[dict[str, Any]]:
+def _points(connection: Connection, job_id: str, current: dict[str, Any] | None, most: int) -> list[dict[str, Any]]:
     """Return a job's loss history: its points, and its current progress as the last one, as in `add_point`.
 
     Args:
@@ -213,7 +213,7 @@ def _position(progress: dict[str, Any]) -> tuple[int, int]:
 
 
 #: Roles of few files, which are shown with every job.
-NAMED_ROLES = ("scene", "style", "cameras")
+_NAMED_ROLES = ("scene", "style", "cameras")
 
 #: Table of the entries in `jobs.inputs`, and expressions for the position, the JSON and the role of an entry.
 _ENTRIES = {
@@ -227,7 +227,7 @@ _ENTRIES = {
 }
 
 
-def counts_and_named(
+def _counts_and_named(
     connection: Connection, job_ids: Sequence[str]
 ) -> tuple[dict[str, dict[str, int]], dict[str, list[dict[str, Any]]]]:
     """Return the number of files by role of each job, and its entries of scene, style images and camera files."""
@@ -235,27 +235,16 @@ def counts_and_named(
     named: dict[str, list[dict[str, Any]]] = {job_id: [] for job_id in job_ids}
     if job_ids:
         of_jobs = {"ids": list(job_ids)}
-        for job_id, role, number in connection.execute(_query(connection, "counts"), of_jobs):
+        for job_id, role, number in connection.execute(_input_query(connection, "counts"), of_jobs):
             counts[job_id][role] = number
-        for job_id, entry in connection.execute(_query(connection, "named"), {**of_jobs, "roles": list(NAMED_ROLES)}):
+        for job_id, entry in connection.execute(
+            _input_query(connection, "named"), {**of_jobs, "roles": list(_NAMED_ROLES)}
+        ):
             named[job_id].append(json.loads(entry))
     return counts, named
 
 
-def page_of_inputs(connection: Connection, job_id: str, start: int, limit: int) -> list[tuple[int, dict[str, Any]]]:
-    """Return a job's entries from a position on, each with its index among those of its role."""
-    rows = connection.execute(_query(connection, "page"), {"ids": [job_id], "start": start, "most": limit})
-    return [(index, json.loads(entry)) for index, entry in rows]
-
-
-def one_input(connection: Connection, job_id: str, role: str, index: int) -> dict[str, Any] | None:
-    """Return a job's entry by its role and its index among those of the role; None if there is none."""
-    parameters = {"ids": [job_id], "roles": [role], "index": index}
-    entry = connection.execute(_query(connection, "one"), parameters).scalar()
-    return None if entry is None else dict(json.loads(entry))
-
-
-def _query(connection: Connection, name: str) -> TextClause:
+def _input_query(connection: Connection, name: str) -> TextClause:
     return _queries(connection.dialect.name)[name]
 
 
@@ -444,12 +433,16 @@ class Jobs:
     def input_page(self, job_id: str, start: int, limit: int) -> list[tuple[int, dict[str, Any]]]:
         """Return a job's inputs from a position on, each with its index among those of its role."""
         with self._database.reading_rows() as connection:
-            return page_of_inputs(connection, job_id, start, limit)
+            parameters = {"ids": [job_id], "start": start, "most": limit}
+            rows = connection.execute(_input_query(connection, "page"), parameters)
+            return [(index, json.loads(entry)) for index, entry in rows]
 
     def input(self, job_id: str, role: str, index: int) -> dict[str, Any] | None:
         """Return an input of a job by its role and its index among those of the role; None if there is none."""
         with self._database.reading_rows() as connection:
-            return one_input(connection, job_id, role, index)
+            parameters = {"ids": [job_id], "roles": [role], "index": index}
+            entry = connection.execute(_input_query(connection, "one"), parameters).scalar()
+            return None if entry is None else dict(json.loads(entry))
 
     def detail(self, job_id: str, owner: str | None) -> tuple[ShownJob, list[AttemptRow]]:
         """Return a job as it is shown, and its attempts, all in one snapshot."""
@@ -626,7 +619,7 @@ class Jobs:
     def loss_history(self, job: JobRow, most: int) -> list[dict[str, Any]]:
         """Return a job's loss history up to its current step, in at most `most` points."""
         with self._database.reading_rows() as connection:
-            return points(connection, job.id, job.progress, most)
+            return _points(connection, job.id, job.progress, most)
 
     def events(self, job_id: str, after: int, limit: int = 500) -> list[EventRow]:
         """Return a job's events after the event number `after`."""
@@ -649,7 +642,7 @@ def _check_queue(session: Session, owner: str, limit: int) -> None:
 
 def _shown(connection: Connection, jobs: Sequence[JobRow]) -> list[ShownJob]:
     """Return jobs as users see them, in the same snapshot."""
-    counts, inputs = counts_and_named(connection, [job.id for job in jobs])
+    counts, inputs = _counts_and_named(connection, [job.id for job in jobs])
     started = [job.id for job in jobs if job.attempt]
     rows = connection.execute(_NEWEST_PREVIEWS, {"ids": started}) if started else ()
     previews = {row.job_id: row.newest for row in rows}

@@ -82,7 +82,7 @@ def _first_of_each_owner() -> Select[Any]:
 #: `most`.
 _QUEUED = and_(JobRow.status == JobStatus.QUEUED, JobRow.not_before <= _NOW)
 _EXPIRED = and_(JobRow.lease_expires_at < _NOW, JobRow.status.in_(ACTIVE))
-WAITING, LOST = _count(_QUEUED), _count(_EXPIRED)
+_WAITING, _LOST = _count(_QUEUED), _count(_EXPIRED)
 #: Ids of the jobs that may be next.
 _CANDIDATES = union_all(_first_of_each_owner(), select(JobRow.id).where(_EXPIRED))
 #: First candidates in order. Their conditions are checked again, because rows may have changed.
@@ -102,7 +102,7 @@ _FIRST = (
 )
 
 
-def next_jobs(session: Session, now: float) -> Sequence[JobRow]:
+def _next_jobs(session: Session, now: float) -> Sequence[JobRow]:
     """Return the next jobs: by priority, then owners' turns, then age, at most one queued job of each owner.
 
     Their rows are locked; rows that others have locked are skipped.
@@ -119,13 +119,13 @@ MAX_RETRY_SECONDS = 300.0
 #: of memory.
 MAX_LOSSES = 10
 #: Code of the error of an attempt that was lost with its dispatcher.
-DISPATCHER_LOST = "dispatcher-lost"
+_DISPATCHER_LOST = "dispatcher-lost"
 
 
 def cause_of(error: Mapping[str, Any] | None) -> Cause:
     """Return the cause of an attempt's end from its recorded error."""
     code = (error or {}).get("code")
-    if code == DISPATCHER_LOST:
+    if code == _DISPATCHER_LOST:
         return Cause.DISPATCHER
     return Cause((error or {}).get("cause", Cause.MACHINE)) if code == InfrastructureError.code else Cause.JOB
 
@@ -275,7 +275,7 @@ class Leases:
         """
         now = self._database.clock()
         with self._database.writing() as session:
-            for job in next_jobs(session, now):
+            for job in _next_jobs(session, now):
                 lost = job.status in ACTIVE
                 if lost and self._close_lost(session, job, dispatcher, now):
                     continue
@@ -292,7 +292,7 @@ class Leases:
         now = self._database.clock()
         total = 0
         with self._database.reading_rows() as connection:
-            for query in (WAITING, LOST):
+            for query in (_WAITING, _LOST):
                 total += connection.execute(query, {"now": now, "most": most - total}).scalar_one()
         return total
 
@@ -453,7 +453,7 @@ class Leases:
 
     def _close_lost(self, session: Session, job: JobRow, dispatcher: str, now: float) -> bool:
         """Close an attempt whose lease `dispatcher` has found expired; return whether this has ended the job."""
-        error = {"code": DISPATCHER_LOST, "message": "The process that ran the job stopped responding."}
+        error = {"code": _DISPATCHER_LOST, "message": "The process that ran the job stopped responding."}
         if job.lease_owner == dispatcher or self._lives(session, job):
             message = "The process that ran the job could not reach the database in time. The job will be retried."
             error = {"code": InfrastructureError.code, "message": message, "cause": Cause.DATABASE}
