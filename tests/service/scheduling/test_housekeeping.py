@@ -37,7 +37,7 @@ def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     everything = {file.location for file in (referenced, late, unknown, before, own)}
     assert set(artifacts.objects.below("")) == everything
     assert housekeeping.remove_strays(store, artifacts) == 0, "rows may still be on their way"
-    monkeypatch.setattr(housekeeping, "_STRAY_SECONDS", -60.0)
+    monkeypatch.setattr(housekeeping, "REMOTE_ORPHAN_SECONDS", -60.0)
     assert housekeeping.remove_strays(store, artifacts) == 3
     assert set(artifacts.objects.below("")) == {referenced.location, own.location}
     store.close()
