@@ -26,7 +26,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -34,12 +34,10 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from api.cli.demo_scene import build_demo
-from benchmarks.inputs import read_views
-from benchmarks.judged import UNSTYLIZED
-from benchmarks.machine import RESULTS, add_pair, describe_machine
+from benchmarks.common import RESULTS, add_pair, describe_machine, read_views
+from benchmarks.equal_steps import UNSTYLIZED, judged
 from sgsst_core import Stylizer, load_cameras, load_image, load_scene, make_settings
 from sgsst_core.quality.judge import Judge
 from sgsst_core.quality.lpips import Lpips
@@ -172,23 +170,16 @@ def run(task: Task, end: float) -> Rows:
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **task.settings))
     rows: Rows = {}
     if task.candidate == DEFAULT:
-        rows = {UNSTYLIZED: judgment_of(judge, scene.sh_dc), START: judgment_of(judge, stylizer.stylized())}
+        rows = {UNSTYLIZED: judged(judge, scene.sh_dc), START: judged(judge, stylizer.stylized())}
     seconds = 0.0
     for step in range(1, stylizer.job.total_steps + 1):
         before = time.perf_counter()
         stylizer.run_step()
         seconds += time.perf_counter() - before
         if step in task.at:
-            rows[f"{DEFAULT} after {step}"] = judgment_of(judge, stylizer.stylized()) | {"seconds": seconds}
-    rows[task.candidate] = judgment_of(judge, stylizer.stylized()) | {"seconds": seconds}
+            rows[f"{DEFAULT} after {step}"] = judged(judge, stylizer.stylized()) | {"seconds": seconds}
+    rows[task.candidate] = judged(judge, stylizer.stylized()) | {"seconds": seconds}
     return {name: {key: float(f"{value:.5g}") for key, value in row.items()} for name, row in rows.items()}
-
-
-def judgment_of(judge: Judge, sh_dc: Tensor) -> dict[str, float]:
-    """Return the judgment of colors [N, 3], without measures that have no value."""
-    judgment = judge.judge(sh_dc)
-    assert judgment is not None, "no view can be judged: choose a larger --resolution"
-    return {name: value for name, value in asdict(judgment).items() if value is not None}
 
 
 @lru_cache(maxsize=1)

@@ -26,16 +26,18 @@ import sys
 import time
 from collections import defaultdict
 from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from typing import Any
 from unittest import mock
 
 import torch
+from torch import Tensor
 
-from benchmarks.inputs import input_parser, read_inputs, read_views
-from benchmarks.judged import compare_rows, judged, write_sheet
+from benchmarks.common import add_pair, input_parser, read_inputs, read_views
 from sgsst_core import Stylizer, make_settings
+from sgsst_core.bench.quality import judged_row
 from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile, read_scene
@@ -47,6 +49,7 @@ from sgsst_core.quality.measure import make_judge, make_novel_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.report.contact_sheet import write_grid
 from sgsst_core.scales import EVEN
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
@@ -54,6 +57,8 @@ from tests.rounding import RoundedToFloat16, RoundedToTf32
 from worker.inputs import select
 from worker.options import parse_selection
 
+#: Name of the row of the scene's own colors.
+UNSTYLIZED = "unstylized"
 COLUMNS = (
     "loss",
     "style",
@@ -88,7 +93,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--settings", default="{}", help="JSON, of all rows")
     parser.add_argument("--region", help="SPEC of a region, as in `sgsst stylize --region NAME:SPEC`")
-    parser.add_argument("--out", type=Path, help="folder for a contact sheet and the colors")
+    parser.add_argument("--out", type=Path, help="folder for a contact sheet")
     arguments = parser.parse_args()
     scene, cameras, style = read_inputs(arguments, arguments.views, arguments.resolution)
     region = JudgedRegion(read_scene(arguments.scene), arguments.region) if arguments.region else None
@@ -106,7 +111,7 @@ def main() -> None:
     rows = {name: json.loads(text or "{}") for name, _, text in (row.partition("=") for row in arguments.rows)}
     paces: dict[tuple[str, int], Pace] = {}
 
-    def run(row: str, seed: int) -> tuple[torch.Tensor, dict[str, float]]:
+    def run(row: str, seed: int) -> tuple[Tensor, dict[str, float]]:
         values = base | rows[row] | {"seed": seed}
         own = values.pop("region_content_weight", None)
         regions = region.regions(own) if region and own is not None else None
@@ -116,17 +121,26 @@ def main() -> None:
         figures = {"loss": loss(colors) / start, **_judged(judge, colors, wanted, region)}
         return colors, figures | seconds_of(paces[row, seed])
 
-    def loss(colors: torch.Tensor) -> float:
+    def loss(colors: Tensor) -> float:
         terms = exact.evaluate(exact.views.covered, colors)
         return EVEN.mean({scale: each.total for scale, each in terms.items()})
 
     start = loss(scene.sh_dc)
-    unstylized = scene.sh_dc, _judged(judge, scene.sh_dc, wanted, region)
-    colors = compare_rows(
-        "equal_steps", arguments.name, description, COLUMNS, unstylized, list(rows), arguments.seeds, run
-    )
+    colors, judgments = {UNSTYLIZED: scene.sh_dc}, {UNSTYLIZED: _judged(judge, scene.sh_dc, wanted, region)}
+    print(f"{arguments.name:28}", *(f"{name:>9}" for name in COLUMNS))
+    _print_row(UNSTYLIZED, judgments[UNSTYLIZED])
+    for row in rows:
+        results = []
+        for seed in arguments.seeds.split(","):
+            colors[row], figures = run(row, int(seed))
+            results.append(figures)
+        judgments[row] = _mean(results)
+        _print_row(row, judgments[row])
+        add_pair("equal_steps", arguments.name, description, judgments)
     if arguments.out:
-        write_sheet(arguments.out, arguments.name, judge, style, colors)
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        sheet = [judged_row(judge, row, sh_dc) for row, sh_dc in colors.items()]
+        write_grid(arguments.out / f"{arguments.name}.jpg", [[("style", style)], *sheet])
 
 
 class JudgedRegion:
@@ -150,7 +164,7 @@ class JudgedRegion:
         """Return the regions of a job in which this one has its own content weight."""
         return Regions((Region("rest"), Region("region", content_weight=content_weight)), self._labels)
 
-    def content(self, judge: Judge, sh_dc: torch.Tensor) -> float:
+    def content(self, judge: Judge, sh_dc: Tensor) -> float:
         """Return the LPIPS of colors [N, 3] against the unstylized scene, mean over the region's pixels on black."""
         distance = pixels = 0.0
         for camera in judge.cameras:
@@ -163,7 +177,7 @@ class JudgedRegion:
 
 
 def _judge(
-    scene: Scene, cameras: list[Camera], style: torch.Tensor, settings: dict[str, Any]
+    scene: Scene, cameras: list[Camera], style: Tensor, settings: dict[str, Any]
 ) -> tuple[Judge, Float32Reference]:
     """Return a judge of the novel views between a job's views, and the exact loss of its views."""
     values = {"precision": "float32", **settings}
@@ -171,13 +185,13 @@ def _judge(
     return make_judge(stylizer, make_novel_views(stylizer), Lpips()), Float32Reference(stylizer)
 
 
-def _judged(judge: Judge, sh_dc: torch.Tensor, wanted: torch.Tensor, region: JudgedRegion | None) -> dict[str, float]:
+def _judged(judge: Judge, sh_dc: Tensor, wanted: Tensor, region: JudgedRegion | None) -> dict[str, float]:
     sliced = [sliced_distance(judge.renders(sh_dc, view), wanted) for view in judge.cameras]
     own = {"region_content": region.content(judge, sh_dc)} if region else {}
     return {**judged(judge, sh_dc), **own, "sliced": sum(sliced) / len(sliced)}
 
 
-def sliced_distance(renders: list[torch.Tensor], wanted: torch.Tensor) -> float:
+def sliced_distance(renders: list[Tensor], wanted: Tensor) -> float:
     """Return the order-2 sliced Wasserstein distance of a view's covered pixels from a style, in 8-bit levels.
 
     Args:
@@ -189,7 +203,7 @@ def sliced_distance(renders: list[torch.Tensor], wanted: torch.Tensor) -> float:
     return 255 * float((quantiles(on_black, coverage) - wanted).square().mean().sqrt())
 
 
-def quantiles(image: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+def quantiles(image: Tensor, weights: Tensor) -> Tensor:
     """Return the quantiles [QUANTILES, DIRECTIONS] of an image [h, w, 3] with pixel weights [h, w]."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn((3, DIRECTIONS), generator=generator).double(), dim=0)
@@ -218,8 +232,8 @@ def steps_as_long_as(pace: Pace, steps_coarse: int, steps_sos: int) -> dict[str,
 
 
 def _run(
-    scene: Scene, cameras: list[Camera], style: torch.Tensor, values: dict[str, Any], regions: Regions | None
-) -> tuple[torch.Tensor, Pace]:
+    scene: Scene, cameras: list[Camera], style: Tensor, values: dict[str, Any], regions: Regions | None
+) -> tuple[Tensor, Pace]:
     """Run a job, and return its colors [N, 3] and its pace."""
     weights = _weights(values.pop("factor", None))
     network = ROUNDED.get(values.pop("rounded", None))
@@ -242,6 +256,27 @@ def _weights(factor: float | dict[str, float] | None) -> BackboneWeights:
         return with_scales(weights, factor)
     layers = [layer.replace("conv", "relu") for layer in weights.convolutions]
     return with_scales(weights, dict.fromkeys(layers, float(factor)))
+
+
+def judged(judge: Judge, sh_dc: Tensor) -> dict[str, float]:
+    """Return the judgment of colors [N, 3], without measures that have no value."""
+    judgment = judge.judge(sh_dc)
+    assert judgment is not None, "no view can be judged: give more cameras, or larger views"
+    return {name: value for name, value in asdict(judgment).items() if value is not None}
+
+
+def _mean(results: list[dict[str, float]]) -> dict[str, Any]:
+    mean: dict[str, Any] = {name: sum(row[name] for row in results) / len(results) for name in results[0]}
+    mean["seeds"] = len(results)
+    if len(results) > 1:
+        values = {name: [row[name] for row in results] for name in results[0]}
+        mean["spread"] = {name: max(each) - min(each) for name, each in values.items()}
+    return mean
+
+
+def _print_row(name: str, row: dict[str, Any]) -> None:
+    """Print the figures of one row in columns; missing figures stay blank."""
+    print(f"{name:28}", *(f"{row[column]:9.3f}" if column in row else " " * 9 for column in COLUMNS), flush=True)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from benchmarks.machine import RESULTS
+from benchmarks.common import RESULTS
 from sgsst_core.bench.error_time import MOMENTS, SLICES
 from sgsst_core.files.atomic import write_json
 from sgsst_core.files.scene_file import read_scene

@@ -20,7 +20,7 @@ from typing import Any
 
 import httpx2
 
-from benchmarks.machine import write_result
+from benchmarks.common import write_result
 from tests.api.page.browser import Watched, chromium, open_browser
 from tests.api.service import SETTINGS, Service
 

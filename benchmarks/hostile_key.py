@@ -26,7 +26,7 @@ from typing import Any
 import httpx2
 import psutil
 
-from benchmarks.machine import write_result
+from benchmarks.common import write_result
 from benchmarks.service_load import spread
 from service.settings import ServiceSettings
 from service.store import open_store

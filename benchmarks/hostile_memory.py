@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from benchmarks.machine import write_result
+from benchmarks.common import write_result
 from tests.api.service import Service, wait_for
 
 MB = 1_000_000

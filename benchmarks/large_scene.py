@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 from scipy.spatial import cKDTree
 
-from benchmarks.machine import write_result
+from benchmarks.common import write_result
 from benchmarks.rasterizer import DATA, timed
 from sgsst_core.bench.synthetic import surface_scene, texture
 from sgsst_core.budget import peak_memory

@@ -17,8 +17,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.inputs import input_parser, read_inputs, with_size
-from benchmarks.machine import RESULTS, write_result
+from benchmarks.common import RESULTS, input_parser, read_inputs, with_size, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import peak_memory
 

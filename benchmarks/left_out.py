@@ -23,8 +23,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from benchmarks.inputs import read_views
-from benchmarks.machine import write_result
+from benchmarks.common import read_views, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import Cache, peak_memory
 from sgsst_core.features.network_weights import BackboneWeights

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from benchmarks.machine import write_result
-from benchmarks.pictures import grainy_photo
+from benchmarks.common import grainy_photo, write_result
 from sgsst_core.budget import device_peak, forget_device_peak, peak_memory
 from sgsst_core.devices import Timer
 from sgsst_core.features.network_weights import load_network_weights

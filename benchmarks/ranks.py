@@ -13,14 +13,13 @@ import math
 import multiprocessing
 import resource
 import statistics
+from collections.abc import Sequence
 from datetime import timedelta
 from typing import Any
 
 import torch
 
-from benchmarks.inputs import input_parser, read_inputs, with_size
-from benchmarks.iteration_work import loads
-from benchmarks.machine import free_address, write_result
+from benchmarks.common import free_address, input_parser, read_inputs, with_size, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import peak_memory
 from sgsst_core.features.partition import Rectangle, computed_twice
@@ -113,7 +112,7 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "seconds": median(steps["together"], "total"),
         "ratio": median(steps["alone"], "total") / median(steps["together"], "total"),
         "ratio_of_fastest": fastest(steps["alone"]) / fastest(steps["together"]),
-        "bound_by_halos": max(loads(one, halo)) / max(loads(shared, halo)),
+        "bound_by_halos": most_pixels(one, halo) / most_pixels(shared, halo),
         "waiting_share_by_rank": [statistics.median(share) for share in waiting],
         "system_seconds_by_rank": [statistics.median(seconds) for seconds in kernel],
         "peak_gb_by_rank": peak,
@@ -127,6 +126,11 @@ def compare(collectives: Collectives, build: Any, rounds: int) -> dict[str, Any]
         "pixels_twice_one_rank": sum(computed_twice(each, loss.tiling.cached(each)) for each in areas),
         "working": loss.tiling.working,
     }
+
+
+def most_pixels(division: Sequence[Sequence[Piece]], halo: int) -> int:
+    """Return the largest number of pixels that a rank passes through the network."""
+    return max(sum(piece.cost(halo) for piece in own) for own in division)
 
 
 def processor_seconds(before: resource.struct_rusage) -> dict[str, float]:

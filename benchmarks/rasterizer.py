@@ -19,8 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.inputs import with_size
-from benchmarks.machine import write_result
+from benchmarks.common import with_size, write_result
 from sgsst_core.bench.synthetic import surface_scene
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene

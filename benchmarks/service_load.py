@@ -33,7 +33,7 @@ import httpx2
 import psutil
 import uvloop
 
-from benchmarks.machine import write_result
+from benchmarks.common import write_result
 from tests.api.service import Service
 from tests.postgres import fresh_database, server
 from tests.small_scenes import wall, write_files

@@ -17,8 +17,7 @@ from typing import Any
 
 from torch import Tensor
 
-from benchmarks.inputs import input_parser, read_views
-from benchmarks.machine import RESULTS, write_result
+from benchmarks.common import RESULTS, input_parser, read_views, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene

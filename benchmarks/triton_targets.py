@@ -26,7 +26,7 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from benchmarks.machine import write_result
+from benchmarks.common import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, TRANSMITTANCE_MIN
 from sgsst_core.features import first_layer_kernels, statistics_kernels
 from sgsst_core.features import pooling_triton_kernels as pooling_kernels

@@ -1,6 +1,5 @@
 """Benchmark of a GPU in one command: `python -m benchmarks.gpu`.
 
-Each module except `inputs`, `part` and `clock` is one part of the benchmark, with a function `run(sizes, findings)`.
-Each part runs in a separate process, so that one that fails, hangs or breaks the device does not affect other parts,
-and each has its own memory peak.
+Each part is a function of sizes and findings in `correctness`, `job` or `speed`. It runs in a process of its own, so
+that one that fails, hangs or breaks the device does not affect the others, and each has its own memory peak.
 """

@@ -2,11 +2,9 @@
 
     python -m benchmarks.gpu [--quick] [--only PART ...] [--gaussians 1000000,3000000,6000000] [--out FILE.json]
 
-The benchmark needs PyTorch, Triton, NumPy, SciPy, Numba, psutil and safetensors. Parts that need another package
-(pydantic for a job's settings, plyfile for a real scene) are skipped if it is missing, and the reason is reported. All
-parts together take less than sixteen minutes. Without a GPU, small sizes run in Triton's interpreter, which tests the
-benchmark but says nothing about speed. Results are written to benchmarks/results/gpu_DEVICE.json. The exit status is 1
-if a part has failed.
+All parts together take less than twelve minutes. Without a GPU, small sizes run in Triton's interpreter, which tests
+the benchmark but says nothing about speed. Results are written to benchmarks/results/gpu_DEVICE.json. The exit status
+is 1 if a part has failed.
 """
 
 from __future__ import annotations
@@ -29,30 +27,23 @@ from typing import Any
 
 import torch
 
+from benchmarks.common import RESULTS, write_result
 from benchmarks.gpu.part import QUICK, Findings, Sizes
-from benchmarks.machine import RESULTS, write_result
 from tests import triton_interpreter
 
-#: Time limit of each part in seconds, 895 in total, the most telling parts first. The first parts load the libraries
-#: from disk and compile the kernels and the CPU rasterizer.
-BUDGETS = {
-    "identity": 15,
-    "job": 360,
-    "poison": 50,
-    "parity": 45,
-    "kernels": 60,
-    "convolutions": 15,
-    "step": 90,
-    "network": 20,
-    "raster": 25,
-    "ranks": 45,
-    "curve": 90,
-    "tests": 80,
+#: Module and time limit in seconds of each part, the most telling parts first. The first parts load the libraries from
+#: disk and compile the kernels and the CPU rasterizer.
+PARTS = {
+    "job": ("job", 360),
+    "poison": ("correctness", 50),
+    "parity": ("correctness", 45),
+    "step": ("speed", 90),
+    "raster": ("speed", 25),
+    "ranks": ("correctness", 45),
+    "curve": ("correctness", 90),
 }
 #: Factor on the time limits without a GPU, where the CPU may be busy and times mean nothing.
 _PATIENCE = 10
-#: Packages of this repository. A missing one is an error, not a reason to skip a part.
-_OWN = ("api", "benchmarks", "service", "sgsst_core", "tests", "worker")
 
 
 def main() -> int:
@@ -66,9 +57,9 @@ def main() -> int:
         return run_part(arguments.only[0], arguments)
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
     parts = {}
-    for part in arguments.only or BUDGETS:
+    for part in arguments.only or PARTS:
         print(f"\n{part}", flush=True)
-        parts[part] = in_a_process(part, BUDGETS[part] * (_PATIENCE if arguments.quick else 1))
+        parts[part] = in_a_process(part, PARTS[part][1] * (_PATIENCE if arguments.quick else 1))
         print(f"{part}: {parts[part]['status']}, {parts[part]['seconds']} s", flush=True)
         if "reason" in parts[part]:
             print(f"  {parts[part]['reason']}", flush=True)
@@ -82,7 +73,7 @@ def parse() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small sizes; always so without a GPU")
-    parser.add_argument("--only", nargs="+", choices=tuple(BUDGETS), metavar="PART", help=", ".join(BUDGETS))
+    parser.add_argument("--only", nargs="+", choices=tuple(PARTS), metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--gaussians", help="numbers of Gaussians, with commas between them")
     parser.add_argument("--out", type=Path, help="JSON file of the results")
     parser.add_argument("--findings", type=Path, help=argparse.SUPPRESS)
@@ -132,11 +123,7 @@ def run_part(part: str, arguments: argparse.Namespace) -> int:
     """Run one part in this process, and add its status as the last finding."""
     findings = Findings(arguments.findings)
     try:
-        importlib.import_module(f"benchmarks.gpu.{part}").run(sizes_of(arguments), findings)
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] in _OWN:
-            raise
-        findings.end({"status": "skipped", "reason": f"{error.name} is not installed"})
+        getattr(importlib.import_module(f"benchmarks.gpu.{PARTS[part][0]}"), part)(sizes_of(arguments), findings)
     except Exception:
         findings.end({"status": "failed", "reason": traceback.format_exc()})
     else:

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 from benchmarks.gpu.part import QUICK, Findings, Sizes
-from benchmarks.gpu.step import ZOOM
+from benchmarks.gpu.speed import ZOOM
 from sgsst_core.bench.synthetic import random_weights, surface_scene, texture, views
 from sgsst_core.features.weight_files import digest_of_bytes, weights_file
 from sgsst_core.files.library import save
@@ -29,7 +29,7 @@ _PATIENCE = 150
 PROGRAM: tuple[str, ...] = (sys.executable, "-m", "api.cli")
 
 
-def run(sizes: Sizes, findings: Findings) -> None:
+def job(sizes: Sizes, findings: Findings) -> None:
     """Run all jobs as by default."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

@@ -15,7 +15,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.machine import RESULTS, write_result
+from benchmarks.common import RESULTS, write_result
 from benchmarks.stability import Case, Measurement, all_cases, measure
 
 #: Width in characters of the table, which a narrower terminal would truncate.

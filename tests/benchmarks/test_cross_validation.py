@@ -21,7 +21,7 @@ from benchmarks.cross_validation import (
     stored,
     tables,
 )
-from benchmarks.judged import UNSTYLIZED
+from benchmarks.equal_steps import UNSTYLIZED
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from benchmarks.gpu import job
-from benchmarks.gpu.__main__ import BUDGETS
+from benchmarks.gpu.__main__ import PARTS
 from benchmarks.gpu.part import QUICK, Findings
 
 pytest.importorskip("triton")
@@ -21,9 +21,9 @@ ROOT = Path(__file__).resolve().parents[2]
 PASSES = {"forward_seconds", "backward_seconds"}
 
 
-def test_all_parts_together_take_less_than_sixteen_minutes() -> None:
-    assert sum(BUDGETS.values()) < 960
-    assert list(BUDGETS)[:4] == ["identity", "job", "poison", "parity"]
+def test_all_parts_together_take_less_than_twelve_minutes() -> None:
+    assert sum(seconds for _, seconds in PARTS.values()) < 720
+    assert list(PARTS)[:3] == ["job", "poison", "parity"]
 
 
 def test_findings_are_printed_at_once(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -48,20 +48,16 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     status, written = benchmark(tmp_path)
     parts = written["parts"]
     assert {name: part.get("reason", part["status"]) for name, part in parts.items()} == dict.fromkeys(
-        BUDGETS, "succeeded"
+        PARTS, "succeeded"
     )
     assert status == 0
     assert written["quick"]
     assert {"date", "machine", "device", "torch"} <= set(written)
     findings = {name: part["findings"] for name, part in parts.items()}
-    assert {"torch", "triton", "copy", "matrix_product"} <= set(findings["identity"])
     assert all(check["passed"] for check in findings["poison"]["small"].values())
     assert len(findings["poison"]["small"]) == 7
     assert all(findings["parity"]["triton"][name]["passed"] for name in ("image", "coverage", "gradient"))
     assert findings["parity"]["triton"]["different_of_2_repeats"]["error"] == 0
-    for place, name in (("step", "render"), ("step", "slot_gradients"), ("cached_weights", "apply_pieces")):
-        assert min(findings["kernels"][place][name].values()) > 0
-        assert findings["kernels"]["first_launch_seconds"][name] > 0
     whole = findings["job"]["3x32x32"]
     assert whole["steps"] == 2
     assert {"start", "reading", "survey", "planning", "vgg_forward", "writing"} <= set(whole["seconds_by_part"])
@@ -69,16 +65,11 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     assert whole["seconds_total"] < whole["seconds"] + 0.02, "the process ends after its last report"
     assert whole["plan"]["prediction"]["seconds"] > 0
     assert whole["plan"]["precision"] == "features in float32"
-    rates = findings["convolutions"]["conv1_1"]["bfloat16"]["forward"]
-    assert set(rates) == {"channels_last", "planes"}
-    assert min(rates.values()) > 0
     for count in ("60", "120"):
         entry = findings["raster"][count]
         assert PASSES | {"survey_seconds_a_view", "lists_seconds", "lists_bytes", "pairs"} <= set(entry)
         assert PASSES | {"first_render_seconds", "bytes"} <= set(entry["cached_weights"])
         assert entry["spherical_harmonics"]["seconds"] > 0
-    for precision in ("float32", "bfloat16"):
-        assert findings["network"][precision]["both"]["tflops"] > 0
     entry = findings["step"]["32x32"]["float32"]
     assert entry["seconds_in_loop"] > 0
     assert entry["rasterizer"] == "triton"
@@ -88,7 +79,6 @@ def test_every_part_succeeds(tmp_path: Path) -> None:
     assert len(findings["curve"]["losses"]) == len(findings["curve"]["losses_on_the_cpu"]) == 2
     assert findings["curve"]["loss"]["passed"]
     assert findings["ranks"]["colors"]["passed"]
-    assert findings["tests"]["failed"] == {}
 
 
 def test_job_runs_on_a_simulated_gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -101,7 +91,7 @@ def test_job_runs_on_a_simulated_gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     monkeypatch.setattr("benchmarks.gpu.job._PATIENCE", 900)
     findings = Findings(tmp_path / "findings.json")
-    job.run(QUICK, findings)
+    job.job(QUICK, findings)
     assert not findings.broken, findings.broken
     entry = findings.entries["3x32x32"]
     assert entry["plan"]["prediction"]["device_bytes"] is not None
@@ -109,9 +99,9 @@ def test_job_runs_on_a_simulated_gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 def test_failed_part_reports_reason_and_others_continue(tmp_path: Path) -> None:
-    status, written = benchmark(tmp_path, "--only", "raster", "network", "--gaussians", "0")
+    status, written = benchmark(tmp_path, "--only", "raster", "parity", "--gaussians", "0")
     assert status == 1
     assert written["parts"]["raster"]["status"] == "failed"
     assert "ZeroDivisionError" in written["parts"]["raster"]["reason"]
     assert written["parts"]["raster"]["findings"]["view"] == [32, 16]
-    assert written["parts"]["network"]["status"] == "succeeded"
+    assert written["parts"]["parity"]["status"] == "succeeded"

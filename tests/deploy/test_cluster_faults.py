@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import cluster_faults, cluster_hosts
+from benchmarks import cluster_faults
 from sgsst_core.features.network_weights import BackboneWeights
 from tests.deploy.test_three_hosts import missing
 
@@ -27,7 +27,7 @@ def folder() -> Iterator[Path]:
 
 
 def networks() -> set[str]:
-    """Return the network devices and namespaces that `benchmarks.cluster_hosts` has created on this machine."""
+    """Return the network devices and namespaces that `benchmarks.cluster_faults` has created on this machine."""
     commands = (["ip", "-o", "link"], ["ip", "netns", "list"])
     said = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for command in commands)
     return {name for text in said for name in re.findall(r"sgsst\d[\w-]*", text)}
@@ -36,7 +36,7 @@ def networks() -> set[str]:
 def test_host_faults_lose_no_job(folder: Path, vgg16_weights: BackboneWeights) -> None:
     for module in ("moto.server", "psycopg", "s3fs"):
         pytest.importorskip(module, reason=f"{module} is not installed: see the extra [dev]")
-    if reason := cluster_hosts.missing() or missing():
+    if reason := cluster_faults.missing() or missing():
         pytest.skip(reason)
     before = networks()
     kinds = ("kill-node", "cut-dispatcher", "restart-database")

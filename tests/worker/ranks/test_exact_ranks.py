@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 import torch
+from benchmarks.iteration_work import moved
 from torch import Tensor
 
-from benchmarks.iteration_work import moved
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss

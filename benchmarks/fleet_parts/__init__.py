@@ -1,1 +1,0 @@
-"""Simulation of a fleet: its jobs, its hosts under a simulated clock, and its figures."""
