@@ -1,7 +1,5 @@
 """Static files of `api/static`: the page at `/`, that of shared results, and the API's documentation at `/docs`.
 
-The scene of `sgsst demo` is offered as if it were one of them; a child process builds it at the first request.
-
 The files are read and compressed once, and served from memory. Their URLs, `/static/DIGEST/NAME`, contain a digest of
 all files, so that browsers can cache them forever. JavaScript modules import each other by relative paths, so a page
 always loads modules of the same version. All URLs in pages and modules are relative, so that a proxy can offer the
@@ -10,14 +8,10 @@ service below any path.
 
 from __future__ import annotations
 
-import asyncio
 import gzip
 import hashlib
 import mimetypes
 import re
-import subprocess
-import sys
-import tempfile
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -28,7 +22,6 @@ from api.http.addresses import path_of
 from api.http.sending import names_etag
 from api.static_files import FOLDER, read_static
 from service import problems
-from service.deadlines import suspended
 from service.settings import ServiceSettings
 
 #: Placeholder in pages for the URL prefix of the files.
@@ -52,8 +45,6 @@ DOCS_POLICY = POLICY.replace("img-src 'self' blob:", "img-src 'self' data:")
 _PAGES = {"/": ("index.html", POLICY), "/shared": ("shared.html", POLICY), "/docs": ("docs.html", DOCS_POLICY)}
 #: Headers of pages: neither other sites nor scripts of other types get anything from them.
 PAGE_HEADERS = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
-#: Start of the names of the example's files.
-EXAMPLE = "example/"
 #: Acceptance of gzip in an Accept-Encoding header; `q=0` refuses it.
 _GZIP = re.compile(r"\bgzip\b(?!\s*;\s*q=0(\.0*)?\s*(,|$))")
 _IMMUTABLE = "public, max-age=31536000, immutable"
@@ -111,32 +102,9 @@ def _file(name: str, body: bytes) -> StaticFile:
     return StaticFile(body, compressed, hashlib.sha256(body).hexdigest(), kind)
 
 
-class ExampleScene:
-    """Files of the demo's scene by name, built at the first request and then served from memory."""
-
-    def __init__(self) -> None:
-        self._lock = asyncio.Lock()
-        self._files: dict[str, StaticFile] = {}
-
-    async def file(self, name: str) -> StaticFile | None:
-        """Return a file; None if there is no such file."""
-        with suspended():
-            async with self._lock:
-                if not self._files:
-                    self._files = await asyncio.to_thread(_built_example)
-        return self._files.get(name)
-
-
-def _built_example() -> dict[str, StaticFile]:
-    """Build the demo's scene in a child process, because the API process never imports PyTorch."""
-    with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-P", "-m", "api.cli.demo_scene", folder], check=True)
-        return {path.name: _file(path.name, path.read_bytes()) for path in Path(folder).iterdir()}
-
-
 def add_static(app: FastAPI) -> None:
     """Add routes for all static files. They require no key, because they are the same for everybody."""
-    static, example = static_files(), ExampleScene()
+    static = static_files()
 
     async def get_page(request: Request) -> Response:
         name, policy = _PAGES[path_of(request.scope)]
@@ -146,8 +114,6 @@ def add_static(app: FastAPI) -> None:
 
     async def get_file(request: Request, digest: str, name: str) -> Response:
         file = static.files.get(name) if digest == static.digest else None
-        if digest == static.digest and name.startswith(EXAMPLE):
-            file = await example.file(name.removeprefix(EXAMPLE))
         if file is None:
             raise problems.NOT_FOUND("There is no such file in this version of the page. Load the page again.")
         return _answer(request, file, _IMMUTABLE, POLICY)

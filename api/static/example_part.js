@@ -16,7 +16,7 @@ export class ExamplePart {
     this.offers = this.buttons.map((button) => h("div.example", button, h("small", say.credit)));
   }
 
-  /** Return the files of the example by role. The service builds its scene at the first request. */
+  /** Return the files of the example by role. */
   async files() {
     for (const button of this.buttons) button.textContent = say.preparing;
     try {

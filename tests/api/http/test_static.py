@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import gzip
 import hashlib
 import json
@@ -12,9 +11,8 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from api.http.static import DOCS_POLICY, POLICY, ExampleScene, StaticFiles, static_files
+from api.http.static import DOCS_POLICY, POLICY, StaticFiles, static_files
 from api.static_files import FOLDER, exported_viewer
-from service.deadlines import Deadline
 from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import DOWNLOADS, FORMATS
 from sgsst_core.files.scene_file import read_scene
@@ -66,9 +64,9 @@ def test_exported_scripts_need_no_modules(script: str) -> None:
     assert not re.search(r"^(import|export) |import\.meta", code, re.MULTILINE)
 
 
-def test_example_is_built_at_the_first_request(client: httpx2.Client, files: StaticFiles, tmp_path: Path) -> None:
+def test_example_is_a_scene_with_cameras(client: httpx2.Client, files: StaticFiles, tmp_path: Path) -> None:
     scene = tmp_path / "motorcycle.sog"
-    answer = client.get(f"/static/{files.digest}/example/{scene.name}", timeout=120)
+    answer = client.get(f"/static/{files.digest}/example/{scene.name}")
     assert (answer.status_code, answer.headers["content-security-policy"]) == (200, POLICY)
     scene.write_bytes(answer.content)
     assert len(read_scene(scene).scene) > 200_000
@@ -76,24 +74,6 @@ def test_example_is_built_at_the_first_request(client: httpx2.Client, files: Sta
     assert client.get(f"/static/{files.digest}/example/..%2F..%2Fapp.py").status_code == 404
     assert client.get(f"/static/{files.digest}/example/none").status_code == 404
     assert client.get("/static/0/example/cameras.json").status_code == 404
-
-
-@pytest.mark.slow
-def test_no_request_for_the_example_is_given_up_while_it_is_built() -> None:
-    given_up: list[str] = []
-
-    async def serve(example: ExampleScene, name: str) -> bool:
-        deadline = Deadline(0.5, lambda: given_up.append(name))
-        file = await example.file(name)
-        deadline.close()
-        return file is not None
-
-    async def serve_both() -> list[bool]:
-        example = ExampleScene()
-        return await asyncio.gather(*(serve(example, name) for name in ("motorcycle.sog", "cameras.json")))
-
-    assert asyncio.run(serve_both()) == [True, True]
-    assert not given_up
 
 
 def test_files_are_cached_by_digest(client: httpx2.Client, files: StaticFiles) -> None:
