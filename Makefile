@@ -26,7 +26,7 @@ demo: $(VENV)/installed
 # Run all checks of `lint`, and the tests that are not marked as slow.
 test: lint
 	$(BIN)/sgsst weights fetch vgg16
-	$(BIN)/python -m sgsst_core.bench.compile_kernels
+	$(BIN)/python -m sgsst_core.bench.device_checks
 	$(PYTEST) -m "not slow"
 
 # Run the slow tests: kills, chains of requests, whole runs, the wheel.
@@ -92,7 +92,7 @@ $(VENV)/created:
 $(VENV)/installed: $(VENV)/created pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time"
 	$(PIP_INSTALL) --editable ".[service,video,heif]"
-	$(BIN)/python -m sgsst_core.bench.compile_kernels
+	$(BIN)/python -m sgsst_core.bench.device_checks
 	@touch $@
 
 $(VENV)/installed-dev: $(VENV)/created pyproject.toml constraints.txt

@@ -39,8 +39,7 @@ from api.cli.demo_scene import build_demo
 from benchmarks.common import RESULTS, add_pair, describe_machine, read_views
 from benchmarks.equal_steps import UNSTYLIZED, judged
 from sgsst_core import Stylizer, load_cameras, load_image, load_scene, make_settings
-from sgsst_core.quality.judge import Judge
-from sgsst_core.quality.lpips import Lpips
+from sgsst_core.quality.judge import Judge, Lpips
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, between, resized, spread
 from sgsst_core.scene.gaussians import Scene

@@ -37,19 +37,17 @@ from torch import Tensor
 
 from benchmarks.common import add_pair, input_parser, read_inputs, read_views
 from sgsst_core import Stylizer, make_settings
-from sgsst_core.bench.quality import judged_row
+from sgsst_core.bench.variants import judged_row
 from sgsst_core.constants import NEAR
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.loss.feature_scale import with_scales
-from sgsst_core.quality.float32_reference import Float32Reference
-from sgsst_core.quality.judge import Judge
-from sgsst_core.quality.lpips import Lpips
-from sgsst_core.quality.measure import make_judge, make_novel_views
+from sgsst_core.quality.judge import Judge, Lpips
+from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.regions.maps import RegionMaps
-from sgsst_core.report.contact_sheet import write_grid
+from sgsst_core.report.images import write_grid
 from sgsst_core.scales import EVEN
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene

@@ -16,13 +16,23 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from benchmarks.common import RESULTS
-from sgsst_core.bench.error_time import MOMENTS, SLICES
+from sgsst_core.bench.variants import MOMENTS, SLICES
 from sgsst_core.files.atomic import write_json
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit
-from sgsst_core.report.charts import draw_legend, draw_points, png_chart, set_log_x, set_log_y
-from sgsst_core.report.history import X_MARGIN, Floats, column, joined, log_limits
-from sgsst_core.report.palette import color_of
+from sgsst_core.report.charts import (
+    X_MARGIN,
+    Floats,
+    column,
+    draw_legend,
+    draw_points,
+    joined,
+    log_limits,
+    png_chart,
+    set_log_x,
+    set_log_y,
+)
+from sgsst_core.report.images import color_of
 from sgsst_core.scene.camera import Camera
 
 STORE = RESULTS / "error_time.json"

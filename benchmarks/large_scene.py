@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.common import write_result
 from benchmarks.rasterizer import DATA, timed
-from sgsst_core.bench.synthetic import surface_scene, texture
+from sgsst_core.bench.device_checks import surface_scene, texture
 from sgsst_core.budget import peak_memory
 from sgsst_core.devices import Timer
 from sgsst_core.features.network_weights import load_network_weights

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.common import with_size, write_result
-from sgsst_core.bench.synthetic import surface_scene
+from sgsst_core.bench.device_checks import surface_scene
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit.cameras import orbit

@@ -37,9 +37,9 @@ from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_
 from sgsst_core.orbit.cameras import ELEVATION, turntable
 from sgsst_core.orbit.choice import find_upright_subject
 from sgsst_core.progress import Decision, warnings_of
-from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
+from sgsst_core.quality.measure import CompressionLoss, measure_compression
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.video import Layer, write_frames
+from sgsst_core.report.images import Layer, write_frames
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene

@@ -19,10 +19,9 @@ from sgsst_core.files.stylized_ply import write_colors, write_stylized
 from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.progress import Progress
 from sgsst_core.quality.findings import findings_of
-from sgsst_core.quality.measure import Measurements
-from sgsst_core.quality.scene_difference import CompressionLoss, measure_compression
-from sgsst_core.report.contact_sheet import write_contact_sheet, write_views
+from sgsst_core.quality.measure import CompressionLoss, Measurements, measure_compression
 from sgsst_core.report.document import build_report, loss_over_time, plan_json, seconds_json, sent_json
+from sgsst_core.report.images import write_contact_sheet, write_views
 from sgsst_core.stylizing.checkpoint import Checkpoint, versions
 from sgsst_core.stylizing.loop import Callbacks, Stopped, run
 from sgsst_core.stylizing.planner import estimate

@@ -250,7 +250,7 @@ def _inputs(request: JobSpec) -> str:
 
 def _write_sheet(path: Path, jobs: dict[str, JobSpec], styles: int) -> None:
     """Write the contact sheet: a row for each scene with a result, a column for scenes and one for each style."""
-    from sgsst_core.report.contact_sheet import write_grid
+    from sgsst_core.report.images import write_grid
 
     requests = list(jobs.items())
     header = [None, *(_style(request) for _, request in requests[:styles])]
@@ -271,7 +271,7 @@ def _style(request: JobSpec) -> tuple[str, Tensor] | None:
 def _renders(requests: Sequence[tuple[str, JobSpec]]) -> list[tuple[str, Tensor] | None]:
     """Return a render of a scene and of each of its results, with their names; None for those that are missing."""
     from sgsst_core.files.scene_file import read_scene
-    from sgsst_core.report.contact_sheet import small_renders
+    from sgsst_core.report.images import small_renders
     from worker.capture import read_capture
 
     source = requests[0][1].source.model_copy(update={"resolution": None})

@@ -11,9 +11,18 @@ import torch
 from rich.table import Column, Table
 from torch import Tensor
 
-from sgsst_core.bench.error_time import Curve, Variant, as_dict, choose_variants, error_time, write_plot
-from sgsst_core.bench.quality import Quality, compare_quality, write_sheet
-from sgsst_core.bench.quality import write_plot as write_quality_plot
+from sgsst_core.bench.variants import (
+    Curve,
+    Quality,
+    Variant,
+    as_dict,
+    choose_variants,
+    compare_quality,
+    error_time,
+    write_plot,
+    write_quality_plot,
+    write_sheet,
+)
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.files.atomic import ensure_writable_folder, write_json
 from sgsst_core.files.images import load_image

@@ -17,7 +17,7 @@ from worker.options import StylizeOptions, ViewOptions
 
 if TYPE_CHECKING:
     from api.cli.bench import VariantsRequest
-    from sgsst_core.bench.error_time import Curve
+    from sgsst_core.bench.variants import Curve
 
 #: Options of a job that apply to all variants.
 _OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")

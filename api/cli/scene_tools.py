@@ -21,8 +21,8 @@ from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.progress import Decision, warnings_of
 from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.contact_sheet import write_views
 from sgsst_core.report.document import plan_json
+from sgsst_core.report.images import write_views
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from worker.derived import blend

@@ -14,6 +14,7 @@ import sys
 import tempfile
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -22,8 +23,16 @@ from torch import Tensor
 
 from benchmarks.common import free_address
 from benchmarks.gpu.part import QUICK, Findings, Sizes, device, network_weights
-from sgsst_core.bench.device_checks import BACKGROUND, CheckSizes, Step, check_device, leave_nan, rasterizer_checks
-from sgsst_core.bench.synthetic import surface_scene, texture, views
+from sgsst_core.bench.device_checks import (
+    BACKGROUND,
+    check_device,
+    different_repeats,
+    make_step,
+    rasterizer_checks,
+    surface_scene,
+    texture,
+    views,
+)
 from sgsst_core.features.vgg import FeatureNetwork, has_bfloat16
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene
@@ -36,6 +45,10 @@ from sgsst_core.stylizing.stylizer import Stylizer
 from tests import triton_interpreter
 from worker.ranks.process_group import ProcessGroupCollectives
 
+#: Number of freed blocks of memory that hold NaN, by size in bytes.
+_FREED = {1 << 12: 64, 1 << 16: 64, 1 << 20: 32, 1 << 24: 8, 1 << 27: 4}
+#: Size in bytes up to which the allocator of a CPU reuses freed blocks; larger ones go back to the system.
+_REUSED_BY_CPU = 1 << 20
 RANKS = 2
 #: Bound on the relative error of the first step's gradient, in the Euclidean norm. It allows for near-ties in max
 #: pooling, which may be resolved differently.
@@ -62,14 +75,15 @@ def parity(sizes: Sizes, findings: Findings) -> None:
         rasterizer = make_rasterizer(name, scene, background=BACKGROUND, device=device())
         for check in rasterizer_checks(rasterizer, scene, camera):
             findings.check(f"{name}/{check.name}", check.error, check.bound)
-        step = Step.of(rasterizer, scene, camera, network_weights(sizes))
-        findings.check(f"{name}/different_of_{sizes.bits}_repeats", step.different_repeats(sizes.bits), 0.0)
+        step = make_step(rasterizer, scene, camera, network_weights(sizes))
+        findings.check(f"{name}/different_of_{sizes.bits}_repeats", different_repeats(step, sizes.bits), 0.0)
 
 
 def poison(sizes: Sizes, findings: Findings) -> None:
     """Run the checks of `sgsst doctor`, then steps and convolutions at the size of views."""
     quick = sizes == QUICK
-    for check in check_device("triton", device(), CheckSizes(100, 32, 24, 2, 16) if quick else CheckSizes()):
+    small: dict[str, Any] = {"gaussians": 100, "size": (32, 24), "repeats": 2, "channels": 16} if quick else {}
+    for check in check_device("triton", device(), **small):
         findings.check(f"small/{check.name.replace(' ', '_')}", check.error, check.bound)
     weights = network_weights(sizes)
     gaussians, (width, height) = sizes.gaussians[0], sizes.view
@@ -77,14 +91,24 @@ def poison(sizes: Sizes, findings: Findings) -> None:
     rasterizer = make_rasterizer("triton", scene, background=BACKGROUND, device=device())
     for dtype in (torch.bfloat16, torch.float32) if has_bfloat16(device()) and not quick else (torch.float32,):
         name = str(dtype).removeprefix("torch.")
-        step = Step.of(rasterizer, scene, camera, weights, dtype)
-        findings.check(f"{width}x{height}/{name}/values_changed_by_nan", step.changed_by_nan(), 0.0)
+        step = make_step(rasterizer, scene, camera, weights, dtype)
+        expected = step()
+        leave_nan(device())
+        findings.check(f"{width}x{height}/{name}/values_changed_by_nan", float((step() != expected).sum()), 0.0)
         network = FeatureNetwork(weights, dtype=dtype, device=device())
         findings.add(f"fused_convolutions/{name}/small", network.fused_layers)
         image = texture(height, width).to(device())
         leave_nan(device())
         network.forward(image, cache=False)
         findings.add(f"fused_convolutions/{name}/{width}x{height}", network.fused_layers)
+
+
+def leave_nan(device: torch.device) -> None:
+    """Fill memory with NaN and free it, so that tensors that are created without values are likely to contain NaN."""
+    most = _REUSED_BY_CPU if device.type == "cpu" else max(_FREED)
+    sizes = [size for size, count in _FREED.items() if size <= most for _ in range(count)]
+    blocks = [torch.full((size // 4,), torch.nan, device=device) for size in sizes]
+    del blocks
 
 
 def ranks(sizes: Sizes, findings: Findings) -> None:

@@ -18,7 +18,7 @@ from PIL import Image
 
 from benchmarks.gpu.part import QUICK, Findings, Sizes
 from benchmarks.gpu.speed import ZOOM
-from sgsst_core.bench.synthetic import random_weights, surface_scene, texture, views
+from sgsst_core.bench.device_checks import random_weights, surface_scene, texture, views
 from sgsst_core.features.weight_files import digest_of_bytes, weights_file
 from sgsst_core.files.library import save
 from sgsst_core.scene.camera import Camera

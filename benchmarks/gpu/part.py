@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from sgsst_core.bench.synthetic import random_weights
+from sgsst_core.bench.device_checks import random_weights
 from sgsst_core.devices import wait_for
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights

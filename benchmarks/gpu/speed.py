@@ -20,7 +20,7 @@ from benchmarks.gpu.part import (
     seconds,
     waited_seconds,
 )
-from sgsst_core.bench.synthetic import surface_scene, texture, views
+from sgsst_core.bench.device_checks import surface_scene, texture, views
 from sgsst_core.budget import peak_memory
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer

@@ -1,1 +1,1 @@
-"""Benchmarks that users can run on their own scenes and machines."""
+"""Benchmarks that users run on their own scene (`variants`), and the examination of their machine (`doctor`)."""

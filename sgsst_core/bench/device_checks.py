@@ -1,38 +1,193 @@
-"""Checks of a device: errors against float64, bit-identical repetitions, and memory that holds NaN."""
+"""Findings of `sgsst doctor` about this machine, checks of its device, and the synthetic inputs of both.
+
+`python -m sgsst_core.bench.device_checks` compiles the kernels that jobs use, which are cached on disk. Otherwise the
+first job on a machine compiles them, and so does each of the service's confined processes, which cannot write there.
+"""
 
 from __future__ import annotations
 
+import importlib.metadata
 import math
-from collections.abc import Iterator
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.bench.synthetic import random_weights, surface_scene, texture, views
-from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
+from sgsst_core.bench.doctor import Diagnosis, State
+from sgsst_core.budget import default_memory_limit
+from sgsst_core.compiled import kernel_folders
+from sgsst_core.errors import OutputError
+from sgsst_core.features import winograd
+from sgsst_core.features.network_sources import BLOCKS
+from sgsst_core.features.network_weights import BackboneWeights, list_network_weights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, use_whole_float32
+from sgsst_core.features.weight_files import cache_folder, damage_of
+from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.terms import StyleTargets
-from sgsst_core.rasterizer import Rasterizer, make_rasterizer
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.facts import describe_machine, gpu_problems
+from sgsst_core.planning.plan import choose_precision
+from sgsst_core.rasterizer import RASTERIZERS, Rasterizer, make_rasterizer, rasterizer_for
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
+from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.loop import stylize
 
+#: Standard deviation of a Gaussian relative to the distance between neighbors. About thirty Gaussians contribute to
+#: each point, as in scans.
+_OVERLAP = 1.0
+_CHANNELS = (64, 128, 256, 512, 512)
+#: Seconds after which a query of `nvidia-smi` counts as failed.
+_TIMEOUT = 10
+#: Gigabytes of memory budget below which only small scenes fit.
+_LITTLE_MEMORY = 2.0
 #: Background of all renders.
 BACKGROUND = (1.0, 0.25, 0.5)
 #: Relative distance from an alpha or transmittance cutoff within which float32 rounding may change the decision, and
-#: error bounds for images and for gradients.
-_CLOSE, _IMAGE_BOUND, _GRADIENT_BOUND = 2e-5, 1e-5, 5e-6
-#: Relative error bounds of float32 features, and of statistics of the same features.
-_FEATURE_BOUND, _STATISTICS_BOUND = 1e-5, 1e-5
-#: Number of freed blocks of memory that hold NaN, by size in bytes.
-_FREED = {1 << 12: 64, 1 << 16: 64, 1 << 20: 32, 1 << 24: 8, 1 << 27: 4}
-#: Size in bytes up to which the allocator of a CPU reuses freed blocks; larger ones go back to the system.
-_REUSED_BY_CPU = 1 << 20
+#: relative error bounds for images and features, and for gradients.
+_CLOSE, _BOUND, _GRADIENT_BOUND = 2e-5, 1e-5, 5e-6
+
+
+def findings() -> Iterator[Diagnosis]:
+    """Yield findings about this machine, made in this process."""
+    yield _weights()
+    yield from _caches()
+    try:
+        triton = importlib.metadata.version("triton")
+    except importlib.metadata.PackageNotFoundError:
+        triton = "missing"
+    versions = f"Python {sys.version.split()[0]}, PyTorch {torch.__version__}, Triton {triton}"
+    yield Diagnosis("program", "works", versions)
+    yield _gpu()
+    gpu = torch.cuda.is_available()
+    device = torch.device("cuda", torch.cuda.current_device()) if gpu else torch.device("cpu")
+    yield _memory(device)
+    rasterizer, finding = _rasterizer(gpu=gpu)
+    yield finding
+    yield _precision()
+    yield from _results(rasterizer, device)
+    compile_kernels()  # those that no check has used, so that the first job does not wait for them
+    yield Diagnosis("kernels", "works", "compiled for all jobs")
+
+
+def _weights() -> Diagnosis:
+    installed = {entry.name: entry.path for entry in list_network_weights() if entry.path is not None}
+    for name, path in installed.items():
+        if damage := damage_of(path, name):
+            return Diagnosis("weights", "problem", damage)
+    networks = [name for name in installed if name in ("vgg19", "vgg16")]
+    if not networks:
+        text = (
+            "no network is installed. Run `sgsst weights fetch vgg19` (575 MB) or `sgsst weights fetch vgg16` (64 MB)."
+        )
+        return Diagnosis("weights", "problem", text)
+    return Diagnosis("weights", "works", f"{' and '.join(networks)} installed and undamaged")
+
+
+def _caches() -> Iterator[Diagnosis]:
+    """Yield a finding for each folder that cannot be written; if all can be, a single finding."""
+    triton = Path(os.environ.get("TRITON_CACHE_DIR") or Path(os.environ.get("TRITON_HOME") or Path.home()) / ".triton")
+    variables = {
+        cache_folder(): "SGSST_CACHE",
+        triton: "TRITON_CACHE_DIR",
+        **dict.fromkeys(kernel_folders(), "NUMBA_CACHE_DIR"),
+    }
+    found = False
+    for folder, variable in variables.items():
+        try:
+            ensure_writable_folder(folder)
+        except (OutputError, OSError):
+            found = True
+            text = f"{folder} cannot be written, so every process compiles or downloads again. Set {variable}."
+            yield Diagnosis("cache", "warning", text)
+    if not kernel_folders():
+        yield Diagnosis("cache", "warning", "no folder for compiled kernels can be written. Set NUMBA_CACHE_DIR.")
+    elif not found:
+        yield Diagnosis("cache", "works", f"{cache_folder()} and the folders of compiled kernels can be written")
+
+
+def _gpu() -> Diagnosis:
+    if torch.cuda.is_available():
+        device = torch.device("cuda", torch.cuda.current_device())
+        capability = ".".join(map(str, torch.cuda.get_device_capability(device)))
+        name, library = torch.cuda.get_device_name(device), torch.version.cuda or torch.version.hip
+        text = (
+            f"{torch.cuda.device_count()} x {name}, compute capability {capability}, CUDA {library}, driver {_driver()}"
+        )
+        return Diagnosis("GPU", "works", text)
+    devices = ("/dev/nvidia0", "/proc/driver/nvidia/version", "/dev/kfd")
+    if not any(Path(path).exists() for path in devices) and shutil.which("nvidia-smi") is None:
+        return Diagnosis("GPU", "works", "there is none; jobs run on the CPU")
+    if torch.version.cuda is None and torch.version.hip is None:
+        text = "there is one, but this PyTorch is built for CPUs only. Install a build for its CUDA or ROCm version."
+        return Diagnosis("GPU", "warning", text)
+    try:
+        torch.zeros(1, device="cuda")
+    except Exception as error:  # whatever the exception, it says why
+        return Diagnosis("GPU", "warning", f"PyTorch cannot use it: {str(error).splitlines()[0]} Update its driver.")
+    return Diagnosis("GPU", "warning", "PyTorch sees none. Check CUDA_VISIBLE_DEVICES and the driver.")
+
+
+def _driver() -> str:
+    """Return the version of the NVIDIA driver; "unknown" if `nvidia-smi` is missing, fails or takes too long."""
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT)
+    except (OSError, subprocess.TimeoutExpired):
+        return "unknown"
+    return done.stdout.split("\n")[0].strip() if done.returncode == 0 else "unknown"
+
+
+def _memory(device: torch.device) -> Diagnosis:
+    gigabytes = default_memory_limit(device) / 1e9
+    where = "of the GPU's" if device.type == "cuda" else "of"
+    text = f"jobs plan with {gigabytes:.1f} GB {where} memory"
+    if gigabytes >= _LITTLE_MEMORY:
+        return Diagnosis("memory", "works", text)
+    return Diagnosis("memory", "warning", f"{text}, enough for small views only. End other programs.")
+
+
+def _rasterizer(*, gpu: bool) -> tuple[str, Diagnosis]:
+    """Return the rasterizer of jobs on this machine, and the finding about it."""
+    problems = gpu_problems(ALONE) if gpu else {}
+    name = rasterizer_for("cuda" if gpu else "cpu", problems)
+    texts = [f"{RASTERIZERS[each].title} cannot be used: {problem}" for each, problem in problems.items()]
+    title = f"{RASTERIZERS[name].title} works here"
+    state: State = "works"
+    if not RASTERIZERS[name].on_gpu:
+        title, state = "views are rendered on the CPU", "warning" if gpu else "works"
+    return name, Diagnosis("rasterizer", state, "; ".join([title, *texts]))
+
+
+def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:
+    """Yield a finding for each wrong result; if all are right, a single finding."""
+    on_gpu = RASTERIZERS[rasterizer].on_gpu
+    where, sizes = (device, {}) if on_gpu else (torch.device("cpu"), {"repeats": 3, "channels": 16})
+    checks = list(check_device(rasterizer, where, **sizes))
+    wrong = [check for check in checks if not check.passed]
+    for check in wrong:
+        text = f"wrong {check.name}: {check.error:.3g} exceeds {check.bound:.3g}"
+        yield Diagnosis("results", "problem", f"{text}. Do not trust results of this machine.")
+    if not wrong:
+        text = f"{len(checks)} checks agree with float64 references, and repeat bit by bit"
+        yield Diagnosis("results", "works", text)
+
+
+def _precision() -> Diagnosis:
+    """Return the precision that jobs choose, and those that can be requested."""
+    machine, settings = describe_machine(make_settings(), ALONE), make_settings(precision="auto")
+    names = ", ".join(("float32", *machine.precisions))
+    return Diagnosis("precision", "works", f"jobs use {choose_precision(settings, machine)}; possible: {names}")
 
 
 @dataclass(frozen=True)
@@ -53,43 +208,35 @@ class Check:
         return math.isfinite(self.error) and self.error <= self.bound
 
 
-@dataclass(frozen=True)
-class CheckSizes:
-    """Sizes of the checks.
-
-    Attributes:
-        width, height: Size of their view in pixels.
-        repeats: Number of repetitions that must be bit-identical.
-        channels: Channels of the network's blocks; VGG's own if None.
-    """
-
-    gaussians: int = 2000
-    width: int = 96
-    height: int = 64
-    repeats: int = 10
-    channels: int | None = None
-
-    @property
-    def weights(self) -> BackboneWeights:
-        """Random weights of VGG16."""
-        return random_weights("vgg16") if self.channels is None else random_weights("vgg16", (self.channels,) * 5)
-
-
-def check_device(name: str, device: torch.device, sizes: CheckSizes) -> Iterator[Check]:
+def check_device(
+    name: str,
+    device: torch.device,
+    *,
+    gaussians: int = 2000,
+    size: tuple[int, int] = (96, 64),
+    repeats: int = 10,
+    channels: int | None = None,
+) -> Iterator[Check]:
     """Yield the result of each check, the most telling first.
 
     Args:
         name: Rasterizer that jobs on this device use.
+        size: Width and height of the view in pixels.
+        repeats: Number of repeated steps that must be bit-identical.
+        channels: Channels of the network's blocks; None for VGG16's own.
     """
     use_whole_float32()
-    scene, camera = surface_scene(sizes.gaussians, degree=1), views(1, sizes.width, sizes.height)[0]
+    scene, (camera,) = surface_scene(gaussians, degree=1), views(1, *size)
     rasterizer = make_rasterizer(name, scene, background=BACKGROUND, device=device)
     yield from rasterizer_checks(rasterizer, scene, camera)
-    weights = sizes.weights
-    yield from network_checks(weights, device, sizes)
-    step = Step.of(rasterizer, scene, camera, weights)
-    yield Check("values changed by NaN in free memory", step.changed_by_nan(), 0.0)
-    yield Check(f"different results of {sizes.repeats} repeated steps", step.different_repeats(sizes.repeats), 0.0)
+    weights = random_weights("vgg16") if channels is None else random_weights("vgg16", (channels,) * 5)
+    image = texture(camera.height, camera.width)
+    exact = FeatureNetwork(weights, STYLE_LAYERS, torch.float64).forward(image, cache=False).features
+    actual = FeatureNetwork(weights, STYLE_LAYERS, device=device).forward(image.to(device), cache=False).features
+    errors = [float(_off(actual[layer], exact[layer]).norm() / exact[layer].norm()) for layer in exact]
+    yield Check("features", max(errors), _BOUND)
+    step = make_step(rasterizer, scene, camera, weights)
+    yield Check(f"different results of {repeats} repeated steps", different_repeats(step, repeats), 0.0)
 
 
 def rasterizer_checks(fast: Rasterizer, scene: Scene, camera: Camera) -> Iterator[Check]:
@@ -100,88 +247,117 @@ def rasterizer_checks(fast: Rasterizer, scene: Scene, camera: Camera) -> Iterato
     band = reference.near_cutoff(camera, _CLOSE)
     pixels[band] = 0
     image = _off(fast.render(colors, camera), reference.render(colors, camera)).amax(-1)
-    yield Check("image", float(image[~band].max()) / max(1.0, float(colors.max())), _IMAGE_BOUND)
+    yield Check("image", float(image[~band].max()) / max(1.0, float(colors.max())), _BOUND)
     coverage = _off(fast.coverage(camera), reference.coverage(camera))
-    yield Check("coverage", float(coverage[~band].max()), _IMAGE_BOUND)
+    yield Check("coverage", float(coverage[~band].max()), _BOUND)
     expected = reference.color_gradient(pixels, camera)
     error = float(_off(fast.color_gradient(pixels, camera), expected).norm() / expected.norm())
     yield Check("gradient", error, _GRADIENT_BOUND)
 
 
-def network_checks(weights: BackboneWeights, device: torch.device, sizes: CheckSizes) -> Iterator[Check]:
-    """Compare float32 features and their statistics with float64, on synthetic weights."""
-    image = texture(sizes.height, sizes.width)
-    exact = FeatureNetwork(weights, STYLE_LAYERS, torch.float64).forward(image, cache=False).features
-    actual = FeatureNetwork(weights, STYLE_LAYERS, device=device).forward(image.to(device), cache=False).features
-    yield Check("features", max(_relative(actual[layer], exact[layer]) for layer in exact), _FEATURE_BOUND)
-    errors = []
-    for features in actual.values():
-        if features.numel():
-            reference = layer_statistics_reference(features.cpu().double())
-            errors.append(_relative(layer_statistics(features).centered, reference.centered))
-    yield Check("statistics", max(errors), _STATISTICS_BOUND)
+def make_step(
+    rasterizer: Rasterizer,
+    scene: Scene,
+    camera: Camera,
+    weights: BackboneWeights,
+    dtype: torch.dtype = torch.float32,
+) -> Callable[[], Tensor]:
+    """Return a function that renders a view and computes loss and color gradient, with a synthetic style.
 
+    The function returns their values as one float64 tensor on the CPU. The network computes in `dtype` on the
+    rasterizer's device.
+    """
+    loss = SosLoss(FeatureNetwork(weights, dtype=dtype, device=rasterizer.device), content_weight=0.0)
+    size = camera.height, camera.width
+    style = loss.targets.of_style(Style.of(texture(*size, seed=1)), size)
+    colors = scene_colors(scene, camera).to(rasterizer.device)
 
-def leave_nan(device: torch.device) -> None:
-    """Fill memory with NaN and free it, so that tensors that are created without values are likely to contain NaN."""
-    most = _REUSED_BY_CPU if device.type == "cpu" else max(_FREED)
-    sizes = [size for size, count in _FREED.items() if size <= most for _ in range(count)]
-    blocks = [torch.full((size // 4,), torch.nan, device=device) for size in sizes]
-    del blocks
-
-
-@dataclass(frozen=True)
-class Step:
-    """Render of a view, its loss, and the color gradient, whose results are compared bit by bit."""
-
-    rasterizer: Rasterizer
-    camera: Camera
-    loss: SosLoss
-    style: StyleTargets
-    colors: Tensor
-
-    @staticmethod
-    def of(
-        rasterizer: Rasterizer,
-        scene: Scene,
-        camera: Camera,
-        weights: BackboneWeights,
-        dtype: torch.dtype = torch.float32,
-    ) -> Step:
-        """Create a step whose network computes in `dtype` on the rasterizer's device, with a synthetic style."""
-        loss = SosLoss(FeatureNetwork(weights, dtype=dtype, device=rasterizer.device), content_weight=0.0)
-        size = camera.height, camera.width
-        style = loss.targets.of_style(Style.of(texture(*size, seed=1)), size)
-        return Step(rasterizer, camera, loss, style, scene_colors(scene, camera).to(rasterizer.device))
-
-    def run(self) -> Tensor:
-        """Return the values of the loss and the color gradient as one float64 tensor on the CPU."""
-        image = self.rasterizer.render(self.colors, self.camera)
-        result = self.loss.evaluate(image, self.style, self.loss.targets.of_view(image))
+    def step() -> Tensor:
+        image = rasterizer.render(colors, camera)
+        result = loss.evaluate(image, style, loss.targets.of_view(image))
         assert result.image_gradient is not None
-        gradient = self.rasterizer.color_gradient(result.image_gradient.to(image), self.camera)
+        gradient = rasterizer.color_gradient(result.image_gradient.to(image), camera)
         return torch.cat([result.values.flatten().cpu().double(), gradient.flatten().cpu().double()])
 
-    def changed_by_nan(self) -> float:
-        """Return the number of values that change if free memory holds NaN."""
-        expected = self.run()
-        leave_nan(self.rasterizer.device)
-        return _different(self.run(), expected)
+    return step
 
-    def different_repeats(self, repeats: int) -> float:
-        """Return how many repetitions have another result than the first run."""
-        expected = self.run()
-        return float(sum(_different(self.run(), expected) > 0 for _ in range(repeats)))
+
+def different_repeats(step: Callable[[], Tensor], repeats: int) -> float:
+    """Return how many repetitions have another result than the first run; NaN differs from everything."""
+    expected = step()
+    return float(sum(not torch.equal(step(), expected) for _ in range(repeats)))
 
 
 def _off(actual: Tensor, expected: Tensor) -> Tensor:
     return (actual.cpu().double() - expected).abs()
 
 
-def _relative(actual: Tensor, expected: Tensor) -> float:
-    return float((actual.cpu().double() - expected.cpu().double()).norm() / expected.cpu().double().norm())
+def surface_scene(count: int, degree: int = 0) -> Scene:
+    """Return Gaussians on a ball of radius 1, sized to cover it, with opacities like those of scans."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    size = math.log(_OVERLAP * math.sqrt(4 * math.pi / count))
+    return Scene(
+        means=F.normalize(normal(count, 3), dim=1) * (1 + 0.01 * normal(count, 1)),
+        quats=normal(count, 4),
+        scales=size + 0.5 * normal(count, 3),
+        opacities=-0.5 + 2 * normal(count),
+        sh_dc=normal(count, 3),
+        sh_rest=0.1 * normal(count, (degree + 1) ** 2 - 1, 3),
+    )
 
 
-def _different(actual: Tensor, expected: Tensor) -> float:
-    """Return the number of values that are not equal; NaN differs from everything."""
-    return float((actual != expected).sum())
+def views(count: int, width: int, height: int, zoom: float = 1.0) -> list[Camera]:
+    """Return cameras around the ball, which fills most of each view's height; with a zoom of 2.1, whole 3:2 views."""
+    up, center = torch.tensor([0.0, -1.0, 0.0]), torch.zeros(3)
+    angles = torch.arange(count) * (2 * math.pi / max(count, 1))
+    return [
+        look_at(
+            f"view_{index}", torch.stack([3 * angle.sin(), torch.zeros(()), -3 * angle.cos()]), center, up,
+            width=width, height=height, focal=1.3 * height * zoom,
+        )
+        for index, angle in enumerate(angles)
+    ]  # fmt: skip
+
+
+def texture(height: int, width: int, seed: int = 0) -> Tensor:
+    """Return an image [height, width, 3], float32 from 0 to 1, with structure at several scales."""
+    generator = torch.Generator().manual_seed(seed)
+    planes = torch.zeros((1, 3, height, width))
+    for cell, strength in ((64, 0.5), (16, 0.3), (4, 0.2)):
+        coarse = torch.rand((1, 3, height // cell + 2, width // cell + 2), generator=generator)
+        planes += strength * F.interpolate(coarse, size=(height, width), mode="bilinear", align_corners=False)
+    return planes[0].permute(1, 2, 0).contiguous()
+
+
+def random_weights(name: str = "vgg19", channels: tuple[int, ...] = _CHANNELS) -> BackboneWeights:
+    """Return random weights of VGG16 or VGG19, whose blocks have these numbers of channels.
+
+    He initialization preserves the magnitude of features from layer to layer.
+    """
+    generator = torch.Generator().manual_seed(16)
+    layers, before = {}, 3
+    for block, (count, after) in enumerate(zip(BLOCKS[name], channels, strict=True), start=1):
+        for index in range(1, count + 1):
+            weight = torch.randn(after, before, 3, 3, generator=generator) * (2 / (9 * before)) ** 0.5
+            layers[f"conv{block}_{index}"] = weight, torch.randn(after, generator=generator)
+            before = after
+    scale, shift = torch.full((3,), 255.0), torch.full((3,), -120.0)
+    return BackboneWeights(name, "random", "", layers, scale, shift)
+
+
+def compile_kernels() -> None:
+    """Stylize small scenes without and with spherical harmonics for two steps, and convolve as wide networks do."""
+    weights, style = random_weights("vgg16", (16,) * 5), texture(32, 32, seed=3)
+    for degree in (0, 1):
+        scene = surface_scene(200, degree=degree)
+        stylize(scene, views(2, 48, 32), style, weights=weights, preset="preview", steps_sos=2)
+    winograd.convolve(torch.zeros((1, 64, 8, 8)), torch.zeros((36, 64, 64)))
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    compile_kernels()

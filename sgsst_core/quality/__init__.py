@@ -1,1 +1,1 @@
-"""Quality of inputs and results: findings, novel views, multi-view consistency, and comparison with exact gradients."""
+"""Measurements of a finished result, and findings about inputs: nothing here changes a job."""

@@ -20,7 +20,7 @@ from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.features.vgg import ALIGNMENT
 from sgsst_core.files.scene_file import SceneFile
 from sgsst_core.planning.survey import Survey, sees_something
-from sgsst_core.quality.scene_difference import scene_psnr
+from sgsst_core.quality.measure import scene_psnr
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.projection import Column, Shapes, project
 from sgsst_core.scene.camera import Camera, spread

@@ -1,36 +1,35 @@
-"""Drawing of charts: common style, logarithmic axes with plain numbers, and the loss chart."""
+"""Charts of a report: its history as columns, with running means on logarithmic axes, as PNG and as inline SVG.
+
+In SVG, colors are CSS variables with the printed color as fallback (`var(--c-222222, #222222)`), so a page can replace
+them on dark screens. Text uses the page's font.
+"""
 
 from __future__ import annotations
 
+import io
 import math
 import re
-from collections.abc import Iterator, Sequence
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from numpy.typing import NDArray
 
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.report.history import (
-    Against,
-    Floats,
-    History,
-    column,
-    drawable,
-    history_of,
-    joined,
-    log_limits,
-    moment_positions,
-    novel_view_moments,
-    thinned,
-)
-from sgsst_core.report.palette import GRID, INK, color_of
+from sgsst_core.loss.terms import TERMS
+from sgsst_core.report.images import GRID, INK, color_of
 
 #: Style of all charts, for `matplotlib.rc_context`.
 STYLE: dict[Any, Any] = {
@@ -179,3 +178,395 @@ def draw_legend(figure: Figure, in_row: int = 3) -> None:
             named.setdefault(label, handle)
     if named:
         figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), in_row))
+
+
+Floats = NDArray[np.float64]
+Against = Literal["seconds", "steps"]
+AGAINST: tuple[Against, ...] = ("seconds", "steps")
+#: Number of bins of an x axis, each narrower than a typographic point. Steps in the same bin are drawn as one point.
+BINS = 300
+#: Range of values on logarithmic axes. matplotlib searches for ticks some decades beyond it, which must fit float64
+#: too.
+_MIN, _MAX = 1e-200, 1e200
+#: Factor by which the x axis extends beyond the first and the last step.
+X_MARGIN = 1.05
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """Steps grouped into bins of an axis, each array [bins] float64.
+
+    Attributes:
+        x: Geometric mean of the x positions of a bin's steps.
+        mean: Geometric mean of the running means at these steps.
+        low, high: Minimum and maximum of the values at these steps.
+    """
+
+    x: Floats
+    mean: Floats
+    low: Floats
+    high: Floats
+
+
+@dataclass(frozen=True)
+class History:
+    """History of a report by column. Each array is [steps] float64, with NaN for missing values.
+
+    Attributes:
+        x: Elapsed seconds, and number of steps.
+        limits: Limits of each x axis, which include the measurements of novel views.
+        phases: Name of each phase's stage, and slice of its steps.
+        terms: Loss terms by scale and name.
+        relative: Loss by scale, relative to the unstylized scene.
+        mean_relative: Mean over scales, relative to the unstylized scene; NaN for steps on a single scale.
+        memory: Memory of the process in bytes.
+        device_memory: Peak memory of the process's tensors on the GPU so far, in bytes.
+        round_length: Number of steps in which every view occurs once.
+    """
+
+    x: dict[Against, Floats]
+    limits: dict[Against, tuple[float, float]]
+    phases: list[tuple[str, slice]]
+    terms: dict[int, dict[str, Floats]]
+    relative: dict[int, Floats]
+    mean_relative: Floats
+    memory: Floats
+    device_memory: Floats
+    round_length: int
+
+    def bin_width(self, against: Against) -> float:
+        """Return the width of an axis's bins, as a difference of natural logarithms."""
+        low, high = self.limits[against]
+        return (math.log(high) - math.log(low)) / BINS
+
+
+def history_of(report: dict[str, Any]) -> History:
+    """Return the history of a report, which may be empty."""
+    records = report["history"]
+    scales = sorted({int(scale) for record in records for scale in record["scales"]})
+    before = report["loss"]["before"]["scales"]
+    x: dict[Against, Floats] = {"seconds": column([record["seconds"] for record in records])}
+    x["steps"] = column([record["step"] for record in records])
+    starts = {scale: column([(before.get(str(scale)) or {}).get("total")]) for scale in scales}
+    phases: list[tuple[str, slice]] = []
+    for stage, run in groupby(record["stage"] for record in records):
+        start = phases[-1][1].stop if phases else 0
+        phases.append((stage, slice(start, start + len(list(run)))))
+
+    def of_scale(scale: int, term: str) -> Floats:
+        return column([record["scales"].get(str(scale), {}).get(term) for record in records])
+
+    several = [len(record["scales"]) > 1 for record in records]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        relative = {scale: of_scale(scale, "total") / starts[scale] for scale in scales}
+    moments = novel_view_moments(report)
+    split = [terms for record in records for terms in record["scales"].values()]
+    terms = [term for term in TERMS if any(own.get(term) for own in split)] or list(TERMS)  # those that are not 0
+    return History(
+        x=x,
+        limits={
+            against: log_limits(np.append(x[against], moment_positions(moments, against)), X_MARGIN)
+            for against in AGAINST
+        },
+        phases=phases,
+        terms={scale: {term: of_scale(scale, term) for term in terms} for scale in scales},
+        relative=relative,
+        mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
+        memory=column([record.get("memory_bytes") for record in records]),
+        device_memory=column([record.get("device_memory_bytes") for record in records]),
+        round_length=round_length(report),
+    )
+
+
+def round_length(report: dict[str, Any]) -> int:
+    """Return the number of steps in which every view is visited once."""
+    views: int = report["cameras"]["count"] - len(report["cameras"]["seeing_nothing"])
+    views_per_step: int = report["settings"].get("views_per_step", 1)
+    return max(1, math.ceil(views / views_per_step))
+
+
+def column(values: Sequence[float | None]) -> Floats:
+    """Return values as an array [n], with NaN for None."""
+    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def joined(columns: Sequence[Floats]) -> Floats:
+    """Concatenate columns; the list may be empty."""
+    return np.concatenate([np.empty(0), *columns])
+
+
+def novel_view_moments(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the report's measurements of novel views; empty if there are none."""
+    return (report.get("novel_views") or {}).get("moments") or []
+
+
+def consistency_at(moment: dict[str, Any], reach: str) -> dict[str, Any]:
+    """Return a moment's consistency at a range, "short" or "long"; empty if it has none."""
+    return (moment.get("consistency") or {}).get(reach) or {}
+
+
+def moment_positions(moments: Sequence[dict[str, Any]], against: Against) -> Floats:
+    """Return the x positions [n] of measurements."""
+    return column([moment.get("seconds" if against == "seconds" else "step") for moment in moments])
+
+
+# --- logarithmic axes ----------------------------------------------------------------------------------------------
+
+
+def drawable(values: Floats) -> NDArray[np.bool_]:
+    """Return the mask [n] bool of the values that a logarithmic axis can show."""
+    return np.isfinite(values) & (values >= _MIN) & (values <= _MAX)
+
+
+def log_limits(values: Floats, margin: float) -> tuple[float, float]:
+    """Return the limits of a logarithmic axis that shows the values; arbitrary limits if there is nothing to show."""
+    shown = values[drawable(values)]
+    if not len(shown):
+        return 0.1, 1.0
+    low, high = float(shown.min()), float(shown.max())
+    margin = 2.0 if high < 1.0001 * low else margin
+    return low / margin, high * margin
+
+
+def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
+    """Group steps into bins of equal width on a logarithmic axis, skipping values that such an axis cannot show.
+
+    Args:
+        x: Positions [n] in ascending order.
+        window: Length of the running mean in steps.
+        width: Width of a bin, as a difference of natural logarithms.
+    """
+    shown = drawable(x) & drawable(values)
+    x, values = x[shown], values[shown]
+    if not len(x):
+        return Thinned(x, values, values, values)
+    positions = np.floor(np.log(x / x[0]) / width)
+    first = np.flatnonzero(np.diff(positions, prepend=-1.0))
+    count = np.diff(first, append=len(x))
+
+    def mean(numbers: Floats) -> Floats:
+        return np.exp(np.add.reduceat(np.log(numbers), first) / count)
+
+    low, high = np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)
+    return Thinned(mean(x), mean(running_mean(values, window)), low, high)
+
+
+def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
+    """Return the geometric mean of the last `window` values at each index, or of all values so far if there are fewer.
+
+    The last mean is that of the last window, as in `convergence.smoothed`.
+    """
+    logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
+    sums = np.concatenate([[0.0], np.cumsum(logs)])
+    end = np.arange(1, len(logs) + 1)
+    start = np.maximum(end - window, 0)
+    means: Floats = np.exp((sums[end] - sums[start]) / (end - start))
+    return means
+
+
+#: Size in inches. At this width, text is legible on a phone, and two charts fit side by side on a desktop screen.
+_WIDTH, _HEIGHT = 5.6, 3.5
+_REACHES = {"short": color_of(0), "long": color_of(1)}
+#: Labels of the y axes of consistency; both have no unit.
+_METRICS = {"rmse": "RMSE of colors, 0 to 1", "lpips": "LPIPS"}
+
+
+@dataclass(frozen=True)
+class PageFigure:
+    """Chart of the page.
+
+    Attributes:
+        name: Prefix of element IDs in the SVG, in lower-case letters.
+        svg: <svg> element by quantity of the x axis.
+    """
+
+    name: str
+    title: str
+    caption: str
+    svg: dict[Against, str]
+
+
+def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
+    """Draw the charts that a report has values for; return an empty list if no step was made."""
+    if not report["history"]:
+        return []
+    history = history_of(report)
+    moments = novel_view_moments(report)
+    probes = (report.get("approximations") or {}).get("moments") or []
+    losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
+    undrawn, caption = int((~drawable(losses)).sum()), "Loss, divided by that of the unstylized scene."
+    if undrawn:  # a logarithmic axis cannot show them
+        caption += f" Not shown: {undrawn:,} of {len(losses):,} values, which are zero or not finite."
+    draw: Callable[[Figure, Against], None] = partial(draw_loss, history=history, moments=moments)
+    figures = [_figure("loss", "Loss, relative to the start", caption, draw)]
+    caption, draw = "The loss of a scale is the sum of these terms.", partial(_draw_split, history=history)
+    figures.append(_figure("split", "Terms of the loss", caption, draw, rows=math.ceil(len(history.terms) / 2)))
+    if any(np.isfinite(_consistency(moments, reach, metric)[1:]).any() for reach in _REACHES for metric in _METRICS):
+        caption = (
+            "Difference between a view and another one that is warped into it. Dashed: the unstylized scene, "
+            "whose views also differ, by highlights."
+        )
+        draw = partial(_draw_consistency, history=history, moments=moments)
+        figures.append(_figure("consistency", "Consistency of novel views", caption, draw))
+    if drawable(column([probe.get("relative_error") for probe in probes])).any():
+        caption = "Norm of the error, relative to the norm of the exact gradient, on a sampled view."
+        draw = partial(_draw_approximations, history=history, probes=probes)
+        figures.append(_figure("approximations", "Error of the approximated gradient", caption, draw))
+    if np.isfinite(history.memory).any():
+        predicted = (report.get("plan") or {}).get("prediction") or {}
+        draw = partial(_draw_memory, history=history, predicted=predicted)
+        caption = "Memory of the process"
+        caption += "; on the GPU, the peak so far." if np.isfinite(history.device_memory).any() else "."
+        figures.append(_figure("memory", "Memory", caption, draw))
+    return figures
+
+
+def _consistency(moments: Sequence[dict[str, Any]], reach: str, metric: str) -> Floats:
+    """Return a metric at each moment [n], with NaN for missing and infinite values."""
+    values = column([consistency_at(moment, reach).get(metric) for moment in moments])
+    return np.where(np.isfinite(values), values, math.nan)
+
+
+def _figure(name: str, title: str, caption: str, draw: Callable[[Figure, Against], None], rows: int = 1) -> PageFigure:
+    """Draw a chart for each x axis at the same size, so that switching between them does not shift the page."""
+    svg = {}
+    for against in AGAINST:
+        with matplotlib.rc_context(STYLE):
+            figure = Figure(figsize=(_WIDTH, _HEIGHT + 2.0 * (rows - 1)), layout="constrained")
+            draw(figure, against)
+            label = f"{title}, against {against}"
+            svg[against] = inline(figure, f"{name}-{against}", label)
+    return PageFigure(name, title, caption, svg)
+
+
+def _draw_split(figure: Figure, against: Against, history: History) -> None:
+    count = len(history.terms)
+    grid = list(figure.subplots(math.ceil(count / 2), min(count, 2), sharey=True, squeeze=False).flat)
+    everything = [values for terms in history.terms.values() for values in terms.values()]
+    for axes, (scale, terms) in zip(grid, history.terms.items(), strict=False):
+        # Each panel has its own x limits. With shared limits, a first phase on the coarsest scale would squeeze the
+        # curves of all other scales into the end of the axis.
+        there = history.x[against][np.any([~np.isnan(values) for values in terms.values()], axis=0)]
+        own = replace(history, limits={**history.limits, against: log_limits(there, X_MARGIN)})
+        for term, values in terms.items():
+            draw_line(axes, own, against, values, color_of(list(TERMS).index(term)), TERMS[term])
+        axes.set_title(scale_name(scale))
+        set_log_x(axes, own.limits[against], against)
+        set_log_y(axes, everything)
+    for axes in grid[: max(count - 2, 0)]:  # another panel is below
+        axes.set_xlabel("")
+    for axes in grid[::2]:
+        axes.set_ylabel("loss")
+    for axes in grid[count:]:
+        axes.set_visible(False)
+    draw_legend(figure, in_row=4)
+
+
+def _draw_consistency(figure: Figure, against: Against, history: History, moments: Sequence[dict[str, Any]]) -> None:
+    known = {name: [np.isfinite(_consistency(moments, reach, name)).any() for reach in _REACHES] for name in _METRICS}
+    metrics = [metric for metric in _METRICS if any(known[metric])]
+    x = moment_positions(moments, against)
+    panels = figure.subplots(1, len(metrics), squeeze=False)[0]
+    for axes, metric in zip(panels, metrics, strict=True):
+        for reach, color in _REACHES.items():
+            values = _consistency(moments, reach, metric)
+            shown = drawable(x) & np.isfinite(values)
+            gap = next(filter(None, (consistency_at(moment, reach).get("gap") for moment in moments)), None)
+            label = f"{reach} range" if gap is None else f"{reach} range ({gap} view{'s' if gap > 1 else ''} apart)"
+            options = {"marker": "o", "markersize": 4, "color": color, "label": label}
+            draw_points(axes, x[shown], values[shown], **options)
+            if moments[0].get("step") == 0 and np.isfinite(values[0]):
+                axes.axhline(values[0], color=color, linestyle="--", linewidth=1)
+        axes.set_ylabel(_METRICS[metric])
+        axes.set_ylim(bottom=0)
+        set_log_x(axes, history.limits[against], against)
+    draw_legend(figure)
+
+
+def _draw_approximations(figure: Figure, against: Against, history: History, probes: Sequence[dict[str, Any]]) -> None:
+    axes = figure.subplots()
+    steps = column([probe.get("step") for probe in probes])
+    # A probe's `seconds` is the duration of one gradient. Its position on the time axis is interpolated from its step.
+    x = steps if against == "steps" else np.interp(steps, history.x["steps"], history.x["seconds"])
+    errors = column([probe.get("relative_error") for probe in probes])
+    shown = drawable(x) & drawable(errors)
+    draw_points(axes, x[shown], errors[shown], marker="o", markersize=4, color=color_of(0))
+    set_log_x(axes, history.limits[against], against)
+    set_log_y(axes, [errors])
+    axes.set_ylabel("relative error")
+
+
+def _draw_memory(figure: Figure, against: Against, history: History, predicted: dict[str, Any]) -> None:
+    axes = figure.subplots()
+    on_device = bool(np.isfinite(history.device_memory).any())
+    shown = [(history.memory, predicted.get("peak_bytes"), "", color_of(0), INK)]
+    if on_device:
+        shown.append((history.device_memory, predicted.get("device_bytes"), " on the GPU", color_of(1), color_of(1)))
+    for memory, peak, where, color, dashed in shown:
+        # Memory is not averaged over a round: what matters is the maximum in each bin.
+        line = thinned(history.x[against], memory / 1e9, 1, history.bin_width(against))
+        marker = "o" if len(line.x) == 1 else None
+        axes.plot(line.x, line.high, color=color, marker=marker, label=f"measured{where}")
+        if peak is not None and math.isfinite(peak):
+            label = f"peak{where}, predicted by the plan"
+            axes.axhline(peak / 1e9, color=dashed, linestyle="--", linewidth=1, label=label)
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel("memory in GB")
+    mark_phases(axes, history, against)
+    set_log_x(axes, history.limits[against], against)
+    draw_legend(figure)
+
+
+# --- SVG that can share a page with other figures ------------------------------------------------------------------
+
+_NAMESPACE = re.compile(r"\{[^}]*\}")
+_COLOR = re.compile(r"(fill|stroke): #([0-9a-f]{6})")
+_REFERENCE = re.compile(r"url\(#([^)]+)\)")
+_FAMILY = re.compile(r"font-family: [^;]*;?")
+_LONG_DECIMAL = re.compile(r"(\.\d\d)\d+")
+
+
+def inline(figure: Figure, name: str, label: str) -> str:
+    """Return a figure as an <svg> element that can share a page with other figures.
+
+    Its element IDs are prefixed with `name`, and it contains no style sheet.
+    """
+    file = io.BytesIO()
+    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # not needed, and has URLs of other servers
+    figure.savefig(file, format="svg", transparent=True, metadata=metadata)
+    root = ElementTree.fromstring(file.getvalue())
+    for parent in root.iter():
+        for child in list(parent):
+            if _NAMESPACE.sub("", child.tag) == "style":  # it would apply to the whole page
+                parent.remove(child)
+    links = [(key, value) for element in root.iter() for key, value in element.attrib.items()]
+    used = {value.removeprefix("#") for key, value in links if _NAMESPACE.sub("", key) == "href"}
+    used.update(reference for _, value in links for reference in _REFERENCE.findall(value))
+    for element in root.iter():
+        element.tag = _NAMESPACE.sub("", element.tag)
+        element.attrib = {
+            key: value
+            for key, value in (_rewritten(*item, name) for item in element.attrib.items())
+            if key != "id" or value.removeprefix(f"{name}-") in used
+        }
+    root.attrib = {"viewBox": root.attrib["viewBox"], "role": "img", "aria-label": label}
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _rewritten(key: str, value: str, name: str) -> tuple[str, str]:
+    """Return an attribute as it appears on the page.
+
+    Its XML namespace is removed, IDs are prefixed with the figure's name, and coordinates are truncated to hundredths
+    of a point.
+    """
+    key = _NAMESPACE.sub("", key)
+    if key == "id":
+        return key, f"{name}-{value}"
+    if key == "href":
+        return key, f"#{name}-{value.removeprefix('#')}"
+    value = _REFERENCE.sub(rf"url(#{name}-\1)", value)
+    if key == "style":
+        return key, _FAMILY.sub("", _COLOR.sub(r"\1: var(--c-\2, #\2)", value))
+    if key in ("d", "points"):
+        value = " ".join(value.split())
+    return key, _LONG_DECIMAL.sub(r"\1", value) if key in ("d", "points", "x", "y", "transform") else value

@@ -13,7 +13,7 @@ from torch import Tensor
 if torch.cuda.is_available():
     pytest.skip("there is a GPU", allow_module_level=True)
 
-from sgsst_core.bench import doctor
+from sgsst_core.bench import device_checks
 from tests.pretend_cuda.counts import Counts
 
 pytest.importorskip("triton")
@@ -67,13 +67,13 @@ def test_host_synchronizations_are_counted(counts: Counts, asked: Callable[[Tens
 
 @pytest.mark.slow
 def test_doctor_describes_the_gpu(counts: Counts) -> None:
-    assert doctor._gpu().text.startswith("1 x pretend, compute capability 9.0, CUDA ")
-    assert doctor._memory(torch.device("cuda", 0)).text == "jobs plan with 105.2 GB of the GPU's memory"
-    assert doctor._precision().text == "jobs use float16; possible: float32, float16, bfloat16, tf32"
+    assert device_checks._gpu().text.startswith("1 x pretend, compute capability 9.0, CUDA ")
+    assert device_checks._memory(torch.device("cuda", 0)).text == "jobs plan with 105.2 GB of the GPU's memory"
+    assert device_checks._precision().text == "jobs use float16; possible: float32, float16, bfloat16, tf32"
 
 
 def test_doctor_explains_why_a_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "exists", lambda path: str(path) == "/dev/nvidia0")
-    finding = doctor._gpu()
+    finding = device_checks._gpu()
     assert finding.state == "warning"
     assert ("built for CPUs only" if torch.version.cuda is None else "PyTorch cannot use it") in finding.text

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from api.cli.bench import error_time_table, point_line
-from sgsst_core.bench.error_time import (
+from sgsst_core.bench.variants import (
     VARIANTS,
     Curve,
     Point,
@@ -24,9 +24,8 @@ from sgsst_core.bench.error_time import (
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.quality.float32_reference import Float32Reference
-from sgsst_core.quality.lpips import Lpips
-from sgsst_core.quality.measure import make_judge, make_novel_views
+from sgsst_core.quality.judge import Lpips
+from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.steps import Evaluation
 from sgsst_core.stylizing.stylizer import Stylizer

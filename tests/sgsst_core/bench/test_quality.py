@@ -10,12 +10,12 @@ import pytest
 import torch
 from PIL import Image
 
-from sgsst_core.bench.error_time import choose_variants
-from sgsst_core.bench.quality import (
+from sgsst_core.bench.variants import (
     TRANSFER,
     UNSTYLIZED,
     Quality,
     VariantResult,
+    choose_variants,
     compare_quality,
     write_plot,
     write_sheet,

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.bench.synthetic import texture
+from sgsst_core.bench.device_checks import texture
 from sgsst_core.features import winograd
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork

@@ -14,7 +14,8 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SettingsError
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.quality.consistency import (
+from sgsst_core.quality.judge import Lpips
+from sgsst_core.quality.novel_views import (
     LONG_RANGE,
     SHORT_RANGE,
     Consistency,
@@ -26,7 +27,6 @@ from sgsst_core.quality.consistency import (
     shown,
     view_pairs,
 )
-from sgsst_core.quality.lpips import Lpips
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, look_at, resized
 from sgsst_core.scene.gaussians import TENSORS, Scene
@@ -181,7 +181,7 @@ def test_row_bands_do_not_change_results(monkeypatch):
     depths = [expected_depth(scene, c, rasterizer) for c in cameras]
     arguments = depths[1], cameras[1], depths[0], cameras[0]
     whole = find_warp(*arguments)
-    monkeypatch.setattr("sgsst_core.quality.consistency._BAND_PIXELS", 7 * 64)
+    monkeypatch.setattr("sgsst_core.quality.novel_views._BAND_PIXELS", 7 * 64)
     banded = find_warp(*arguments)
     for part in ("pixels", "sources", "weights"):
         assert torch.equal(getattr(whole, part), getattr(banded, part))

@@ -11,7 +11,7 @@ import torch
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.parallel.collectives import ALONE
 from sgsst_core.planning.facts import equip
-from sgsst_core.quality.float32_reference import Float32Reference, approximations
+from sgsst_core.quality.measure import Float32Reference, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job

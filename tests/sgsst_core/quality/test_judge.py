@@ -12,8 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
-from sgsst_core.quality.judge import JUDGED_SIDE, Judge, Judgment, frechet_distance, saturated
-from sgsst_core.quality.lpips import Lpips
+from sgsst_core.quality.judge import JUDGED_SIDE, Judge, Judgment, Lpips, frechet_distance, saturated
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.regions.definition import Region, Regions

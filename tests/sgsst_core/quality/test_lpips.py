@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sgsst_core.errors import WeightsError
 from sgsst_core.features.network_weights import load_perceptual
-from sgsst_core.quality.lpips import MIN_SIDE, Lpips, load_lpips_or_none
+from sgsst_core.quality.judge import MIN_SIDE, Lpips, load_lpips_or_none
 from tests.sgsst_core.synthetic_images import synthetic_image
 
 Array = NDArray[np.float64]

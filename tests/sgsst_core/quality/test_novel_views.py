@@ -22,10 +22,8 @@ from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import GRAM_WEIGHT
-from sgsst_core.quality.consistency import LONG_RANGE, SHORT_RANGE, expected_depth
-from sgsst_core.quality.lpips import Lpips
-from sgsst_core.quality.novel_cameras import neighbors
-from sgsst_core.quality.novel_views import MAX_VIEWS, NovelViews
+from sgsst_core.quality.judge import Lpips
+from sgsst_core.quality.novel_views import LONG_RANGE, MAX_VIEWS, SHORT_RANGE, NovelViews, expected_depth, neighbors
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.camera import Camera, between, look_at, resized, spread

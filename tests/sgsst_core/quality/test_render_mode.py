@@ -11,7 +11,7 @@ import torch
 
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.quality.findings import render_mode_findings, small_gaussians
-from sgsst_core.quality.scene_difference import scene_psnr
+from sgsst_core.quality.measure import scene_psnr
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.projection import project
 from sgsst_core.rasterizer.reference import splat

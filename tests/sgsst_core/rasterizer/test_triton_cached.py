@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.facts import count_weights
-from sgsst_core.quality.float32_reference import approximations
+from sgsst_core.quality.measure import approximations
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Precision
 from sgsst_core.rasterizer.cached import CachedRasterizer

@@ -14,7 +14,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.quality.float32_reference import Float32Reference
+from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.regions.definition import Region, Regions, check_regions

@@ -11,7 +11,7 @@ from PIL import Image, ImageColor
 
 from sgsst_core.errors import OutputError
 from sgsst_core.report.charts import write_loss_chart
-from sgsst_core.report.palette import COLORS, INK
+from sgsst_core.report.images import COLORS, INK
 from tests.sgsst_core.report.sample import sample_report
 
 pytestmark = pytest.mark.filterwarnings("error")

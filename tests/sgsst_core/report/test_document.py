@@ -15,9 +15,9 @@ from api.cli.console import loss_text
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.atomic import write_json
 from sgsst_core.loss.terms import LossTerms
-from sgsst_core.report.contact_sheet import write_contact_sheet
+from sgsst_core.report.charts import history_of, running_mean
 from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
-from sgsst_core.report.history import history_of, running_mean
+from sgsst_core.report.images import write_contact_sheet
 from sgsst_core.report.page import render_page
 from sgsst_core.scales import EVEN
 from sgsst_core.settings import make_settings

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sgsst_core.report.history import BINS, running_mean, thinned
+from sgsst_core.report.charts import BINS, running_mean, thinned
 from sgsst_core.scales import smoothed
 
 

@@ -17,11 +17,10 @@ from PIL import Image
 from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.terms import TERMS
+from sgsst_core.report.charts import BINS, draw_figures
 from sgsst_core.report.document import Sources, build_report
-from sgsst_core.report.figures import draw_figures
-from sgsst_core.report.history import BINS
+from sgsst_core.report.images import ON_DARK
 from sgsst_core.report.page import render_page, write_page
-from sgsst_core.report.palette import ON_DARK
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.stylizer import Stylizer

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sgsst_core.errors import CameraError
-from sgsst_core.quality.novel_cameras import neighbors
+from sgsst_core.quality.novel_views import neighbors
 from sgsst_core.scene.camera import Camera, look_at
 from sgsst_core.scene.camera_path import CameraPath, catmull_rom_tangents, framed, in_path_order, moved
 

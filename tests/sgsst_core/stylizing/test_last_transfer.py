@@ -13,10 +13,9 @@ from sgsst_core import Settings, Stylizer, make_settings
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.plan import Plan
-from sgsst_core.quality.float32_reference import Float32Reference
-from sgsst_core.quality.measure import Measurements
+from sgsst_core.quality.measure import Float32Reference, Measurements
 from sgsst_core.regions.definition import Region, Regions
-from sgsst_core.report.contact_sheet import write_contact_sheet
+from sgsst_core.report.images import write_contact_sheet
 from sgsst_core.scene.colors import on_screen_by_luminance
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.style import Style

@@ -10,8 +10,7 @@ import torch
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.quality.float32_reference import Float32Reference
-from sgsst_core.quality.measure import Measurements
+from sgsst_core.quality.measure import Float32Reference, Measurements
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.steps import mean_loss

@@ -12,7 +12,7 @@ import torch
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.quality.float32_reference import Float32Reference
+from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import harmonics_energy
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held

@@ -13,7 +13,7 @@ from torch import Tensor
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.terms import ViewTarget
-from sgsst_core.quality.float32_reference import Float32Reference
+from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions.definition import Region, Regions
 from sgsst_core.regions.maps import RegionMaps

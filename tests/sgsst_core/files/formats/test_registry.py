@@ -31,7 +31,7 @@ from sgsst_core.files.formats.spz import SPZ, SPZ_3
 from sgsst_core.files.library import load_scene, save
 from sgsst_core.files.scene_file import losses, read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
-from sgsst_core.quality.scene_difference import measure_compression
+from sgsst_core.quality.measure import measure_compression
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors

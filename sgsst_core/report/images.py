@@ -1,12 +1,15 @@
-"""Contact sheets: style images and renders of some views, side by side as a JPEG."""
+"""Images of reports in their colors: contact sheets as JPEG, and the frames of videos."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import accumulate, zip_longest
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
@@ -14,12 +17,39 @@ from torch import Tensor
 from sgsst_core.constants import NEAR
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.images import to_image
-from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.palette import INK, PAPER
+from sgsst_core.files.video import VideoFrame
+from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.stylizing.stylizer import Stylizer
+
+PAPER = "#ffffff"
+#: Color of text and axes, and of grid lines.
+INK, GRID = "#222222", "#888888"
+#: Colors of data series, in this order; distinguishable with color vision deficiency.
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+#: Replacements for the colors of charts on a dark screen.
+ON_DARK = {
+    INK: "#e4e7eb",
+    GRID: "#8b949e",
+    **dict(zip(COLORS, ("#4aa8e8", "#ff8b3d", "#2ecc9b", "#e79cc4", "#f2b632", "#9bd4f7"), strict=True)),
+}
+#: Colors of the page by their names in its style sheet: for light paper, and for a dark screen.
+PAGE = {
+    "paper": (PAPER, "#14171b"),
+    "ink": (INK, ON_DARK[INK]),
+    "quiet": ("#5b636c", "#9aa4af"),
+    "line": ("#d9dde2", "#333a42"),
+    "shade": ("#f4f6f8", "#1d2228"),
+    "accent": (COLORS[0], ON_DARK[COLORS[0]]),
+}
+
+
+def color_of(index: int) -> str:
+    """Return the color of the data series with the given index; colors repeat after the last one."""
+    return COLORS[index % len(COLORS)]
+
 
 #: Sizes in pixels: height of an image, maximum width of an image, gaps, and the text of labels.
 _CELL_HEIGHT = 330
@@ -142,3 +172,83 @@ def _fitted(image: Image.Image) -> Image.Image:
     factor = min(_MAX_CELL_WIDTH / image.width, _CELL_HEIGHT / image.height)
     size = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
     return image.resize(size, Image.Resampling.LANCZOS)
+
+
+#: Transition from the unstylized to the stylized scene: a vertical line that moves to the right, or a cross-fade.
+Transition = Literal["wipe", "fade"]
+#: Fraction of a video before the transition, and after it.
+_HOLD = 0.15
+#: Alpha below which a pixel rounds to transparent; its color is then black instead of amplified rounding errors.
+_INVISIBLE = 0.5 / 255
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Scene with its rasterizer; scenes that only differ in their colors can share one.
+
+    With an alpha channel, the rasterizer's background must be black.
+    """
+
+    scene: Scene
+    rasterizer: Rasterizer = field(repr=False)
+
+    def image(self, camera: Camera, *, alpha: bool) -> Tensor:
+        """Return the image [h, w, 3] float32; with alpha [h, w, 4], with premultiplied colors."""
+        colors = scene_colors(self.scene, camera, self.rasterizer.device)
+        image = self.rasterizer.render(colors, camera).to("cpu", torch.float32)
+        if not alpha:
+            return image.clamp(0, 1)
+        coverage = self.rasterizer.coverage(camera).to("cpu", torch.float32).clamp(0, 1)
+        return torch.cat([torch.minimum(image.clamp_min(0), coverage[:, :, None]), coverage[:, :, None]], dim=2)
+
+
+def write_frames(
+    write: Callable[[VideoFrame], None],
+    layer: Layer,
+    cameras: Sequence[Camera],
+    *,
+    unstylized: Layer | None = None,
+    transition: Transition = "wipe",
+    alpha: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Render the frames of a video, one per camera. One frame is in memory at a time.
+
+    Args:
+        write: Function that appends a frame to the video; see `sgsst_core.files.video.video_writer`.
+        cameras: Cameras of one size, one per frame.
+        unstylized: Scene at the start of the transition; None for no transition.
+        progress: Callback that receives the numbers of completed and of all frames.
+    """
+    for index, camera in enumerate(cameras):
+        fraction = 1.0 if unstylized is None else shown_fraction(index / max(len(cameras) - 1, 1))
+        if unstylized is None or fraction == 1:
+            image = layer.image(camera, alpha=alpha)
+        elif fraction == 0:
+            image = unstylized.image(camera, alpha=alpha)
+        else:
+            before, after = unstylized.image(camera, alpha=alpha), layer.image(camera, alpha=alpha)
+            line = round(fraction * before.shape[1])
+            wiped = torch.cat([after[:, :line], before[:, line:]], dim=1)
+            image = wiped if transition == "wipe" else torch.lerp(before, after, fraction)
+        write(_to_bytes(image))
+        progress(index + 1, len(cameras))
+
+
+def shown_fraction(time: float) -> float:
+    """Return how much of the stylized scene a transition shows, in 0..1, at a time in 0..1 of the video.
+
+    It is smooth, and holds both ends for 15 % of the video.
+    """
+    x = min(max((time - _HOLD) / (1 - 2 * _HOLD), 0.0), 1.0)
+    return x * x * (3 - 2 * x)
+
+
+def _to_bytes(image: Tensor) -> VideoFrame:
+    """Return an image [h, w, 3], or [h, w, 4] with premultiplied colors, as a frame with straight alpha."""
+    if image.shape[2] == 4:
+        alpha = image[:, :, 3:]
+        straight = torch.where(alpha > _INVISIBLE, image[:, :, :3] / alpha.clamp_min(_INVISIBLE), 0.0)
+        image = torch.cat([straight.clamp_max(1), alpha], dim=2)
+    frame: VideoFrame = (image * 255).round().to(torch.uint8).numpy().astype(np.uint8, copy=False)
+    return frame
