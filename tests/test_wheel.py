@@ -121,13 +121,6 @@ def test_wheel_contains_the_licenses_of_its_files(wheel: Path) -> None:
     assert {"LICENSE", "docs/credits.md"} | vendored <= packed
 
 
-def test_packages_are_imported_from_the_wheel(installed: Path, tmp_path: Path) -> None:
-    code = f"import {', '.join(PACKAGES)}; print(*(package.__file__ for package in ({', '.join(PACKAGES)})))"
-    files = run([installed / "python", "-c", code], tmp_path).split()
-    assert all(Path(file).is_relative_to(installed.parent) for file in files), files
-    assert run([installed / "sgsst", "--version"], tmp_path).strip()
-
-
 def test_web_page_and_its_assets_are_installed(installed: Path, tmp_path: Path) -> None:
     code = (
         "from api.http.static import static_files as served; print(served().digest, *served().pages, *served().files)"
@@ -178,11 +171,6 @@ def test_core_commands_name_the_missing_extra(core: Path, tmp_path: Path, argume
     assert "extra `service` installs. Run `pip install 'sgsst-service[service]'`" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
-
-
-def test_core_includes_the_client(core: Path, tmp_path: Path) -> None:
-    done = subprocess.run([core / "sgsst", "submit", "missing.ply", "--style", "a.jpg"], capture_output=True, text=True)
-    assert "missing.ply: not a file" in done.stderr
 
 
 def test_migrations_create_the_database(installed: Path, tmp_path: Path) -> None:

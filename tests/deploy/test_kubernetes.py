@@ -190,6 +190,16 @@ def test_pods_reach_only_what_they_need(overlay: str) -> None:
             assert credentials_of_the_cloud in block["except"]
 
 
+def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[dict[str, Any]]:
+    """Return the objects of the overlay `gpu` after `change` has modified its kustomization, as an operator might."""
+    shutil.copytree(FOLDER, folder / "kubernetes")
+    overlay = folder / "kubernetes" / "overlays" / "gpu"
+    kustomization = yaml.safe_load((overlay / "kustomization.yaml").read_text())
+    change(kustomization)
+    (overlay / "kustomization.yaml").write_text(yaml.safe_dump(kustomization))
+    return [document for document in yaml.safe_load_all(build(overlay)) if document]
+
+
 def test_webhooks_are_an_optional_component(tmp_path: Path) -> None:
     """The component enables webhooks and lets dispatchers reach all ports of public addresses, but no private ones."""
     for overlay in OVERLAYS:
@@ -213,30 +223,6 @@ def _holds(block: dict[str, Any], address: str) -> bool:
     parsed = ip_address(address)
     networks = [ip_network(block["cidr"]), *map(ip_network, block.get("except", ()))]
     return parsed in networks[0] and not any(parsed in network for network in networks[1:])
-
-
-def test_images_can_be_pinned_by_digest(tmp_path: Path) -> None:
-    digest = "sha256:" + 64 * "a"
-
-    def pin(overlay: dict[str, Any]) -> None:
-        for image in overlay["images"]:
-            del image["newTag"]
-            image["digest"] = digest
-
-    manifests = changed(tmp_path, pin)
-    images = re.findall(r"image: (\S+)", yaml.safe_dump_all(manifests))
-    assert len(images) >= 8
-    assert {image.partition("@")[2] for image in images} == {digest}
-
-
-def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[dict[str, Any]]:
-    """Return the objects of the overlay `gpu` after `change` has modified its kustomization, as an operator might."""
-    shutil.copytree(FOLDER, folder / "kubernetes")
-    overlay = folder / "kubernetes" / "overlays" / "gpu"
-    kustomization = yaml.safe_load((overlay / "kustomization.yaml").read_text())
-    change(kustomization)
-    (overlay / "kustomization.yaml").write_text(yaml.safe_dump(kustomization))
-    return [document for document in yaml.safe_load_all(build(overlay)) if document]
 
 
 @each_overlay
@@ -285,15 +271,3 @@ def test_settings_and_secrets_exist_in_the_service(overlay: str) -> None:
     }
     assert named <= SECRETS
     assert of_kind(overlay, "Secret") == []
-
-
-def test_api_stays_available_during_updates() -> None:
-    (api,) = [each for each in of_kind("gpu", "Deployment") if each["metadata"]["name"] == "sgsst-api"]
-    assert api["spec"]["replicas"] == 2
-    assert api["spec"]["strategy"]["rollingUpdate"] == {"maxSurge": 1, "maxUnavailable": 0}
-    (budget,) = of_kind("gpu", "PodDisruptionBudget")
-    assert budget["spec"]["selector"] == {"matchLabels": {"app.kubernetes.io/name": "sgsst-api"}}
-    assert budget["spec"]["minAvailable"] == 1
-    (ingress,) = of_kind("gpu", "Ingress")
-    assert ingress["spec"]["tls"]
-    assert ingress["metadata"]["annotations"]["nginx.ingress.kubernetes.io/proxy-body-size"] == "0"

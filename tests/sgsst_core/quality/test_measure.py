@@ -1,19 +1,26 @@
-"""Tests of quality measurements: before and after the steps, and without effect on them."""
+"""Tests of quality measurements: before and after the steps, without effect on them, and against exact gradients."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
-from sgsst_core import Stylizer, make_settings, run
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.quality.measure import Measurements
+from sgsst_core.parallel.collectives import ALONE
+from sgsst_core.planning.facts import equip
+from sgsst_core.quality.measure import Float32Reference, Measurements, approximations
+from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.loop import Callbacks
+from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.planner import plan_job
-from tests.small_scenes import cameras, style, wall
+from sgsst_core.stylizing.steps import mean_loss
+from sgsst_core.stylizing.stylizer import Stylizer
+from tests.rounding import RoundedToTf32
+from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STEPS = 8
@@ -73,3 +80,84 @@ def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: Ba
     start, same = (stylizer.measured[0]["novel_views"]["gram"] for stylizer in (other, usual))
     assert start == pytest.approx(same, rel=1e-6)
     assert all(terms["nearest"] > 0 for terms in other.history[-1].terms.values())
+
+
+def prepared(weights: BackboneWeights, scene: object = None, **values: Any) -> Stylizer:
+    given: dict[str, Any] = {
+        "steps_coarse": 0,
+        "steps_sos": 12,
+        "training_background": "background",
+        "warm_start": False,
+        **values,
+    }
+    settings = make_settings(**given)
+    return Stylizer.planned(scene or ball(500), cameras(2), style(), settings, weights=weights)  # type: ignore[arg-type]
+
+
+def in_bfloat16(weights: BackboneWeights) -> Stylizer:
+    """Return a job whose plan is constructed by hand, so that the precision does not depend on the processor."""
+    scene, settings = ball(500), make_settings(steps_sos=12, training_background="background", warm_start=False)
+    plan = plan_job(scene, cameras(2), Style.of(style()), settings, weights=weights).plan
+    plan = replace(plan, precision="bfloat16")
+    return Stylizer(prepare_job(plan, scene, cameras(2), Style.of(style()), settings, weights=weights))
+
+
+def test_float32_job_agrees_with_its_reference(tiny_weights: BackboneWeights) -> None:
+    stylizer = prepared(tiny_weights, wall(sh_degree=2))
+    stylizer.run_step()
+    reference = Float32Reference(stylizer)
+    error = reference.gradient_error()
+    assert approximations(stylizer) == []
+    assert error.relative_error < 1e-5
+    assert error.cosine == pytest.approx(1, abs=1e-6)
+    expected = mean_loss(stylizer.evaluate([0, 1]))
+    assert mean_loss(reference.evaluate([0, 1], stylizer.stylized())) == pytest.approx(expected, rel=1e-5)
+
+
+def test_initial_error_can_be_measured_later(tiny_weights: BackboneWeights) -> None:
+    """The error has the same value as if it was measured before the first step, and colors are not affected."""
+    stylizer = in_bfloat16(tiny_weights)
+    reference = Float32Reference(stylizer)
+    first = reference.gradient_error()
+    for _ in range(3):
+        stylizer.run_step()
+    colors = stylizer.sh_dc.clone()
+    late = reference.gradient_error(start=True)
+    assert (late.step, late.view, late.relative_error, late.cosine) == (
+        0,
+        first.view,
+        first.relative_error,
+        first.cosine,
+    )
+    assert torch.equal(stylizer.sh_dc, colors)
+    assert reference.gradient_error().relative_error != first.relative_error
+
+
+def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) -> None:
+    """The plan is constructed by hand, and TF32 is emulated, because a CPU would use float32."""
+    scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12, warm_start=False)
+    context = equip(scene, cameras(2), settings, tiny_weights, ALONE)
+    plan = replace(
+        plan_job(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights).plan, precision="tf32"
+    )
+    rounded = RoundedToTf32(tiny_weights, context.network().layers)
+    errors = []
+    for shop in (None, replace(context, networks={"tf32": rounded})):
+        stylizer = Stylizer(
+            prepare_job(
+                plan, scene, cameras(2), Style.of(style()), settings, weights=tiny_weights, planning_context=shop
+            )
+        )
+        assert approximations(stylizer) == ["TF32 convolutions"]
+        errors.append(Float32Reference(stylizer).gradient_error())
+    assert errors[0].relative_error < 1e-5
+    assert 1e-3 < errors[1].relative_error < 0.2
+    assert errors[1].cosine > 0.98
+
+
+def test_bfloat16_error_is_plausible(tiny_weights: BackboneWeights) -> None:
+    stylizer = in_bfloat16(tiny_weights)
+    assert approximations(stylizer) == ["bfloat16 features"]
+    error = Float32Reference(stylizer).gradient_error()
+    assert 1e-3 < error.relative_error < 0.8
+    assert error.cosine > 0.6

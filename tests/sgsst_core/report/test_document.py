@@ -1,3 +1,5 @@
+"""Tests of the JSON document of a report, and of the contact sheet."""
+
 from __future__ import annotations
 
 import json
@@ -13,7 +15,6 @@ from PIL import Image
 
 from api.cli.console import loss_text
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.files.atomic import write_json
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.report.charts import history_of, running_mean
 from sgsst_core.report.document import REPORT_VERSION, Sources, build_report, loss_over_time
@@ -52,12 +53,6 @@ def sources(tiny_weights: BackboneWeights) -> Sources:
     return Sources(Path("a/scene.ply"), 2, (Path("style.png"),), Path("cameras.json"), None, tiny_weights)
 
 
-def test_evaluation_views_are_spread_over_covered_views(
-    finished: tuple[Stylizer, Evaluation, Evaluation],
-) -> None:
-    assert finished[0].job.evaluation_views == [0, 1, 4, 5]
-
-
 def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources) -> None:
     stylizer, before, after = finished
     report = build_report(stylizer, sources, "finished", before, after)
@@ -89,24 +84,6 @@ def test_typical_step_is_the_median_of_those_with_as_many_scales(
     monkeypatch.setattr(stylizer, "history", history)
     measured = build_report(stylizer, sources, "finished", before, after)["plan"]["measured"]
     assert (measured["seconds"], measured["seconds_coarse"]) == (4.0, None)
-
-
-def test_report_has_measurements_and_their_fraction_of_time(
-    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stylizer, before, after = finished
-    monkeypatch.setattr(stylizer, "seconds", 200.0)
-    monkeypatch.setitem(stylizer.seconds_by_part, "measuring", 30.0)
-    nothing: dict[str, Any] = {"novel_views": None, "approximation": None}
-    entries = [{"step": 0, **nothing, "novel_view_names": ["a", "b"]}, {"step": 7, **nothing}]
-    monkeypatch.setattr(stylizer, "measured", entries)
-    assert build_report(stylizer, sources, "finished", before, after)["measuring"] == {
-        "fraction": 1.0,
-        "seconds": 30.0,
-        "of_steps": 0.15,
-        "loss_views": 4,
-        "novel_view_count": 2,
-    }
 
 
 def test_report_has_the_losses_of_the_steps(
@@ -215,19 +192,6 @@ def test_loss_over_time_needs_steps(finished: tuple[Stylizer, Evaluation, Evalua
         assert loss_over_time(stylizer, {0: LossTerms(gram=8.0)}) is None
     finally:
         stylizer.history = history
-
-
-def test_report_is_plain_json(
-    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, tmp_path: Path
-) -> None:
-    stylizer, before, after = finished
-    report = build_report(stylizer, sources, "finished", before, after)
-    write_json(tmp_path / "r.json", report)
-
-    def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is not JSON")
-
-    assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"), parse_constant=refuse) == report
 
 
 def test_coarse_steps_are_relative_to_their_own_scale(

@@ -16,8 +16,6 @@ from PIL import Image
 
 from sgsst_core.errors import OutputError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.terms import TERMS
-from sgsst_core.report.charts import BINS, draw_figures
 from sgsst_core.report.document import Sources, build_report
 from sgsst_core.report.images import ON_DARK
 from sgsst_core.report.page import render_page, write_page
@@ -170,34 +168,6 @@ def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
         assert f"#against-{against}:not(:checked) ~ .figures .against-{against} {{ display: none; }}" in page.html
 
 
-def test_lines_are_named_and_phases_marked() -> None:
-    loss = draw_figures(losses_alone(scales=2, also="novel_views"))[0].svg["steps"]
-    words = Page(loss).text
-    for name in ("scale 0 (full size)", "scale 1 (1/2)", "mean", "Gram distance, novel views", "steps"):
-        assert name in words
-    assert "coarsest scale" in words
-    assert "all scales" in words
-
-
-def test_split_has_a_panel_for_each_scale() -> None:
-    report = losses_alone(scales=3)
-    words = Page(draw_figures(report)[1].svg["seconds"]).text
-    assert [words.count(f"scale {scale} (") for scale in range(4)] == [1, 1, 1, 0]
-    assert all(name in words for name in TERMS.values())
-
-
-def test_unused_loss_terms_are_not_drawn() -> None:
-    report = losses_alone()
-    for record in report["history"]:
-        for terms in record["scales"].values():
-            terms["nearest"] = 0.0
-            del terms["content"]  # as in a report from before this term existed
-    words = Page(draw_figures(report)[1].svg["seconds"]).text
-    assert TERMS["gram"] in words
-    assert TERMS["nearest"] not in words
-    assert TERMS["content"] not in words
-
-
 def test_hostile_names_are_escaped() -> None:
     report = sample_report()
     report["scene"]["path"] = f"folder/{HOSTILE.replace('/', '∕')}.ply"
@@ -288,18 +258,6 @@ def test_judgment_of_the_result_is_shown_next_to_the_start() -> None:
     assert "distance to the style" not in parsed_without_figures(report).text
 
 
-def test_collapsed_section_has_all_other_fields() -> None:
-    report = sample_report()
-    report["a_field_of_later"] = {"deep": [{"inside": True}], "bytes": 5_000_000}
-    text = parsed_without_figures(report).text
-    assert "sha256 " + "0123456789abcdef" * 4 in text
-    assert "path folder/garden.ply" in text
-    assert "deep" in text
-    assert "5 MB (5,000,000 bytes)" in text
-    assert "processor some processor" in text
-    assert "views c lpips alex" in text
-
-
 def test_reports_without_optional_parts_are_shown() -> None:
     report = sample_report()
     report.update(novel_views=None, approximations=None, loss_over_time=None, findings=[], seconds_by_part={})
@@ -371,14 +329,6 @@ def test_extreme_losses_are_shown(size: float) -> None:
         for terms in record["scales"].values():
             terms.update(dict.fromkeys(terms, size))
     parsed(report)
-
-
-@pytest.mark.slow
-def test_long_history_stays_small() -> None:
-    page = parsed(losses_alone(5 * BINS, 5 * BINS, scales=3))
-    assert len(page.html.encode()) < 1_500_000  # leaves as much again for the sheet
-    points = [attributes.get("d") or "" for tag, attributes in page.elements if tag == "path"]
-    assert max(path.count("L") for path in points) < 2 * BINS + 10
 
 
 def test_page_of_a_real_job_is_self_contained(tiny_weights: BackboneWeights, tmp_path: Path, one_thread: None) -> None:

@@ -1,4 +1,4 @@
-"""Test of `deploy/two_hosts.sh`: one job on two hosts with cold caches, simulated by namespaces of this machine."""
+"""Tests on simulated hosts, which are namespaces of this machine: one job, the service, and failures of hosts."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from benchmarks import cluster_faults
 from sgsst_core.features.network_weights import BackboneWeights
 
 pytestmark = pytest.mark.slow
@@ -85,3 +88,63 @@ def test_job_runs_on_two_hosts_with_cold_caches(tmp_path: Path, vgg16_weights: B
     assert out.is_file()
     assert list(kernels.rglob("*.nbi")), "the kernels were not compiled here"
     assert_removed(re.search(r"^Two hosts: 10\.77\.(\d+)\.2 and 10\.77\.\1\.3$", ended.stdout, flags=re.M))
+
+
+def missing() -> str | None:
+    """Return which required program this machine lacks, or None if it has all."""
+    for tool in ("curl", "setpriv", "initdb"):
+        if shutil.which(tool) is None and not list(Path("/usr/lib/postgresql").glob(f"*/bin/{tool}")):
+            return f"{tool} is missing: apt-get install -y curl util-linux postgresql"
+    return None
+
+
+def test_cluster_job_needs_no_shared_folder(tmp_path: Path, vgg16_weights: BackboneWeights) -> None:
+    for module in ("moto.server", "psycopg", "s3fs"):
+        pytest.importorskip(module, reason=f"{module} is not installed: see the extra [dev]")
+    if reason := problem() or missing():
+        pytest.skip(reason)
+    environment = {**os.environ, "BIN": str(Path(sys.executable).parent)}
+    command = [str(ROOT / "deploy" / "three_hosts.sh"), str(tmp_path / "out"), "kill"]
+    ended = run(command, environment)
+    assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}"
+    assert "computed on: host-node" in ended.stdout
+    assert "the result is that of sgsst stylize, byte for byte" in ended.stdout
+    assert re.findall(r"^left on host-(\w+): 0 files beside the cache, 0 of jobs$", ended.stdout, flags=re.M) == [
+        "api",
+        "head",
+        "node",
+    ]
+    assert "the node was killed with its disk at step" in ended.stdout
+    assert_removed(re.search(r"^Three hosts of 10\.77\.(\d+): ", ended.stdout, flags=re.M))
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """Provide a folder with a path short enough for Ray's sockets."""
+    path = Path(tempfile.mkdtemp(prefix="sgsst-c-", dir="/tmp"))
+    yield path
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def networks() -> set[str]:
+    """Return the network devices and namespaces that `benchmarks.cluster_faults` has created on this machine."""
+    commands = (["ip", "-o", "link"], ["ip", "netns", "list"])
+    said = (subprocess.run(command, capture_output=True, text=True, check=True).stdout for command in commands)
+    return {name for text in said for name in re.findall(r"sgsst\d[\w-]*", text)}
+
+
+def test_host_faults_lose_no_job(folder: Path, vgg16_weights: BackboneWeights) -> None:
+    for module in ("moto.server", "psycopg", "s3fs"):
+        pytest.importorskip(module, reason=f"{module} is not installed: see the extra [dev]")
+    if reason := cluster_faults.missing() or missing():
+        pytest.skip(reason)
+    before = networks()
+    kinds = ("kill-node", "cut-dispatcher", "restart-database")
+    result = cluster_faults.measure(folder, kinds, len(kinds))
+    assert result["faults"] == len(kinds)
+    assert result["jobs_accepted"] >= len(kinds)
+    assert (result["lost"], result["not_succeeded"]) == (0, [])
+    assert (result["published_twice"], result["different"]) == (0, 0)
+    assert not any(result["left_on_hosts"].values())
+    assert result["left_in_store"] == []
+    assert networks() == before
