@@ -29,7 +29,7 @@ from sgsst_core.planning.survey import sees_something
 from sgsst_core.quality.judge import MIN_SIDE, Lpips, shown
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.base import CameraKey, camera_key
-from sgsst_core.regions.maps import ViewMaps
+from sgsst_core.regions.maps import RegionMaps
 from sgsst_core.scene.camera import Camera, between, resized, spread
 from sgsst_core.scene.camera_path import moved, nearest_walk, similarly_rotated
 from sgsst_core.scene.gaussians import Scene, sampled
@@ -110,7 +110,7 @@ class NovelViews:
         most: int = MAX_VIEWS,
         memory: int = 1 << 29,
         rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
-        maps: ViewMaps | None = None,
+        maps: RegionMaps | None = None,
     ) -> None:
         self.scene = scene
         self.rasterizer = rasterizer
