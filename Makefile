@@ -23,11 +23,15 @@ demo: $(VENV)/installed
 	$(BIN)/sgsst weights fetch vgg16
 	$(BIN)/sgsst demo --out $(DEMO)
 
-# Run all checks of `lint`, and the tests that are not marked as slow.
-test: lint
+# Run all checks of `lint`, and the tests that are not marked as slow; with FILES=..., only the fast tests of these paths.
+test: $(if $(FILES),$(VENV)/installed-dev,lint)
+ifdef FILES
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m "not slow" $(FILES)
+else
 	$(BIN)/sgsst weights fetch vgg16
 	$(BIN)/python -m sgsst_core.bench.device_checks
 	$(PYTEST) -m "not slow"
+endif
 
 # Run the slow tests: kills, chains of requests, whole runs, the wheel.
 test-slow: $(VENV)/installed-dev
