@@ -47,6 +47,8 @@ LARGE_COEFFICIENT = 20.0
 FAR_WORLD = 1e4
 #: Total blend weight below which a Gaussian changes no view by a gray level.
 HARDLY_SEEN = 1.0 / 255.0
+#: Total blend weight below which a Gaussian is in no view; sums of weights are 0 or much larger.
+_NO_WEIGHT = 1e-300
 #: Fields of view in degrees above and below which a view is reported. Above `WIDE`, perspective varies so much within
 #: one Gaussian that its linear approximation is inaccurate.
 WIDE, NARROW = 140.0, 1.0
@@ -108,18 +110,19 @@ def findings_of(
     return [*findings, *(finding for image in images for finding in style_findings(image, cameras))]
 
 
-#: Function that checks a slice of n Gaussians. For each question, it returns a mask [n] bool of extreme Gaussians and
-#: the checked values [n] of all Gaussians.
-_Check = Callable[[slice], Sequence[tuple[Tensor, Tensor]]]
-
-
 @dataclass(frozen=True)
 class _Question:
-    """Property checked for every Gaussian; its worst value is the largest if `largest` is set, else the smallest."""
+    """Property of Gaussians that is extreme above a bound, or below it.
+
+    Attributes:
+        value: Function that returns the values [n] of a slice of n Gaussians. NaN is never extreme.
+    """
 
     what: str
     done: str
-    largest: bool = True
+    value: Callable[[slice], Tensor]
+    bound: float
+    below: bool = False
 
 
 def scene_findings(file: SceneFile) -> list[Finding]:
@@ -134,106 +137,83 @@ def scene_findings(file: SceneFile) -> list[Finding]:
     if file.clamped:
         done = "read as almost 0 or 1, as in compressed formats; the stylized PLY keeps them"
         findings.append(Finding("scene", "infinite opacity", file.clamped, total, "", done))
-    for check, questions in (_rotations(scene), _sizes(scene, extent), _opacities(scene)):
-        findings += _asked("scene", file, check, questions)
-    done = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
-    reached = "; --target-loss may be reached at once, because they raise the initial loss"
-    for name, values, what_else in (("DC", scene.sh_dc, reached), ("higher", scene.sh_rest, "")):
-        if values.shape[1]:
-            question = _Question(f"{name} SH coefficients above {LARGE_COEFFICIENT:g}", done + what_else)
-            findings += _asked("scene", file, _large_coefficients(values), [question])
+    for question in _questions(scene, extent):
+        findings += _asked("scene", file, question)
     return findings + _far_from_origin(file, center, extent)
 
 
-def _asked(subject: Subject, file: SceneFile, check: _Check, questions: Sequence[_Question]) -> list[Finding]:
-    """Check the scene slice by slice; return one finding per question with at least one extreme Gaussian.
-
-    Slices avoid a float64 copy of the whole scene.
-    """
-    total, retained = len(file.scene), file.retained
-    counts = [0] * len(questions)
-    worst = [(-math.inf, -1, math.nan)] * len(questions)  # (value to compare, Gaussian, value)
-    for part in _parts(total):
-        for number, (extreme, value) in enumerate(check(part)):
-            count = int(extreme.sum())
-            if count:
-                counts[number] += count
-                order = value.double() if questions[number].largest else -value.double()
-                index = int(torch.where(extreme, order, -math.inf).argmax())
-                extreme_value = (float(order[index]), part.start + index, float(value[index]))
-                if worst[number][1] < 0 or extreme_value[0] > worst[number][0]:
-                    worst[number] = extreme_value
-    rows = [at if retained is None or at < 0 else int(np.flatnonzero(retained)[at]) for _, at, _ in worst]
-    return [
-        Finding(subject, ask.what, count, total, f"Gaussian {row}: {value:.3g}", ask.done)
-        for ask, count, row, (_, _, value) in zip(questions, counts, rows, worst, strict=True)
-        if count
-    ]
-
-
-def _rotations(scene: Scene) -> tuple[_Check, list[_Question]]:
+def _questions(scene: Scene, extent: float) -> list[_Question]:
     low, high = QUATERNION_LENGTHS
+    sh_rest = scene.sh_rest
+    sizes = sh_rest.largest() if isinstance(sh_rest, StoredHarmonics) else None
 
-    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-        length = scene.quats[part].double().norm(dim=1)
-        return [(length < low, length), (length > high, length)]
+    def length(part: slice) -> Tensor:
+        return scene.quats[part].double().norm(dim=1)
+
+    def longest(part: slice) -> Tensor:
+        return scene.scales[part].double().amax(dim=1)
+
+    def relative(part: slice) -> Tensor:
+        return (longest(part) - math.log(extent)).clamp(-700, 700).exp()
+
+    def slender(part: slice) -> Tensor:
+        logarithms = scene.scales[part].double().sort(dim=1).values
+        return (logarithms[:, 2] - logarithms[:, 1]).clamp_max(700).exp()
+
+    def if_drawn(value: Callable[[slice], Tensor]) -> Callable[[slice], Tensor]:
+        return lambda part: torch.where(longest(part) <= OVERFLOW_SCALE, value(part), math.nan)
+
+    def opacity(part: slice) -> Tensor:
+        return scene.opacities[part].double().sigmoid()
+
+    def dc(part: slice) -> Tensor:
+        return scene.sh_dc[part].abs().amax(dim=1)
+
+    def higher(part: slice) -> Tensor:
+        return sizes[part] if sizes is not None else scene.sh_rest[part].flatten(1).abs().amax(dim=1)
 
     normalized = "normalized in float64, like all quaternions"
-    return check, [
-        _Question(f"quaternion shorter than {low:g}", normalized, largest=False),
-        _Question(f"quaternion longer than {high:g}", normalized),
-    ]
-
-
-def _sizes(scene: Scene, extent: float) -> tuple[_Check, list[_Question]]:
-    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-        logarithms = scene.scales[part].double().sort(dim=1).values
-        longest, middle = logarithms[:, 2], logarithms[:, 1]
-        drawn = longest <= OVERFLOW_SCALE
-        relative = (longest - math.log(extent)).clamp(-700, 700).exp()
-        slender = (longest - middle).clamp_max(700).exp()
-        return [
-            (~drawn, longest),
-            ((relative > LARGE_SCALE) & drawn, relative),
-            (relative < SMALL_SCALE, relative),
-            ((slender > NEEDLE) & drawn, slender),
-        ]
-
     covers = "drawn; each may cover all raster tiles of all views, which costs time and memory"
     small = f"smaller than {SMALL_SCALE:g} of the scene's extent (value: fraction)"
     needles = f"needles more than {NEEDLE:g} times as long as thick (value: ratio)"
     exact = "drawn exactly: the determinant is a sum of positive terms, so nothing cancels"
-    return check, [
-        _Question("size that overflows (value: its logarithm)", "never drawn"),
-        _Question("longer than the scene's extent (value: ratio)", covers),
-        _Question(small, "drawn as a point, blurred over one pixel", largest=False),
-        _Question(needles, exact),
+    cubed = "unchanged; gradients grow with their third power, and a job stops if a gradient exceeds 1e19"
+    reached = "; --target-loss may be reached at once, because they raise the initial loss"
+    large = f"SH coefficients above {LARGE_COEFFICIENT:g}"
+    questions = [
+        _Question(f"quaternion shorter than {low:g}", normalized, length, low, below=True),
+        _Question(f"quaternion longer than {high:g}", normalized, length, high),
+        _Question("size that overflows (value: its logarithm)", "never drawn", longest, OVERFLOW_SCALE),
+        _Question("longer than the scene's extent (value: ratio)", covers, if_drawn(relative), LARGE_SCALE),
+        _Question(small, "drawn as a point, blurred over one pixel", relative, SMALL_SCALE, below=True),
+        _Question(needles, exact, if_drawn(slender), NEEDLE),
+        _Question("opacity below 1/255", "neither drawn nor optimized", opacity, ALPHA_MIN, below=True),
+        _Question(
+            f"opacity above {ALPHA_MAX:g}", f"drawn with opacity {ALPHA_MAX:g}, as in training", opacity, ALPHA_MAX
+        ),
+        _Question(f"DC {large}", cubed + reached, dc, LARGE_COEFFICIENT),
     ]
+    return (
+        [*questions, _Question(f"higher {large}", cubed, higher, LARGE_COEFFICIENT)] if sh_rest.shape[1] else questions
+    )
 
 
-def _opacities(scene: Scene) -> tuple[_Check, list[_Question]]:
-    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-        opacity = scene.opacities[part].double().sigmoid()
-        return [(opacity < ALPHA_MIN, opacity), (opacity > ALPHA_MAX, opacity)]
-
-    return check, [
-        _Question("opacity below 1/255", "neither drawn nor optimized", largest=False),
-        _Question(f"opacity above {ALPHA_MAX:g}", f"drawn with opacity {ALPHA_MAX:g}, as in training"),
-    ]
-
-
-def _large_coefficients(values: Tensor | StoredHarmonics) -> _Check:
-    """Return a check for large SH coefficients in values [N, K, 3]."""
-    if isinstance(values, StoredHarmonics):
-        sizes = values.largest()
-        return lambda part: [(sizes[part] > LARGE_COEFFICIENT, sizes[part])]
-    held = values
-
-    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-        size = held[part].flatten(1).abs().amax(dim=1)
-        return [(size > LARGE_COEFFICIENT, size)]
-
-    return check
+def _asked(subject: Subject, file: SceneFile, question: _Question) -> list[Finding]:
+    """Return a finding if at least one Gaussian is extreme. Slices avoid a float64 copy of the whole scene."""
+    sign = -1.0 if question.below else 1.0
+    count, worst, index = 0, -math.inf, -1
+    for part in _parts(len(file.scene)):
+        values = sign * question.value(part).double()
+        values = torch.where(values > sign * question.bound, values, -math.inf)
+        count += int((values > -math.inf).sum())
+        largest = int(values.argmax())
+        if float(values[largest]) > worst:
+            worst, index = float(values[largest]), part.start + largest
+    if not count:
+        return []
+    row = index if file.retained is None else int(np.flatnonzero(file.retained)[index])
+    text = f"Gaussian {row}: {sign * worst:.3g}"
+    return [Finding(subject, question.what, count, len(file.scene), text, question.done)]
 
 
 def _far_from_origin(file: SceneFile, center: Tensor, extent: float) -> list[Finding]:
@@ -369,16 +349,15 @@ def _uncovered(fractions: list[float], cameras: Sequence[Camera]) -> list[Findin
 
 def _seldom_seen(file: SceneFile, blend_weights: Tensor) -> list[Finding]:
     """Report Gaussians that are hardly or never seen, given their total blend weights [N]."""
-
-    def check(part: slice) -> list[tuple[Tensor, Tensor]]:
-        weights = blend_weights[part]
-        return [(weights == 0, weights), ((weights > 0) & (weights < HARDLY_SEEN), weights)]
-
     unseen = "neither drawn nor optimized; their colors follow their neighbors' at the end (preset paper: unchanged)"
     what = "hardly seen: blend weights of all pixels sum to less than 1/255 (value: sum)"
     done = "optimized at the same rate as all others; their colors may be extreme from other viewpoints"
-    questions = [_Question("in no view", unseen), _Question(what, done, largest=False)]
-    return _asked("views", file, check, questions)
+    seen = torch.where(blend_weights > 0, blend_weights, math.nan)
+    questions = [
+        _Question("in no view", unseen, lambda part: blend_weights[part], _NO_WEIGHT, below=True),
+        _Question(what, done, lambda part: seen[part], HARDLY_SEEN, below=True),
+    ]
+    return [finding for question in questions for finding in _asked("views", file, question)]
 
 
 def style_findings(style: Tensor, cameras: Sequence[Camera]) -> list[Finding]:

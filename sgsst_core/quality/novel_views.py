@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from sgsst_core.budget import Cache, tensor_bytes
-from sgsst_core.errors import SettingsError
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import StyleTargets
 from sgsst_core.planning.survey import sees_something
@@ -81,7 +80,6 @@ class NovelViews:
         style_targets: Function that returns the style targets of `loss` for views of a camera's size.
         weighted: Whether to weight statistics by rendered coverage, as the job does.
         lpips: LPIPS network; None skips LPIPS.
-        first: `NovelViewMoment.gram` of the run's first measurement, for a resumed run; None if there is none yet.
         most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
         memory: Memory budget in bytes for coverage, colors, warps and images. What does not fit is recomputed.
         rasterizer_of: Function that creates a rasterizer for a sample of the Gaussians; see `choose_novel_cameras`.
@@ -106,7 +104,6 @@ class NovelViews:
         *,
         weighted: bool,
         lpips: Lpips | None = None,
-        first: dict[int, float] | None = None,
         most: int = MAX_VIEWS,
         memory: int = 1 << 29,
         rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
@@ -116,7 +113,7 @@ class NovelViews:
         self.rasterizer = rasterizer
         self.lpips = lpips
         self.weighted = weighted
-        self.first = first
+        self.first: dict[int, float] | None = None
         self._style_targets = style_targets
         self._maps = maps
         self._loss = SosLoss(
@@ -299,13 +296,7 @@ def consistency(
 
 
 def view_pairs(count: int, gap: int, at_most: int | None = None) -> list[tuple[int, int]]:
-    """Return all pairs (i, i + gap) of `count` views, or at most `at_most` evenly spread ones.
-
-    Raises:
-        SettingsError: If `gap` or `at_most` is below 1.
-    """
-    if gap < 1 or (at_most is not None and at_most < 1):
-        raise SettingsError(f"Pairs of views {gap} apart, at most {at_most}: both numbers must be at least 1.")
+    """Return all pairs (i, i + gap) of `count` views, or at most `at_most` evenly spread ones."""
     firsts = range(max(count - gap, 0))
     return [(i, i + gap) for i in (firsts if at_most is None else spread(firsts, at_most))]
 

@@ -300,11 +300,6 @@ def novel_view_moments(report: dict[str, Any]) -> list[dict[str, Any]]:
     return (report.get("novel_views") or {}).get("moments") or []
 
 
-def consistency_at(moment: dict[str, Any], reach: str) -> dict[str, Any]:
-    """Return a moment's consistency at a range, "short" or "long"; empty if it has none."""
-    return (moment.get("consistency") or {}).get(reach) or {}
-
-
 def moment_positions(moments: Sequence[dict[str, Any]], against: Against) -> Floats:
     """Return the x positions [n] of measurements."""
     return column([moment.get("seconds" if against == "seconds" else "step") for moment in moments])
@@ -366,9 +361,6 @@ def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
 
 #: Size in inches. At this width, text is legible on a phone, and two charts fit side by side on a desktop screen.
 _WIDTH, _HEIGHT = 5.6, 3.5
-_REACHES = {"short": color_of(0), "long": color_of(1)}
-#: Labels of the y axes of consistency; both have no unit.
-_METRICS = {"rmse": "RMSE of colors, 0 to 1", "lpips": "LPIPS"}
 
 
 @dataclass(frozen=True)
@@ -392,7 +384,6 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
         return []
     history = history_of(report)
     moments = novel_view_moments(report)
-    probes = (report.get("approximations") or {}).get("moments") or []
     losses = column([terms["total"] for record in report["history"] for terms in record["scales"].values()])
     undrawn, caption = int((~drawable(losses)).sum()), "Loss, divided by that of the unstylized scene."
     if undrawn:  # a logarithmic axis cannot show them
@@ -401,17 +392,6 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
     figures = [_figure("loss", "Loss, relative to the start", caption, draw)]
     caption, draw = "The loss of a scale is the sum of these terms.", partial(_draw_split, history=history)
     figures.append(_figure("split", "Terms of the loss", caption, draw, rows=math.ceil(len(history.terms) / 2)))
-    if any(np.isfinite(_consistency(moments, reach, metric)[1:]).any() for reach in _REACHES for metric in _METRICS):
-        caption = (
-            "Difference between a view and another one that is warped into it. Dashed: the unstylized scene, "
-            "whose views also differ, by highlights."
-        )
-        draw = partial(_draw_consistency, history=history, moments=moments)
-        figures.append(_figure("consistency", "Consistency of novel views", caption, draw))
-    if drawable(column([probe.get("relative_error") for probe in probes])).any():
-        caption = "Norm of the error, relative to the norm of the exact gradient, on a sampled view."
-        draw = partial(_draw_approximations, history=history, probes=probes)
-        figures.append(_figure("approximations", "Error of the approximated gradient", caption, draw))
     if np.isfinite(history.memory).any():
         predicted = (report.get("plan") or {}).get("prediction") or {}
         draw = partial(_draw_memory, history=history, predicted=predicted)
@@ -419,12 +399,6 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
         caption += "; on the GPU, the peak so far." if np.isfinite(history.device_memory).any() else "."
         figures.append(_figure("memory", "Memory", caption, draw))
     return figures
-
-
-def _consistency(moments: Sequence[dict[str, Any]], reach: str, metric: str) -> Floats:
-    """Return a metric at each moment [n], with NaN for missing and infinite values."""
-    values = column([consistency_at(moment, reach).get(metric) for moment in moments])
-    return np.where(np.isfinite(values), values, math.nan)
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[Figure, Against], None], rows: int = 1) -> PageFigure:
@@ -460,40 +434,6 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
     for axes in grid[count:]:
         axes.set_visible(False)
     draw_legend(figure, in_row=4)
-
-
-def _draw_consistency(figure: Figure, against: Against, history: History, moments: Sequence[dict[str, Any]]) -> None:
-    known = {name: [np.isfinite(_consistency(moments, reach, name)).any() for reach in _REACHES] for name in _METRICS}
-    metrics = [metric for metric in _METRICS if any(known[metric])]
-    x = moment_positions(moments, against)
-    panels = figure.subplots(1, len(metrics), squeeze=False)[0]
-    for axes, metric in zip(panels, metrics, strict=True):
-        for reach, color in _REACHES.items():
-            values = _consistency(moments, reach, metric)
-            shown = drawable(x) & np.isfinite(values)
-            gap = next(filter(None, (consistency_at(moment, reach).get("gap") for moment in moments)), None)
-            label = f"{reach} range" if gap is None else f"{reach} range ({gap} view{'s' if gap > 1 else ''} apart)"
-            options = {"marker": "o", "markersize": 4, "color": color, "label": label}
-            draw_points(axes, x[shown], values[shown], **options)
-            if moments[0].get("step") == 0 and np.isfinite(values[0]):
-                axes.axhline(values[0], color=color, linestyle="--", linewidth=1)
-        axes.set_ylabel(_METRICS[metric])
-        axes.set_ylim(bottom=0)
-        set_log_x(axes, history.limits[against], against)
-    draw_legend(figure)
-
-
-def _draw_approximations(figure: Figure, against: Against, history: History, probes: Sequence[dict[str, Any]]) -> None:
-    axes = figure.subplots()
-    steps = column([probe.get("step") for probe in probes])
-    # A probe's `seconds` is the duration of one gradient. Its position on the time axis is interpolated from its step.
-    x = steps if against == "steps" else np.interp(steps, history.x["steps"], history.x["seconds"])
-    errors = column([probe.get("relative_error") for probe in probes])
-    shown = drawable(x) & drawable(errors)
-    draw_points(axes, x[shown], errors[shown], marker="o", markersize=4, color=color_of(0))
-    set_log_x(axes, history.limits[against], against)
-    set_log_y(axes, [errors])
-    axes.set_ylabel("relative error")
 
 
 def _draw_memory(figure: Figure, against: Against, history: History, predicted: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
-from sgsst_core.report.charts import AGAINST, BINS, consistency_at, draw_figures, novel_view_moments, round_length
+from sgsst_core.report.charts import AGAINST, BINS, draw_figures, novel_view_moments, round_length
 from sgsst_core.report.images import ON_DARK, PAGE
 
 #: Maximum number of list members shown in the collapsed section, followed by their total number.
@@ -195,6 +195,11 @@ def loss_table(report: dict[str, Any]) -> Table:
     )
 
 
+def consistency_at(moment: dict[str, Any], reach: str) -> dict[str, Any]:
+    """Return a moment's consistency at a range, "short" or "long"; empty if it has none."""
+    return (moment.get("consistency") or {}).get(reach) or {}
+
+
 def novel_views_table(report: dict[str, Any]) -> Table | None:
     """Return all measurements of novel views, without empty columns; None if there are none."""
     moments = novel_view_moments(report)
@@ -289,10 +294,10 @@ def finding_table(report: dict[str, Any]) -> Table | None:
 
 def approximation_table(report: dict[str, Any]) -> Table | None:
     """Return all comparisons of the job's gradient with the exact one; None if there are none."""
-    names, rows = report["cameras"]["names"], []
+    rows = []
     for entry in (report.get("approximations") or {}).get("moments") or []:
-        view, taken, exact = entry["view"], entry.get("seconds"), entry.get("seconds_exact")
-        row = [f"{entry['step']:,}", names[view] if isinstance(view, int) and 0 <= view < len(names) else str(view)]
+        taken, exact = entry.get("seconds"), entry.get("seconds_exact")
+        row = [f"{entry['step']:,}", entry["view"]]
         row += [number(entry.get("relative_error")), number(entry.get("cosine"), 6), duration(taken), duration(exact)]
         rows.append([*row, number(exact / taken if taken and exact is not None else None)])
     errors = ["relative error of the gradient", "cosine to the exact gradient"]

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from benchmarks.stability.sos_reference import box_average_reference, features_reference
 from sgsst_core.constants import COARSEST_SHORTER_SIDE, COLOR_OFFSET, SH_C0
-from sgsst_core.errors import SettingsError
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import GRAM_WEIGHT
@@ -260,8 +259,6 @@ def test_gram_distance_is_relative_to_the_first_measurement(network):
     gray = measured.measure(torch.zeros_like(scene.sh_dc))
     assert gray.gram_relative == pytest.approx(gray.gram[0] / first.gram[0])
     assert abs(gray.gram_relative - 1) > 0.1
-    resumed = novel_views(scene, views, network, first=first.gram)
-    assert resumed.measure(torch.zeros_like(scene.sh_dc)) == gray
 
 
 def test_caching_does_not_change_measurements(network, lpips):
@@ -587,9 +584,6 @@ def test_pairs_are_all_or_evenly_spread():
     assert view_pairs(2, 2) == view_pairs(0, 1) == []
     assert view_pairs(97, 7, at_most=3) == [(15, 22), (45, 52), (75, 82)]
     assert view_pairs(4, 1, at_most=9) == view_pairs(4, 1)
-    for gap, at_most in ((0, None), (-1, None), (1, 0)):
-        with pytest.raises(SettingsError, match="at least 1"):
-            view_pairs(5, gap, at_most)
 
 
 def test_incomparable_images_are_refused_by_name():

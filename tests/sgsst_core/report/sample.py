@@ -67,7 +67,7 @@ def sample_report(coarse: int = 6, sos: int = 12, scales: int = 2) -> dict[str, 
         "approximations": {
             "what": ["bfloat16 features", "half-precision blend weights"],
             "moments": [
-                {"step": step, "view": 1, "relative_error": e, "cosine": 0.97, "seconds": 0.5, "seconds_exact": 1.25}
+                {"step": step, "view": "b", "relative_error": e, "cosine": 0.97, "seconds": 0.5, "seconds_exact": 1.25}
                 for step, e in ((3, 0.21), (9, 0.24))
             ],
         },

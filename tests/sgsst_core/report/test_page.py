@@ -148,8 +148,8 @@ def test_sheet_is_embedded_unchanged() -> None:
 def test_every_figure_is_drawn_by_seconds_and_by_steps() -> None:
     page = sample_page()
     figures = [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
-    assert figures == ["loss", "split", "consistency", "approximations", "memory"]
-    labels = {"loss, relative to the unstylized scene", "RMSE of colors, 0 to 1", "relative error", "memory in GB"}
+    assert figures == ["loss", "split", "memory"]
+    labels = {"loss, relative to the unstylized scene", "memory in GB"}
     assert labels <= {piece.strip() for piece in page.pieces}
     used = set(re.findall(r"var\(--c-([0-9a-f]{6}), #\1\)", page.html))
     defined = dict(re.findall(r"--c-([0-9a-f]{6}): (#[0-9a-f]{6});", page.html))
@@ -283,7 +283,6 @@ def test_novel_views_without_values_are_shown() -> None:
     for record in report["history"]:
         del record["memory_bytes"]
     page = parsed(report)
-    assert "consistency" not in [attributes["id"] for tag, attributes in page.elements if tag == "figure"]
     assert "They were not compared with the exact gradient." in page.text
     report["novel_views"]["moments"] = []
     parsed_without_figures(report)
