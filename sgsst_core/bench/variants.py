@@ -60,6 +60,15 @@ if TYPE_CHECKING:
 SLICES = 32
 #: Numbers of slices after which the variants are evaluated.
 MOMENTS = (1, 2, 4, 8, 16, 32)
+#: Markers of curves. Their number (7) and the number of colors (6) have no common divisor, so up to 42 variants have
+#: distinct combinations of marker and color.
+_MARKERS = "osD^vP*"
+#: Measures of the judgment that the plot shows, with their titles.
+_JUDGED = {"style": "distance from the style (AlexNet)", "color_distance": "color distance"}
+#: Names of the outcomes that are judged for comparison with the variants.
+UNSTYLIZED, TRANSFER = "unstylized", "transfer"
+#: Number of views in each row of the contact sheet.
+_SHOWN = 3
 
 
 @dataclass(frozen=True)
@@ -275,15 +284,6 @@ def as_dict(curves: Sequence[Curve]) -> dict[str, Any]:
     }
 
 
-#: Markers of curves. Their number (7) and the number of colors (6) have no common divisor, so up to 42 variants have
-#: distinct combinations of marker and color.
-_MARKERS = "osD^vP*"
-
-
-#: Measures of the judgment that the plot shows, with their titles.
-_JUDGED = {"style": "distance from the style (AlexNet)", "color_distance": "color distance"}
-
-
 def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
     """Write a PNG of loss and judgments against seconds on logarithmic axes.
 
@@ -293,28 +293,25 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
         OutputError: If the file cannot be written.
     """
     shown = [curve for curve in curves if curve.points]
-    scales = sorted({scale for curve in shown for point in curve.points for scale in point.by_scale})
-    measures = _JUDGED if any(point.judgment for curve in shown for point in curve.points) else {}
-    with png_chart(path, (5.2 * (1 + len(scales) + len(measures)), 4.8)) as figure:
-        mean, *panels = figure.subplots(1, 1 + len(scales) + len(measures), squeeze=False)[0]
-        losses = [_draw_curves(mean, shown, "mean of the scales", lambda point: point.relative)]
-        for axes, scale in zip(panels, scales, strict=False):
-
-            def loss(point: Point, scale: int = scale) -> float | None:
-                return point.by_scale.get(scale)
-
-            losses.append(_draw_curves(axes, shown, scale_name(scale), loss))
-        for axes in (mean, *panels[: len(scales)]):
-            set_log_y(axes, losses)
-        for axes, (name, what) in zip(panels[len(scales) :], measures.items(), strict=True):
-
-            def judged(point: Point, name: str = name) -> float | None:
-                return getattr(point.judgment, name, None)
-
-            set_log_y(axes, [_draw_curves(axes, shown, what, judged)])
+    points = [point for curve in shown for point in curve.points]
+    panels: list[tuple[str, Callable[[Point], float | None]]] = [("mean of the scales", lambda point: point.relative)]
+    panels += [
+        (scale_name(scale), lambda point, scale=scale: point.by_scale.get(scale))
+        for scale in sorted({scale for point in points for scale in point.by_scale})
+    ]
+    losses = len(panels)
+    if any(point.judgment for point in points):
+        panels += [
+            (what, lambda point, name=name: getattr(point.judgment, name, None)) for name, what in _JUDGED.items()
+        ]
+    with png_chart(path, (5.2 * len(panels), 4.8)) as figure:
+        every = figure.subplots(1, len(panels), squeeze=False)[0]
+        drawn = [_draw_curves(axes, shown, *panel) for axes, panel in zip(every, panels, strict=True)]
+        for index, axes in enumerate(every):
+            set_log_y(axes, drawn[:losses] if index < losses else [drawn[index]])
         front = [point for _, point in pareto_front(shown)]
-        mean.plot([p.seconds for p in front], [p.relative for p in front], "--", color=INK, lw=2.5, alpha=0.35)
-        mean.set_ylabel(RELATIVE_LOSS)
+        every[0].plot([p.seconds for p in front], [p.relative for p in front], "--", color=INK, lw=2.5, alpha=0.35)
+        every[0].set_ylabel(RELATIVE_LOSS)
         draw_legend(figure, in_row=7)
         figure.suptitle(f"{title} (dashed: Pareto front)")
 
@@ -329,12 +326,6 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str, value: Callabl
     set_log_x(axes, log_limits(joined(seconds), X_MARGIN), "seconds of optimization")
     axes.set_title(title)
     return joined(values)
-
-
-#: Names of the outcomes that are judged for comparison with the variants.
-UNSTYLIZED, TRANSFER = "unstylized", "transfer"
-#: Number of views in each row of the contact sheet.
-_SHOWN = 3
 
 
 @dataclass(frozen=True)

@@ -58,12 +58,6 @@ class Measurements:
         """Exact loss and gradient of the job."""
         return Float32Reference(self._stylizer, measuring_memory(self._stylizer.job.memory))
 
-    @cached_property
-    def _seen_by(self) -> tuple[Scene, Rasterizer]:
-        """Scene of the novel views, and its rasterizer."""
-        scene = self._stylizer.job.scene.without_zero_bands()
-        return scene, rasterizer_beside(self._stylizer, scene)
-
     def evaluate(self, *, unstylized: bool = False) -> Evaluation:
         """Return the exact loss on the evaluation views, for the current colors or the unstylized scene."""
         stylizer = self._stylizer
@@ -113,7 +107,7 @@ class Measurements:
     @cached_property
     def _novel_views(self) -> NovelViews:
         """Novel views of the job."""
-        stylizer, (scene, rasterizer) = self._stylizer, self._seen_by
+        stylizer, scene = self._stylizer, self._stylizer.job.scene.without_zero_bands()
         # Features that define Gram distances are float32, and have Gram statistics even if the job optimizes another
         # loss.
         source: StylizationJob | ExactLoss = stylizer.job
@@ -121,34 +115,46 @@ class Measurements:
             source = ExactLoss(stylizer, "sos")
         elif stylizer.job.plan.precision not in WHOLE_FLOAT32:
             source = self.exact
-        return NovelViews(
-            stylizer.job.views.cameras,
-            stylizer.job.views.covered,
+        rasterizer = rasterizer_beside(stylizer, scene)
+        return make_novel_views(
+            stylizer,
             scene,
             rasterizer,
-            source.loss,
-            source.style_targets,
-            weighted=stylizer.job.plan.weighted,
+            source,
             lpips=load_lpips_or_none(stylizer.job.network.device),
-            memory=measuring_memory(stylizer.job.memory),
             most=stylizer.job.plan.novel_views,
             rasterizer_of=partial(rasterizer_beside, stylizer),
             maps=stylizer.job.styles.maps(rasterizer),
         )
 
 
-def make_novel_views(stylizer: Stylizer) -> NovelViews:
-    """Create the novel views of a job, with all Gaussians of its scene."""
-    exact = ExactLoss(stylizer, "sos")
+def make_novel_views(
+    stylizer: Stylizer,
+    scene: Scene | None = None,
+    rasterizer: Rasterizer | None = None,
+    source: StylizationJob | ExactLoss | None = None,
+    **options: Any,
+) -> NovelViews:
+    """Create the novel views of a job.
+
+    Args:
+        scene: Scene to show; None for that of the job.
+        rasterizer: Rasterizer of the scene; None for one beside the job's.
+        source: Loss and targets of the Gram distance; None for the paper's loss in float32.
+        options: Further arguments of `NovelViews`.
+    """
+    job = stylizer.job
+    scene, source = scene or job.scene, source or ExactLoss(stylizer, "sos")
     return NovelViews(
-        stylizer.job.views.cameras,
-        stylizer.job.views.covered,
-        stylizer.job.scene,
-        rasterizer_beside(stylizer, stylizer.job.scene),
-        exact.loss,
-        exact.style_targets,
-        weighted=stylizer.job.plan.weighted,
-        memory=measuring_memory(stylizer.job.memory),
+        job.views.cameras,
+        job.views.covered,
+        scene,
+        rasterizer or rasterizer_beside(stylizer, scene),
+        source.loss,
+        source.style_targets,
+        weighted=job.plan.weighted,
+        memory=measuring_memory(job.memory),
+        **options,
     )
 
 
