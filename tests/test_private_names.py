@@ -30,31 +30,46 @@ def test_only_listed_modules_use_private_names() -> None:
     )
 
 
-def ray_worker() -> str:
-    """Return the source of Ray's driver module.
-
-    Ray itself is not imported, because it reads its authentication mode at import.
-    """
-    spec = importlib.util.find_spec("ray")
+def source(package: str, file: str) -> str:
+    """Return a file of a package that is not imported: Ray reads its authentication mode at import."""
+    spec = importlib.util.find_spec(package)
     assert spec is not None
     assert spec.origin is not None
-    return (Path(spec.origin).parent / "_private" / "worker.py").read_text()
+    return (Path(spec.origin).parent / file).read_text()
 
 
-def test_ray_print_function_is_replaceable() -> None:
-    assert "\ndef print_to_stdstream(" in ray_worker(), (
-        "Ray's driver prints the errors of its processes by another function now. Find what writes them to standard "
-        "output, and replace that one in worker/ranks/cluster.py."
-    )
+WORKER, HTTPTOOLS = ("ray", "_private/worker.py"), ("uvicorn", "protocols/http/httptools_impl.py")
+FOLDER = (
+    "Find what took its place, and change worker/ranks/cluster.py: without a folder of its own, what a killed Ray "
+    "leaves behind cannot be swept away; without 127.0.0.1, Ray listens on the network."
+)
+LOOPBACK = (
+    "Find what keeps Ray from replacing 127.0.0.1 by an address that others reach, and change worker/ranks/cluster.py; "
+    "tests/worker/ranks/test_sockets.py lists the sockets."
+)
+PRINTS = (
+    "Ray's driver prints the errors of its processes by another function now. Find what writes them to standard "
+    "output, and replace that one in worker/ranks/cluster.py."
+)
+ANSWER = "Find how api/http/connection.py can tell whether an answer is open."
+STATE = "Find what api/http/connection.py can read instead."
 
 
-@pytest.mark.parametrize("option", ["_temp_dir", "_node_ip_address"])
-def test_ray_init_accepts_folder_and_address(option: str) -> None:
-    assert f'"{option}"' in ray_worker(), (
-        f"ray.init no longer knows {option}. Find what took its place, and change worker/ranks/cluster.py: "
-        "without a folder of its own, what a killed Ray leaves behind cannot be swept away; without 127.0.0.1, Ray "
-        "listens on the network."
-    )
+@pytest.mark.parametrize(
+    ("where", "text", "remedy"),
+    [
+        (WORKER, "\ndef print_to_stdstream(", PRINTS),
+        (WORKER, '"_temp_dir"', FOLDER),
+        (WORKER, '"_node_ip_address"', FOLDER),
+        (("ray", "_private/ray_constants.py"), '"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"', LOOPBACK),
+        (("ray", "_private/services.py"), "ENABLE_RAY_CLUSTER", LOOPBACK),
+        *((HTTPTOOLS, f" self.{name}", STATE) for name in ("loop", "transport", "flow", "connections", "pipeline")),
+        *((HTTPTOOLS, f" self.{name}", STATE) for name in ("scope", "headers", "cycle")),
+        *((HTTPTOOLS, f" self.{name}", ANSWER) for name in ("body", "response_started", "response_complete")),
+    ],
+)
+def test_names_in_sources_exist(where: tuple[str, str], text: str, remedy: str) -> None:
+    assert text in source(*where), f"{'/'.join(where)} has no {text.strip()} any more. {remedy}"
 
 
 def test_numba_cache_save_method_is_replaceable() -> None:
@@ -66,22 +81,7 @@ def test_numba_cache_save_method_is_replaceable() -> None:
     )
 
 
-def test_ray_can_keep_the_loopback_address() -> None:
-    spec = importlib.util.find_spec("ray")
-    assert spec is not None
-    assert spec.origin is not None
-    sources = [
-        (Path(spec.origin).parent / "_private" / name).read_text() for name in ("ray_constants.py", "services.py")
-    ]
-    is_supported = '"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"' in sources[0] and "ENABLE_RAY_CLUSTER" in sources[1]
-    assert is_supported, (
-        "Ray no longer reads RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER. Find what keeps it from replacing 127.0.0.1 by an "
-        "address that others reach, and change worker/ranks/cluster.py; tests/worker/ranks/test_sockets.py lists the "
-        "sockets."
-    )
-
-
-def test_tcp_store_accepts_a_listening_socket() -> None:
+def test_names_of_pytorch_exist() -> None:
     import torch.distributed as dist
 
     store: Any = dist.TCPStore  # type: ignore[attr-defined]
@@ -90,11 +90,6 @@ def test_tcp_store_accepts_a_listening_socket() -> None:
         "change `_meet` in worker/ranks/process_group.py; else it listens on every interface, without "
         "authentication."
     )
-
-
-def test_process_group_device_can_be_reset() -> None:
-    import torch.distributed as dist
-
     assert isinstance(getattr(dist.ProcessGroup, "bound_device_id", None), property), (
         "A process group no longer has bound_device_id. Find how groups of some ranks are made without the others, and "
         "change `process_group` in worker/ranks/process_group.py; else GPU ranks hang once the plan has left some out."
@@ -125,24 +120,4 @@ def test_overridden_connection_methods_exist(method: str) -> None:
     assert method in vars(HttpToolsProtocol), (
         f"uvicorn's HTTP protocol has no {method} any more: api/http/connection.py overrides nothing there. Find what "
         "it is called now; tests/api/http/hostile shows whether heads are bounded again."
-    )
-
-
-@pytest.mark.parametrize(
-    "attribute", ["loop", "transport", "flow", "connections", "pipeline", "scope", "headers", "cycle"]
-)
-def test_connection_attributes_exist(attribute: str) -> None:
-    from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
-
-    assert f"self.{attribute}" in inspect.getsource(HttpToolsProtocol.__init__), (
-        f"uvicorn's HTTP protocol does not set {attribute} any more: find what api/http/connection.py can read instead."
-    )
-
-
-@pytest.mark.parametrize("attribute", ["body", "response_started", "response_complete"])
-def test_response_attributes_exist(attribute: str) -> None:
-    from uvicorn.protocols.http.httptools_impl import RequestResponseCycle
-
-    assert f"self.{attribute}" in inspect.getsource(RequestResponseCycle.__init__), (
-        f"uvicorn's answers have no {attribute} any more: find how api/http/connection.py can tell whether one is open."
     )
