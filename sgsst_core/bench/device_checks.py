@@ -102,17 +102,17 @@ def _caches() -> Iterator[Diagnosis]:
         triton: "TRITON_CACHE_DIR",
         **dict.fromkeys(kernel_folders(), "NUMBA_CACHE_DIR"),
     }
-    found = False
+    unwritable = False
     for folder, variable in variables.items():
         try:
             ensure_writable_folder(folder)
         except (OutputError, OSError):
-            found = True
+            unwritable = True
             text = f"{folder} cannot be written, so every process compiles or downloads again. Set {variable}."
             yield Diagnosis("cache", "warning", text)
     if not kernel_folders():
         yield Diagnosis("cache", "warning", "no folder for compiled kernels can be written. Set NUMBA_CACHE_DIR.")
-    elif not found:
+    elif not unwritable:
         yield Diagnosis("cache", "works", f"{cache_folder()} and the folders of compiled kernels can be written")
 
 
