@@ -1,6 +1,6 @@
 """Ahead-of-time compilation of all GPU kernels for real targets, without a GPU or driver, and their resource usage.
 
-    python -m benchmarks.triton_targets [--name triton_targets]
+    python -m benchmarks.triton_targets
 
 Triton's interpreter accepts code that does not compile, so both are needed: tests in the interpreter check the kernels'
 results, and this benchmark checks that they compile. Registers and spills are read from the compilers' output, and the
@@ -10,7 +10,6 @@ disassembler.
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import subprocess
@@ -26,7 +25,6 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from benchmarks.common import write_result
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, TRANSMITTANCE_MIN
 from sgsst_core.features import first_layer_kernels, statistics_kernels
 from sgsst_core.features import pooling_triton_kernels as pooling_kernels
@@ -304,10 +302,7 @@ def _of_amd(assembly: str) -> dict[str, int]:
 
 
 def main() -> int:
-    """Compile all kernels for all targets, then print and store the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--name", default=None, help="of the file in benchmarks/results; none is written without it")
-    arguments = parser.parse_args()
+    """Compile all kernels for all targets, and print the table."""
     if os.environ.get("TRITON_INTERPRET") == "1":
         print("TRITON_INTERPRET is set: kernels would be interpreted, not compiled", file=sys.stderr)
         return 2
@@ -316,8 +311,6 @@ def main() -> int:
     for name, targets in table.items():
         for target, used in targets.items():
             print(f"{name:<28}{target:<8}" + "  ".join(f"{key} {value}" for key, value in used.items()), flush=True)
-    if arguments.name:
-        write_result(arguments.name, {"triton": triton.__version__, "kernels": table})
     return 0
 
 

@@ -52,11 +52,6 @@ def test_second_seed_is_shown_but_never_chosen() -> None:
     assert "| second-seed (score -0.693, better on 2), mean | 2 |" in tables(pairs)
 
 
-def test_each_pair_is_shown_before_and_after() -> None:
-    row = tables({"demo, a": pair()}).splitlines()[2]
-    assert row == f"| demo, a |{' 2.000 → 1.000 |' * 3} 2.0 → 1.0 |  →  |  →  |"
-
-
 def test_choice_sees_neither_the_scene_nor_the_painting_left_out() -> None:
     """On the first pair's scene and painting, `cold` is far ahead; elsewhere `random` is, by little."""
     pairs = {

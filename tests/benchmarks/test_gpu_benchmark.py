@@ -21,19 +21,6 @@ ROOT = Path(__file__).resolve().parents[2]
 PASSES = {"forward_seconds", "backward_seconds"}
 
 
-def test_all_parts_together_take_less_than_twelve_minutes() -> None:
-    assert sum(seconds for _, seconds in PARTS.values()) < 720
-    assert list(PARTS)[:3] == ["job", "poison", "parity"]
-
-
-def test_findings_are_printed_at_once(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    findings = Findings(tmp_path / "findings.json")
-    findings.add("a/b", {"c": 0.5})
-    assert capfd.readouterr().out.split() == ["a/b/c", "0.5"]
-    findings.check("off", 2.0, 1.0)
-    assert findings.broken == ["off: 2 exceeds 1"]
-
-
 def benchmark(folder: Path, *options: str) -> tuple[int, dict[str, Any]]:
     """Run the benchmark; return its exit status and the written results."""
     out = folder / "gpu.json"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -69,21 +68,6 @@ def test_variants_are_evaluated_at_equal_times(
     values = json.loads(json.dumps(as_dict(curves)))
     assert set(values["variants"]) == set(names)
     assert values["pareto_front"]
-
-
-@pytest.mark.slow
-def test_points_are_results_of_jobs(tiny_weights: BackboneWeights) -> None:
-    """A variant that has finished repeats its last point; its colors are those of a job with the same settings."""
-    settings: dict[str, Any] = {"steps_coarse": 0, "steps_sos": 3}
-    scene, views = wall(), cameras(2, 48, 36)
-    (curve,) = error_time(scene, views, style(), choose_variants(["standard"]), 600.0, weights=tiny_weights, **settings)
-    assert [point.step for point in curve.points][-2:] == [3, 3]
-    assert len(curve.points) == 6
-    job = Stylizer.planned(scene, views, style(), make_settings(**settings), weights=tiny_weights)
-    while job.step < 3:
-        job.run_step()
-    assert curve.sh_dc is not None
-    assert torch.equal(curve.sh_dc, job.stylized())
 
 
 @pytest.mark.slow
