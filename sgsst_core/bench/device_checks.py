@@ -172,8 +172,8 @@ def _rasterizer(*, gpu: bool) -> tuple[str, Diagnosis]:
 def _results(rasterizer: str, device: torch.device) -> Iterator[Diagnosis]:
     """Yield a finding for each wrong result; if all are right, a single finding."""
     on_gpu = RASTERIZERS[rasterizer].on_gpu
-    where, sizes = (device, {}) if on_gpu else (torch.device("cpu"), {"repeats": 3, "channels": 16})
-    checks = list(check_device(rasterizer, where, **sizes))
+    cpu = torch.device("cpu")
+    checks = list(check_device(rasterizer, device) if on_gpu else check_device(rasterizer, cpu, repeats=3, channels=16))
     wrong = [check for check in checks if not check.passed]
     for check in wrong:
         text = f"wrong {check.name}: {check.error:.3g} exceeds {check.bound:.3g}"

@@ -15,6 +15,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -295,15 +296,11 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
     shown = [curve for curve in curves if curve.points]
     points = [point for curve in shown for point in curve.points]
     panels: list[tuple[str, Callable[[Point], float | None]]] = [("mean of the scales", lambda point: point.relative)]
-    panels += [
-        (scale_name(scale), lambda point, scale=scale: point.by_scale.get(scale))
-        for scale in sorted({scale for point in points for scale in point.by_scale})
-    ]
+    for scale in sorted({scale for point in points for scale in point.by_scale}):
+        panels += [(scale_name(scale), partial(_loss_of, scale))]
     losses = len(panels)
     if any(point.judgment for point in points):
-        panels += [
-            (what, lambda point, name=name: getattr(point.judgment, name, None)) for name, what in _JUDGED.items()
-        ]
+        panels += [(what, partial(_judged, name)) for name, what in _JUDGED.items()]
     with png_chart(path, (5.2 * len(panels), 4.8)) as figure:
         every = figure.subplots(1, len(panels), squeeze=False)[0]
         drawn = [_draw_curves(axes, shown, *panel) for axes, panel in zip(every, panels, strict=True)]
@@ -314,6 +311,14 @@ def write_plot(path: Path, curves: Sequence[Curve], title: str) -> None:
         every[0].set_ylabel(RELATIVE_LOSS)
         draw_legend(figure, in_row=7)
         figure.suptitle(f"{title} (dashed: Pareto front)")
+
+
+def _loss_of(scale: int, point: Point) -> float | None:
+    return point.by_scale.get(scale)
+
+
+def _judged(name: str, point: Point) -> float | None:
+    return getattr(point.judgment, name, None)
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str, value: Callable[[Point], float | None]) -> Floats:

@@ -144,11 +144,11 @@ def scene_findings(file: SceneFile) -> list[Finding]:
 
 def _questions(scene: Scene, extent: float) -> list[_Question]:
     low, high = QUATERNION_LENGTHS
-    sh_rest = scene.sh_rest
-    sizes = sh_rest.largest() if isinstance(sh_rest, StoredHarmonics) else None
+    rest = scene.sh_rest
+    stored = rest.largest() if isinstance(rest, StoredHarmonics) else None
 
     def length(part: slice) -> Tensor:
-        return scene.quats[part].double().norm(dim=1)
+        return torch.linalg.vector_norm(scene.quats[part].double(), dim=1)
 
     def longest(part: slice) -> Tensor:
         return scene.scales[part].double().amax(dim=1)
@@ -170,7 +170,10 @@ def _questions(scene: Scene, extent: float) -> list[_Question]:
         return scene.sh_dc[part].abs().amax(dim=1)
 
     def higher(part: slice) -> Tensor:
-        return sizes[part] if sizes is not None else scene.sh_rest[part].flatten(1).abs().amax(dim=1)
+        if isinstance(rest, Tensor):
+            return rest[part].flatten(1).abs().amax(dim=1)
+        assert stored is not None
+        return stored[part]
 
     normalized = "normalized in float64, like all quaternions"
     covers = "drawn; each may cover all raster tiles of all views, which costs time and memory"
@@ -193,9 +196,7 @@ def _questions(scene: Scene, extent: float) -> list[_Question]:
         ),
         _Question(f"DC {large}", cubed + reached, dc, LARGE_COEFFICIENT),
     ]
-    return (
-        [*questions, _Question(f"higher {large}", cubed, higher, LARGE_COEFFICIENT)] if sh_rest.shape[1] else questions
-    )
+    return [*questions, _Question(f"higher {large}", cubed, higher, LARGE_COEFFICIENT)] if rest.shape[1] else questions
 
 
 def _asked(subject: Subject, file: SceneFile, question: _Question) -> list[Finding]:

@@ -17,7 +17,7 @@ from sgsst_core.constants import COARSEST_SHORTER_SIDE, COLOR_OFFSET, SH_C0
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, layer_stride
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import GRAM_WEIGHT
-from sgsst_core.quality.judge import Lpips
+from sgsst_core.quality.judge import Lpips, shown
 from sgsst_core.quality.novel_views import (
     LONG_RANGE,
     MAX_VIEWS,
@@ -30,7 +30,6 @@ from sgsst_core.quality.novel_views import (
     find_warp,
     neighbors,
     project_pixels,
-    shown,
     view_pairs,
 )
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer

@@ -173,6 +173,8 @@ def test_hostile_names_are_escaped() -> None:
     report["scene"]["path"] = f"folder/{HOSTILE.replace('/', '∕')}.ply"
     report["styles"][0]["path"] = "<img src=x onerror=alert(1)>.jpg"
     report["cameras"]["names"][1] = HOSTILE
+    for moment in report["approximations"]["moments"]:
+        moment["view"] = HOSTILE
     report["cameras"]["seeing_nothing"] = [HOSTILE]
     report["findings"][0]["worst"] = HOSTILE
     report["plan"]["decisions"][0]["decision"] = HOSTILE
