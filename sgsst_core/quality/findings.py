@@ -148,7 +148,8 @@ def _questions(scene: Scene, extent: float) -> list[_Question]:
     stored = rest.largest() if isinstance(rest, StoredHarmonics) else None
 
     def length(part: slice) -> Tensor:
-        return torch.linalg.vector_norm(scene.quats[part].double(), dim=1)
+        norms: Tensor = torch.linalg.vector_norm(scene.quats[part].double(), dim=1)
+        return norms
 
     def longest(part: slice) -> Tensor:
         return scene.scales[part].double().amax(dim=1)
