@@ -58,19 +58,6 @@ def test_interrupted_job_is_measured_after_its_last_step(tiny_weights: BackboneW
     assert measured(stylizer, lambda: stylizer.step == 3) == [0, 3]
 
 
-def test_measured_views_are_shown(tiny_weights: BackboneWeights) -> None:
-    stylizer, shown = make(tiny_weights, measure=1.0), list[tuple[int, int]]()
-    measure = Measurements(stylizer, lambda done, total: shown.append((done, total)))
-    measure.at_the_end()
-    novel = stylizer.job.plan.novel_views
-    assert shown == [(done, novel) for done in range(novel)] * 2
-    shown.clear()
-    measure.evaluate(unstylized=True)
-    views = len(stylizer.job.evaluation_views)
-    assert shown == [(done, views) for done in range(views)]
-    assert (novel, views) == (2, 4)
-
-
 @pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
 def test_other_style_losses_are_measured_by_the_same_statistics(tiny_weights: BackboneWeights, style_loss: str) -> None:
     usual, other = (make(tiny_weights, style_loss=each) for each in ("sos", style_loss))
@@ -112,25 +99,6 @@ def test_float32_job_agrees_with_its_reference(tiny_weights: BackboneWeights) ->
     assert error.cosine == pytest.approx(1, abs=1e-6)
     expected = mean_loss(stylizer.evaluate([0, 1]))
     assert mean_loss(reference.evaluate([0, 1], stylizer.stylized())) == pytest.approx(expected, rel=1e-5)
-
-
-def test_initial_error_can_be_measured_later(tiny_weights: BackboneWeights) -> None:
-    """The error has the same value as if it was measured before the first step, and colors are not affected."""
-    stylizer = in_bfloat16(tiny_weights)
-    reference = Float32Reference(stylizer)
-    first = reference.gradient_error()
-    for _ in range(3):
-        stylizer.run_step()
-    colors = stylizer.sh_dc.clone()
-    late = reference.gradient_error(start=True)
-    assert (late.step, late.view, late.relative_error, late.cosine) == (
-        0,
-        first.view,
-        first.relative_error,
-        first.cosine,
-    )
-    assert torch.equal(stylizer.sh_dc, colors)
-    assert reference.gradient_error().relative_error != first.relative_error
 
 
 def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) -> None:

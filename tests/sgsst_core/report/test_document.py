@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import random
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +72,6 @@ def test_report_describes_the_job(finished: tuple[Stylizer, Evaluation, Evaluati
     assert report["memory"]["device_peak_bytes"] is report["plan"]["measured"]["device_bytes"] is None
     parts = sum(report["seconds_by_part"].values())
     assert 0.2 * report["seconds"] < parts <= report["seconds"] + 0.01
-
-
-def test_typical_step_is_the_median_of_those_with_as_many_scales(
-    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stylizer, before, after = finished
-    at = (9.0, 14.0, 16.0, 20.0, 22.0)  # steps take 9, 5, 2, 4 and 2 s; the first one includes the style
-    history = [replace(record, seconds=seconds) for record, seconds in zip(stylizer.history, at, strict=False)]
-    monkeypatch.setattr(stylizer, "history", history)
-    measured = build_report(stylizer, sources, "finished", before, after)["plan"]["measured"]
-    assert (measured["seconds"], measured["seconds_coarse"]) == (4.0, None)
 
 
 def test_report_has_the_losses_of_the_steps(
@@ -192,24 +180,6 @@ def test_loss_over_time_needs_steps(finished: tuple[Stylizer, Evaluation, Evalua
         assert loss_over_time(stylizer, {0: LossTerms(gram=8.0)}) is None
     finally:
         stylizer.history = history
-
-
-def test_coarse_steps_are_relative_to_their_own_scale(
-    finished: tuple[Stylizer, Evaluation, Evaluation], sources: Sources
-) -> None:
-    stylizer = finished[0]
-    before = {0: LossTerms(gram=6.0), 1: LossTerms(gram=2.0)}
-    history = stylizer.history
-    stylizer.history = [
-        StepRecord(1, "coarse", 0, 0.1, 1.0, {1: LossTerms(gram=1.0)}, {}, 0),
-        StepRecord(2, "sos", 0, 0.2, 1.0, {0: LossTerms(gram=1.0), 1: LossTerms(gram=1.0)}, {}, 0),
-    ]
-    try:
-        report = build_report(stylizer, sources, "finished", before, before)
-    finally:
-        stylizer.history = history
-    assert [entry["relative"] for entry in report["history"]] == [0.5, 0.25]
-    assert [report["steps"][stage]["done"] for stage in ("coarse", "sos")] == [1, 1]
 
 
 def test_contact_sheet_shows_the_stylized_views(

@@ -272,24 +272,6 @@ def test_reports_without_optional_parts_are_shown() -> None:
     assert "Loss over time" not in page.text
 
 
-def test_novel_views_without_values_are_shown() -> None:
-    report = sample_report()
-    for moment in report["novel_views"]["moments"]:
-        moment["consistency"] = {
-            "short": {"gap": 1, "pairs": 0, "compared": 0.0, "rmse": None, "lpips": None},
-            "long": None,
-        }
-        moment["gram_relative"] = math.nan
-    report["approximations"]["moments"] = []
-    report["loss_over_time"].update(reached=[], last_tenth=None)
-    for record in report["history"]:
-        del record["memory_bytes"]
-    page = parsed(report)
-    assert "They were not compared with the exact gradient." in page.text
-    report["novel_views"]["moments"] = []
-    parsed_without_figures(report)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("coarse", "sos"), [(1, 1), (0, 2)])
 def test_single_steps_are_drawn_as_markers(coarse: int, sos: int) -> None:

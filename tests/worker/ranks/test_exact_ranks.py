@@ -16,7 +16,7 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.features.vgg import HALO, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import TERMS, layers_of
-from sgsst_core.parallel.collectives import ALONE, Collectives
+from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange
 from sgsst_core.parallel.division import Divider, Piece, Shares, Tiling, divide
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
