@@ -22,7 +22,7 @@ from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.orbit.cameras import orbit
+from sgsst_core.orbit import orbit
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
 

@@ -45,8 +45,7 @@ from sgsst_core.loss.feature_scale import with_scales
 from sgsst_core.quality.judge import Judge, Lpips
 from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.regions.definition import Region, Regions
-from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.regions import Region, RegionMaps, Regions
 from sgsst_core.report.images import write_grid
 from sgsst_core.scales import EVEN
 from sgsst_core.scene.camera import Camera, spread

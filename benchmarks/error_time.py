@@ -19,7 +19,7 @@ from benchmarks.common import RESULTS
 from sgsst_core.bench.variants import MOMENTS, SLICES
 from sgsst_core.files.atomic import write_json
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.orbit.cameras import orbit
+from sgsst_core.orbit import orbit
 from sgsst_core.report.charts import (
     X_MARGIN,
     Floats,

@@ -23,7 +23,7 @@ from benchmarks.common import with_size, write_result
 from sgsst_core.bench.device_checks import surface_scene
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.orbit.cameras import orbit
+from sgsst_core.orbit import orbit
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer

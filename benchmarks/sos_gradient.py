@@ -27,7 +27,7 @@ from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import ContentDifference, StyleTarget, StyleTargets, content_factor, style_loss
 from sgsst_core.scales import scale_count
-from sgsst_core.scene.pyramid import add_upscaled_, downscale
+from sgsst_core.scene.colors import add_upscaled_, downscale
 from sgsst_core.style import Style
 
 #: Memory limit in bytes: enough to cache the activations of a 2048x2048 view, 1.3 KB per pixel in float32.

@@ -26,8 +26,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, TRANSMITTANCE_MIN
-from sgsst_core.features import first_layer_kernels, statistics_kernels
-from sgsst_core.features import pooling_triton_kernels as pooling_kernels
+from sgsst_core.features import triton_kernels as feature_kernels
 from sgsst_core.features.statistics import (
     FLUSH,
     POSITIONS,
@@ -38,9 +37,8 @@ from sgsst_core.features.statistics import (
 from sgsst_core.loss import terms
 from sgsst_core.loss import triton_kernels as loss_kernels
 from sgsst_core.loss.terms import CONTENT_POSITIONS, GRAM_WEIGHT, MEAN_WEIGHT, STD_WEIGHT
-from sgsst_core.rasterizer import triton_cached_kernels as cached_kernels
 from sgsst_core.rasterizer import triton_kernels as kernels
-from sgsst_core.scene import spherical_harmonics_triton_kernels as harmonics_kernels
+from sgsst_core.scene import triton_kernels as harmonics_kernels
 
 TARGETS = {
     "sm_80": GPUTarget("cuda", 80, 32),
@@ -77,7 +75,7 @@ _TYPES = {
     ),
     **dict.fromkeys(("total", "visible", "width", "height", "across"), "i32"),
 }
-_FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (cached_kernels.HALF_SCALE, "*fp16")}
+_FORMS: dict[str, tuple[float, str]] = {"float32": (1.0, "*fp32"), "half": (kernels.HALF_SCALE, "*fp16")}
 
 
 @dataclass(frozen=True)
@@ -93,12 +91,12 @@ class Target:
 def _of_cached_weights(form: str) -> dict[str, Target]:
     scale, weights = _FORMS[form]
     types = {"weights": weights, "gaussians": "*i32"}
-    read = {"SCALE": scale, "P": cached_kernels.PIECES.value}
-    keep = Target(cached_kernels.store_pieces, {**_CUTS, "SCALE": scale}, kernels.PIXEL_WARPS, {"weights": weights})
+    read = {"SCALE": scale, "P": kernels.PIECES.value}
+    keep = Target(kernels.store_pieces, {**_CUTS, "SCALE": scale}, kernels.PIXEL_WARPS, {"weights": weights})
     return {
         f"store_pieces_{form}": keep,
-        f"apply_pieces_{form}": Target(cached_kernels.apply_pieces, read, 1, types),
-        f"piece_gradients_{form}": Target(cached_kernels.piece_gradients, read, 1, types),
+        f"apply_pieces_{form}": Target(kernels.apply_pieces, read, 1, types),
+        f"piece_gradients_{form}": Target(kernels.piece_gradients, read, 1, types),
     }
 
 
@@ -118,7 +116,7 @@ def _of_features(form: str, channels: int, of: str) -> dict[str, Target]:
         gradient = {**gradient, "low": None}
     return {
         f"shifted_moments_{of}": Target(
-            statistics_kernels.shifted_moments,
+            feature_kernels.shifted_moments,
             moments,
             4,
             {"features": features, "sums": "*fp32"},
@@ -138,7 +136,7 @@ def _of_statistics(channels: int, of: str = "") -> dict[str, Target]:
     block = {"ROWS": entries // block_of_channels(channels), "COLUMNS": block_of_channels(channels)}
     return {
         f"combine_moments{of}": Target(
-            statistics_kernels.combine_moments,
+            feature_kernels.combine_moments,
             {"CHANNELS": channels, "ENTRIES": entries},
             4,
             {"sums": "*fp64", "mean": "*fp64"},
@@ -172,16 +170,16 @@ KERNELS: dict[str, Target] = {
     **{
         f"{kernel.__name__}_{form}": Target(
             kernel,
-            {"CHANNELS": 64, "MASK": torch.iinfo(integers).max, "BLOCK": pooling_kernels.BLOCK.value},
+            {"CHANNELS": 64, "MASK": torch.iinfo(integers).max, "BLOCK": feature_kernels.BLOCK.value},
             4,
             {"gradient": types, "source": types, "out": types, "height": "i32", "windows": "i32"},
         )
-        for kernel in (pooling_kernels.max_pool, pooling_kernels.max_pool_backward)
+        for kernel in (feature_kernels.max_pool, feature_kernels.max_pool_backward)
         for form, integers, types in (("float32", torch.int32, "*i32"), ("bfloat16", torch.int16, "*i16"))
     },
     "survey": Target(kernels.survey, _CUTS, kernels.SUMMING_WARPS, {"height": "i32"}),
     "add_slot_weights": Target(kernels.add_slot_weights, _ADDED, 4, {"slots": "*fp32"}),
-    "count_pieces": Target(cached_kernels.count_pieces, _CUTS, kernels.SUMMING_WARPS),
+    "count_pieces": Target(kernels.count_pieces, _CUTS, kernels.SUMMING_WARPS),
     **_of_cached_weights("float32"),
     **_of_cached_weights("half"),
     **_of_features("float32", _WIDEST, "float32"),
@@ -203,15 +201,15 @@ KERNELS: dict[str, Target] = {
     **{
         kernel.__name__: Target(
             kernel,
-            {"CHANNELS": 64, "BLOCK": 64, "P": first_layer_kernels.P.value},
+            {"CHANNELS": 64, "BLOCK": 64, "P": feature_kernels.P.value},
             4,
             dict.fromkeys(("weight", "bias", "gradient"), "*bf16")
             | dict.fromkeys(("pixels", "scale", "shift"), "*fp32")
             | {"height": "i32", "out": out},
         )
         for kernel, out in (
-            (first_layer_kernels.convolve_pixels, "*bf16"),
-            (first_layer_kernels.pixel_gradients, "*fp32"),
+            (feature_kernels.convolve_pixels, "*bf16"),
+            (feature_kernels.pixel_gradients, "*fp32"),
         )
     },
     "rest_colors": Target(

@@ -23,7 +23,7 @@ _LOCK = threading.RLock()
 
 
 #: Source files whose functions and constants are compiled into kernels of other modules.
-_COMPILED_IN = ("constants.py", "rasterizer/vectors.py", "rasterizer/kernels.py")
+_COMPILED_IN = ("constants.py", "rasterizer/kernels.py")
 
 
 #: Folders in which Numba caches compiled kernels.

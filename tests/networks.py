@@ -10,8 +10,7 @@ from typing import Literal
 
 import torch
 
-from sgsst_core.features.network_sources import BLOCKS, CAFFE_MEAN
-from sgsst_core.features.network_weights import BackboneWeights, cache_folder, fetch_network_weights
+from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeights, cache_folder, fetch_network_weights
 from sgsst_core.features.vgg import PIXELS
 
 #: Number of channels of every layer.

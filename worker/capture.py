@@ -16,8 +16,7 @@ from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.images import WHITE, Color
 from sgsst_core.files.photos import MAX_MISSING, Photo, PhotoFolder, check_photos, photo_size, some_names
 from sgsst_core.files.scene_file import SceneFile, read_scene
-from sgsst_core.orbit.choice import Orbit, OrbitRequest, make_orbit
-from sgsst_core.orbit.subject import find_subject, find_up
+from sgsst_core.orbit import Orbit, OrbitRequest, find_subject, find_up, make_orbit
 from sgsst_core.planning.survey import compare_photos, frame_warnings, implausible, shown_by
 from sgsst_core.progress import Decision
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread, undistorted

@@ -26,22 +26,27 @@ from sgsst_core.files.blending import blend_scenes, check_same_shape, common_res
 from sgsst_core.files.formats import format_of_name, read_scene_header, scene_path
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
-from sgsst_core.files.formats.sog import META_NAME, SOG
-from sgsst_core.files.formats.streamed_sog import INDEX_NAME, STREAMED_SOG
+from sgsst_core.files.formats.sog import INDEX_NAME, META_NAME, SOG, STREAMED_SOG
 from sgsst_core.files.images import Color
-from sgsst_core.files.library import load_scene
-from sgsst_core.files.scene_file import SceneFile, encode_scene, losses, read_scene, write_levels, write_sog_folder
-from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint
-from sgsst_core.files.usd import USD_SUFFIXES, check_usd, write_usd
+from sgsst_core.files.library import TrainerCheckpoint, load_scene
+from sgsst_core.files.scene_file import (
+    USD_SUFFIXES,
+    SceneFile,
+    check_usd,
+    encode_scene,
+    losses,
+    read_scene,
+    write_levels,
+    write_sog_folder,
+    write_usd,
+)
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
-from sgsst_core.orbit.cameras import ELEVATION, turntable
-from sgsst_core.orbit.choice import find_upright_subject
+from sgsst_core.orbit import ELEVATION, find_upright_subject, turntable
 from sgsst_core.progress import Decision, warnings_of
 from sgsst_core.quality.measure import CompressionLoss, measure_compression
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.images import Layer, write_frames
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.camera_path import CameraPath, framed, in_path_order
+from sgsst_core.scene.camera import Camera, CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.settings import Settings

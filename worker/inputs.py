@@ -39,7 +39,7 @@ from sgsst_core.files.images import WHITE, Color, image_size, load_image
 from sgsst_core.files.photos import Photo, check_names, find_masks, load_photo
 from sgsst_core.files.scene_file import HELD_BYTES, SceneFile, read_property, read_scene, stays_in_file
 from sgsst_core.files.stylized_ply import check_sh_attenuation
-from sgsst_core.orbit.choice import Orbit
+from sgsst_core.orbit import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.facts import check_scales
 from sgsst_core.planning.plan import OPTIMIZER_BYTES
@@ -47,8 +47,10 @@ from sgsst_core.planning.survey import nothing_seen, sees_something
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
-from sgsst_core.regions.definition import Region, Regions, check_regions
-from sgsst_core.regions.selection import (
+from sgsst_core.regions import (
+    Region,
+    Regions,
+    check_regions,
     count_votes,
     decide_by_votes,
     in_box,

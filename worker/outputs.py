@@ -12,7 +12,7 @@ from sgsst_core.files.atomic import ensure_writable_folder
 from sgsst_core.files.formats import RESULT_SUFFIXES, format_of_name, read_scene_header
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
-from sgsst_core.files.formats.streamed_sog import STREAMED_SOG
+from sgsst_core.files.formats.sog import STREAMED_SOG
 from worker.job import JobSpec, check_choice, check_steps
 
 if TYPE_CHECKING:

@@ -34,7 +34,7 @@ from sgsst_core.planning.plan import LOSS_VIEWS, Plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice
 from sgsst_core.rasterizer import RASTERIZERS
-from sgsst_core.refine.split import Refinement
+from sgsst_core.refine import Refinement
 from sgsst_core.report.document import Sources
 from sgsst_core.scene.camera import resized, spread
 from sgsst_core.scene.gaussians import Scene

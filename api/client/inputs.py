@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from api.client.answers import RequestError
-from sgsst_core.files.camera_folder import find_cameras, issue_warning
-from sgsst_core.files.colmap_model import label
+from sgsst_core.files.camera_folder import find_cameras, issue_warning, label
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".avif", ".heic", ".heif", ".hif")
 

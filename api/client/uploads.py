@@ -16,7 +16,7 @@ from api.client.answers import ApiError, RequestError
 from api.client.inputs import InputFile, JobFiles, input_files
 from api.client.transport import Progress, Transport, in_thread, json_text
 from sgsst_core.files.formats import scene_path
-from sgsst_core.files.formats.streamed_sog import INDEX_NAME, pack
+from sgsst_core.files.formats.sog import INDEX_NAME, pack
 
 #: Maximum bytes of a part; larger files are uploaded in parts.
 PART_BYTES = 16 << 20

@@ -24,8 +24,8 @@ from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import TENSORS, Scene
-from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.style import Style
 
 Group = Literal[

@@ -15,13 +15,13 @@ import torch
 from benchmarks.stability.case import Case, CaseResult, Group, ordinary, repeated
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import InvalidInputError
-from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.glb import GLB
+from sgsst_core.files.formats.ply import COMPRESSED_PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.orbit.choice import OrbitRequest, make_orbit
+from sgsst_core.orbit import OrbitRequest, make_orbit
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held
 

@@ -38,17 +38,17 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import cache_in_memory, kernel_folders, load_registries
 from sgsst_core.devices import seconds_left
 from sgsst_core.errors import InvalidInputError, SceneError, SettingsError, SgsstError, WeightsError
-from sgsst_core.features import pooling_kernels, winograd_kernels  # noqa: F401  # see `_confine`
+from sgsst_core.features import kernels as feature_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.features.network_weights import list_network_weights
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.images import image_size
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.orbit.choice import find_upright_subject
+from sgsst_core.orbit import find_upright_subject
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.survey import OTHER_FRAME
 from sgsst_core.progress import Progress, warnings_of
 from sgsst_core.report.document import plan_json
-from sgsst_core.scene import spherical_harmonics_kernels  # noqa: F401  # see `_confine`
+from sgsst_core.scene import kernels as scene_kernels  # noqa: F401  # see `_confine`
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import versions

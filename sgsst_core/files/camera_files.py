@@ -20,13 +20,21 @@ from numpy.typing import NDArray
 
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.advice import refuse_camera_json
-from sgsst_core.files.camera_folder import FORMATS, find_cameras, issue_warning, load_json
-from sgsst_core.files.colmap_model import COMPARE, QUATERNION_TOLERANCE, ColmapCamera, Warn, read_model
+from sgsst_core.files.camera_folder import (
+    COMPARE,
+    FORMATS,
+    QUATERNION_TOLERANCE,
+    ColmapCamera,
+    Warn,
+    find_cameras,
+    issue_warning,
+    load_json,
+    read_model,
+)
 from sgsst_core.files.images import image_size
 from sgsst_core.files.photos import PhotoFolder
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.lens import COEFFICIENTS, FORMULAS, Lens
-from sgsst_core.scene.rotations import exact_rotation
+from sgsst_core.scene.camera import COEFFICIENTS, FORMULAS, Camera, Lens
+from sgsst_core.scene.gaussians import exact_rotation
 
 #: Largest deviation of a size from whole pixels that is attributed to rounding: 119.99999 is 120.
 _WHOLE_TOLERANCE = 0.01

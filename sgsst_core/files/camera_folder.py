@@ -1,17 +1,28 @@
-"""Search for camera files: which file of a folder holds the cameras. PyTorch is not imported."""
+"""Files of cameras: which file of a folder holds them, and COLMAP sparse models. PyTorch is not imported.
+
+COLMAP's models are read, binary or text, as its "Output Format" page defines them. Only `cameras` and `images` are
+read, which contain everything that a view needs: COLMAP writes the pose of each image into `images`, even if `rigs` and
+`frames` also determine it. `points3D`, `rigs` and `frames` are never opened. What is in a file but belongs to no entry
+is counted and reported.
+"""
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import json
+import math
+import mmap
+import re
+import struct
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sgsst_core.errors import CameraError
-from sgsst_core.files.advice import CAMERAS, refuse_camera_folder, refuse_known
-from sgsst_core.files.colmap_model import Warn, read_model
+from sgsst_core.files.advice import CAMERAS, POINTER, refuse_camera_folder, refuse_known
 
 FORMATS = "an INRIA cameras.json, a COLMAP sparse model or a nerfstudio/Blender transforms.json"
 #: Names of JSON files with cameras, in order of preference. Any other name is read if it is the only one.
@@ -176,3 +187,234 @@ def _models_below(folder: Path) -> list[Path]:
             if models:
                 return models
     return []
+
+
+T = TypeVar("T")
+Warn = Callable[[str], None]
+
+_CONVERT = "Convert it with `colmap image_undistorter`, and give the OUT/sparse that it writes"
+_EXPORT_AGAIN = "Export the model again."
+#: Advice of warnings about files whose entries may not be all.
+COMPARE = "If views are missing, export the model again"
+_HEAD_BYTES = 4096
+
+#: Largest deviation of a quaternion's length from 1 that is attributed to rounding in the file.
+QUATERNION_TOLERANCE = 0.01
+#: COLMAP's camera models by number: name and number of parameters.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
+}
+_PARAMETERS = dict(_MODELS.values())
+#: Stricter than `int` and `float`, which accept `1_0` and digits of other scripts.
+_INTEGER = re.compile("[0-9]{1,18}")
+_NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
+#: Line of points: x, y and ID of the 3D point of each. The possessive quantifiers keep the time linear.
+_POINTS = re.compile(rb"(?:(?:(?:[-+.0-9eE]++|-?nan|-?inf)(?:\s++|$)){3}+)++")
+#: Number of entries in the comment that COLMAP writes at the beginning of a text file.
+_DECLARED = re.compile(rb"# Number of (?:cameras|images): ([0-9]{1,18})\b")
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """Intrinsics of a camera: name of the model, size in pixels, and parameters in the model's order."""
+
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """Registered image with its pose.
+
+    Attributes:
+        name: Path of the image, relative to COLMAP's image folder.
+        camera: ID of its camera.
+        rotation: Quaternion wxyz, world to camera, as stored.
+        translation: Translation, world to camera.
+    """
+
+    name: str
+    camera: int
+    rotation: Sequence[float]
+    translation: Sequence[float]
+
+
+def read_model(folder: Path, warn: Warn) -> tuple[dict[int, ColmapCamera], list[ColmapImage]]:
+    """Read the cameras by ID, and the registered images in the file's order.
+
+    Binary files take precedence over text files, as in COLMAP.
+
+    Args:
+        warn: Callback for files with more or less than they declare.
+
+    Raises:
+        CameraError: If a file is missing, truncated, or has an invalid value. The message names the file.
+    """
+    cameras, images = folder / "cameras.bin", folder / "images.bin"
+    if cameras.is_file():
+        return (
+            _by_id(cameras, _binary(cameras, _binary_camera, warn)),
+            list(_by_id(images, _binary(images, _binary_image, warn)).values()),
+        )
+    cameras, images = folder / "cameras.txt", folder / "images.txt"
+    intrinsics = _by_id(cameras, _text_cameras(cameras))
+    poses = _by_id(images, _text_images(images))
+    for path, count in ((cameras, len(intrinsics)), (images, len(poses))):
+        with path.open("rb") as file:
+            stated = _DECLARED.search(file.read(_HEAD_BYTES))
+        if stated and int(stated[1]) != count:
+            warn(f"{path}: holds {count:,} {path.stem}, but its first lines state {int(stated[1]):,}. {COMPARE}")
+    return intrinsics, list(poses.values())
+
+
+def _by_id(path: Path, entries: Iterator[tuple[int, T]]) -> dict[int, T]:
+    by_id: dict[int, T] = {}
+    try:
+        refuse_known(path, [POINTER], CameraError)
+        for number, entry in entries:
+            if number in by_id:
+                raise CameraError(f"{path}: has id {number} twice. Export the model again.")
+            by_id[number] = entry
+    except OSError as error:
+        raise CameraError(f"{path}: cannot be read: {error.strerror}. Copy the model again.") from error
+    except KeyError as error:
+        raise CameraError(f"{path}: has an unknown COLMAP camera model, number {error}. {_CONVERT}.") from error
+    except EOFError as error:
+        raise CameraError(f"{path}: is truncated or corrupt: {error}. Copy the model again.") from error
+    except (struct.error, ValueError) as error:
+        raise CameraError(f"{path}: is truncated or corrupt. Copy the model again.") from error
+    return by_id
+
+
+def _binary(path: Path, read: Callable[[mmap.mmap, int], tuple[int, T, int]], warn: Warn) -> Iterator[tuple[int, T]]:
+    """Yield as many entries as the file declares."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        position, count = 8, struct.unpack_from("<Q", data)[0]
+        for done in range(count):
+            try:
+                number, entry, position = read(data, position)
+            except (struct.error, EOFError):
+                position = len(data) + 1
+            if position > len(data):
+                raise EOFError(f"it declares {count:,} {path.stem} and ends after {done:,}")
+            yield number, entry
+        if position < len(data):
+            left = len(data) - position
+            warn(f"{path}: has {left:,} bytes after the {count:,} {path.stem} that it declares. {COMPARE}")
+
+
+def _binary_camera(data: mmap.mmap, position: int) -> tuple[int, ColmapCamera, int]:
+    """Read a camera: ID (uint32), model (int32), width and height (uint64), parameters (float64)."""
+    number, model, width, height = struct.unpack_from("<IiQQ", data, position)
+    name, count = _MODELS[model]
+    parameters = struct.unpack_from(f"<{count}d", data, position + 24)
+    return number, ColmapCamera(name, width, height, parameters), position + 24 + 8 * count
+
+
+def _binary_image(data: mmap.mmap, position: int) -> tuple[int, ColmapImage, int]:
+    """Read an image: ID (uint32), pose (7 float64), camera (uint32), name (null-terminated), points.
+
+    The points are a count (uint64) and 24 bytes each; they are skipped.
+    """
+    number, *pose, camera = struct.unpack_from("<I7dI", data, position)
+    end_of_name = data.find(b"\0", position + 64)
+    if end_of_name < 0:
+        raise EOFError
+    name = label(data[position + 64 : end_of_name])
+    points: int = struct.unpack_from("<Q", data, end_of_name + 1)[0]
+    return number, ColmapImage(name, camera, pose[:4], pose[4:]), end_of_name + 9 + 24 * points
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
+    """Yield cameras from lines of ID, model name, width, height and parameters."""
+    for where, line in _lines(path):
+        words = [label(word) for word in line.split()]
+        model = words[1] if len(words) > 1 else ""
+        if not words:
+            continue
+        if model not in _PARAMETERS or len(words) != 4 + _PARAMETERS[model]:
+            raise CameraError(
+                f"{where}: expected id, COLMAP camera model, width, height and its parameters. {_EXPORT_AGAIN}"
+            )
+        number, width, height = (_integer(where, word) for word in (words[0], *words[2:4]))
+        yield number, ColmapCamera(model, width, height, tuple(_number(where, word) for word in words[4:]))
+
+
+def _text_images(path: Path) -> Iterator[tuple[int, ColmapImage]]:
+    """Yield images from lines of ID, quaternion, translation, camera ID and name.
+
+    Each may be followed by a line of points, which is skipped. Some programs leave out such lines if they are empty.
+    """
+    may_be_points = False
+    for where, line in _lines(path):
+        words = [label(word) for word in line.split(maxsplit=9)]
+        if not line or (may_be_points and _POINTS.fullmatch(line) and not _is_pose(words)):
+            may_be_points = False
+            continue
+        if len(words) != 10:
+            raise CameraError(
+                f"{where}: expected id, 7 numbers of the pose, camera id and name, or the points of the image above as "
+                f"x, y and id. {_EXPORT_AGAIN}"
+            )
+        pose = [_number(where, word) for word in words[1:8]]
+        yield _integer(where, words[0]), ColmapImage(words[9], _integer(where, words[8]), pose[:4], pose[4:])
+        may_be_points = True
+
+
+def _is_pose(words: Sequence[str]) -> bool:
+    """Return whether the words of a line of numbers are those of an image, whose name may be a number too."""
+    ids = all(_INTEGER.fullmatch(word) for word in (words[0], *words[8:9]))
+    numbers = len(words) >= 9 and all(_NUMBER.fullmatch(word) for word in words[1:8])
+    return ids and numbers and abs(math.hypot(*map(float, words[1:5])) - 1) <= QUATERNION_TOLERANCE
+
+
+def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Yield the location of each line (for error messages) and its text without blanks around it, except comments."""
+    with path.open("rb") as file:
+        for number, data in enumerate(file, start=1):
+            line = data.removeprefix(codecs.BOM_UTF8).strip()
+            if not line.startswith(b"#"):
+                yield f"{path}: line {number}", line
+
+
+def _integer(where: str, word: str) -> int:
+    if not _INTEGER.fullmatch(word):
+        raise CameraError(f"{where}: {word[:40]!r} is not a whole number. {_EXPORT_AGAIN}")
+    return int(word)
+
+
+def _number(where: str, word: str) -> float:
+    if not _NUMBER.fullmatch(word):
+        raise CameraError(f"{where}: {word[:40]!r} is not a number. {_EXPORT_AGAIN}")
+    return float(word)
+
+
+def label(name: bytes) -> str:
+    """Return a name as text that can be printed and stored.
+
+    A name that is not UTF-8, such as one in CP949 or GBK, gets one character per byte (ISO 8859-1): different names
+    stay different.
+    """
+    try:
+        return name.decode()
+    except UnicodeDecodeError:
+        return name.decode("latin-1")

@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from sgsst_core.errors import ImageError
-from sgsst_core.files.colmap_model import label
+from sgsst_core.files.camera_folder import label
 from sgsst_core.files.images import BLACK, HEIF_SUFFIXES, Color, load_image, stored_size
 from sgsst_core.scene.camera import Camera
 

@@ -22,8 +22,7 @@ from torch import Tensor
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.formats.ply import PLY, PROPERTIES, RGB
-from sgsst_core.files.formats.ply_header import FILTER_3D, PlyHeader, element_offsets, retagged
+from sgsst_core.files.formats.ply import FILTER_3D, PLY, PROPERTIES, RGB, PlyHeader, element_offsets, retagged
 from sgsst_core.files.formats.scene_format import blocks
 from sgsst_core.files.scene_file import SceneFile, encode_scene, file_stamp
 from sgsst_core.scene.gaussians import attenuation_factor

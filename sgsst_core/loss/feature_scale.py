@@ -19,8 +19,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from sgsst_core.features.network_sources import CAFFE_MEAN
-from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.network_weights import CAFFE_MEAN, BackboneWeights
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, FeatureNetwork
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.settings import FeatureScale, Settings

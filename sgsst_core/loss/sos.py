@@ -52,7 +52,7 @@ from sgsst_core.parallel.division import (
     rounds,
 )
 from sgsst_core.scales import EVEN, ScaleWeights
-from sgsst_core.scene.pyramid import downscale, resize_area, style_size
+from sgsst_core.scene.colors import downscale, resize_area, style_size
 from sgsst_core.settings import Settings, StyleLossName, make_settings
 from sgsst_core.style import Style, chosen_positions
 

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.devices import Timer, on_device
-from sgsst_core.features.network_sources import BLOCKS, KAPPA
-from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.network_weights import BLOCKS, KAPPA, BackboneWeights
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.statistics import (
     TILE,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from sgsst_core.features.statistics_kernels import cells_of, halves, load_features, load_weights, mask_of
+from sgsst_core.features.triton_kernels import cells_of, halves, load_features, load_weights, mask_of
 
 # Arguments are untyped: Triton compiles one version per argument type.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"

@@ -27,7 +27,7 @@ from sgsst_core.features.partition import (
 from sgsst_core.features.vgg import ALIGNMENT, layer_stride
 from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange
 from sgsst_core.scales import EVEN, ScaleWeights, scale_count
-from sgsst_core.scene.pyramid import add_upscaled_, downscale
+from sgsst_core.scene.colors import add_upscaled_, downscale
 
 Size = tuple[int, int]  # height, width in pixels
 

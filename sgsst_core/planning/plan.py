@@ -21,7 +21,7 @@ from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import ANOTHER_LOSS, VIEWS, Decision
 from sgsst_core.rasterizer import RASTERIZERS
-from sgsst_core.refine.split import Refinement
+from sgsst_core.refine import Refinement
 from sgsst_core.scales import MIN_FALL, ScaleWeights, scale_count, window_length
 from sgsst_core.settings import WHOLE_FLOAT32, CachedWeights, PlannedBackground, PlannedPrecision, Settings
 

@@ -24,8 +24,8 @@ from sgsst_core.quality.measure import scene_psnr
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.projection import Column, Shapes, project
 from sgsst_core.scene.camera import Camera, spread
+from sgsst_core.scene.colors import style_size
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import style_size
 from sgsst_core.scene.rendering import CLASSIC, Rendering
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.style import Style

@@ -32,8 +32,8 @@ from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.features.network_weights import list_network_weights, load_perceptual
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Moments, Style, color_moments, square_root, style_moments
 from sgsst_core.stylizing.job import JobStyles

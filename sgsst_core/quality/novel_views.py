@@ -28,9 +28,8 @@ from sgsst_core.planning.survey import sees_something
 from sgsst_core.quality.judge import MIN_SIDE, Lpips, shown
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.base import CameraKey, camera_key
-from sgsst_core.regions.maps import RegionMaps
-from sgsst_core.scene.camera import Camera, between, resized, spread
-from sgsst_core.scene.camera_path import moved, nearest_walk, similarly_rotated
+from sgsst_core.regions import RegionMaps
+from sgsst_core.scene.camera import Camera, between, moved, nearest_walk, resized, similarly_rotated, spread
 from sgsst_core.scene.gaussians import Scene, sampled
 from sgsst_core.stylizing.steps import ShowViews, show_nothing
 from sgsst_core.stylizing.views import ViewColors

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from sgsst_core.errors import InvalidInputError, SettingsError
 from sgsst_core.files.atomic import atomic_path, write_json
-from sgsst_core.scene.pyramid import resize_area
+from sgsst_core.scene.colors import resize_area
 from sgsst_core.settings import reason
 
 #: Number of variants that a page can compare: one for each arrow key.

@@ -16,13 +16,13 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import ALPHA_MAX
 from sgsst_core.rasterizer import kernels
-from sgsst_core.rasterizer.projection import Shapes
-from sgsst_core.rasterizer.tile_intersections import (
+from sgsst_core.rasterizer.base import TiledRasterizer, cache_of_intersections
+from sgsst_core.rasterizer.projection import (
+    Shapes,
     TileIntersections,
     build_tile_intersections,
     intersections_of_subset,
 )
-from sgsst_core.rasterizer.tiled import TiledRasterizer, cache_of_intersections
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 

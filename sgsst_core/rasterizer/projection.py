@@ -1,4 +1,4 @@
-"""EWA projection of a scene onto the image plane of one camera, in float64.
+"""EWA projection of a scene onto the image plane of a camera in float64, depth sort, and tile intersections.
 
 Zwicker, Pfister, van Baar, Gross, "EWA Splatting", IEEE TVCG 2002: a Gaussian with covariance V becomes a 2D Gaussian
 with covariance J V J^T, where J is the Jacobian of the perspective at its center. For numerical accuracy:
@@ -15,6 +15,14 @@ with covariance J V J^T, where J is the Jacobian of the perspective at its cente
 * The support of a Gaussian is exactly the area where its alpha is at least ALPHA_MIN: half extents t sqrt(p) and
   t sqrt(r) with t = sqrt(2 ln(opacity / ALPHA_MIN)). There is no other cutoff, so a renderer that evaluates alpha at
   every pixel gives the same image.
+
+The depth sort is a stable sort of positive float64 numbers on all cores. Positive floats have the same order as their
+bits interpreted as integers. A parallel counting sort by the upper bits distributes the Gaussians over many buckets;
+then each bucket is sorted separately. Gaussians of equal depth keep the order of the file, so the result is that of any
+stable sort, for any number of threads.
+
+Tile intersections are the depth-sorted Gaussians of each raster tile. They are built once per camera, because geometry
+is frozen.
 """
 
 # Arguments are untyped: Numba compiles one version per argument type.
@@ -31,9 +39,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sgsst_core import container
 from sgsst_core.compiled import compiled, kernel_threads
-from sgsst_core.constants import LOG2_ALPHA_MIN, NEAR, TO_POWER_OF_TWO
-from sgsst_core.rasterizer.depth_order import depth_order, take_elements
+from sgsst_core.constants import LOG2_ALPHA_MIN, NEAR, RASTER_TILE, TO_POWER_OF_TWO
+from sgsst_core.errors import TooManyIntersectionsError
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
@@ -175,7 +184,7 @@ def _rotation(quat):
 
 
 @compiled()
-def _row(focal, slope, axis, forward):
+def _write_row(focal, slope, axis, forward):
     """Return one row of J R_camera: focal / z times (camera axis - slope * viewing axis)."""
     a = focal * (axis[0] - slope * forward[0])
     b = focal * (axis[1] - slope * forward[1])
@@ -244,8 +253,8 @@ def _project_one(mean, quat, deviation, opacity, pose, intrinsics, near, blur, v
         return 0.0
     slope_x = min(intrinsics[7], max(intrinsics[6], x / z))
     slope_y = min(intrinsics[9], max(intrinsics[8], y / z))
-    row0 = _row(fx / z, slope_x, pose[0], pose[2])
-    row1 = _row(fy / z, slope_y, pose[1], pose[2])
+    row0 = _write_row(fx / z, slope_x, pose[0], pose[2])
+    row1 = _write_row(fy / z, slope_y, pose[1], pose[2])
     u, v = fx * (x / z) + cx, fy * (y / z) + cy
     if _surely_outside(u, width, row0, deviation, support, blur):
         return 0.0
@@ -311,3 +320,323 @@ def take_rows(values, indices, out) -> None:
     for i in numba.prange(indices.size):
         for column in range(values.shape[1]):
             out[i, column] = values[indices[i], column]
+
+
+#: Gaussians per bucket if depths are spread evenly.
+_BUCKET = 16
+_MAX_BUCKETS = 1 << 17
+#: Buckets of up to this size are sorted by insertion, larger ones by merging.
+_INSERTED = 48
+
+
+def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Sort the indices of visible Gaussians by depth; equal depths stay in index order.
+
+    Args:
+        depths: [N] float64; positive for visible Gaussians, because the near plane is at a positive depth.
+        visible: [V], ascending indices into `depths`.
+
+    Returns:
+        `visible` sorted by depth, int32.
+    """
+    count = len(visible)
+    if not count:
+        return np.empty(0, dtype=np.int32)
+    with kernel_threads():
+        threads = numba.get_num_threads()
+        bits = np.empty(count, dtype=np.int64)
+        take_elements(depths.view(np.int64), visible, bits)
+        lowest, highest = int(bits.min()), int(bits.max())
+        target = min(max(count // _BUCKET, 1), _MAX_BUCKETS)
+        shift = max((highest - lowest).bit_length() - target.bit_length(), 0)
+        buckets = ((highest - lowest) >> shift) + 1
+        chunks = np.linspace(0, count, threads + 1).astype(np.int64)
+        counts = np.zeros((threads, buckets), dtype=np.int64)
+        _count(bits, lowest, shift, chunks, counts)
+        starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts.sum(axis=0))])
+        # First position that each chunk writes to in each bucket: after all lower buckets, and after the entries of all
+        # preceding chunks in the same bucket.
+        offsets = starts[:-1] + np.cumsum(counts, axis=0) - counts
+        order, keys = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int64)
+        _scatter(bits, visible, lowest, shift, chunks, offsets, order, keys)
+        bounds = np.searchsorted(starts, chunks).astype(np.int64)
+        _sort_buckets(starts, bounds, keys, order)
+    return order
+
+
+@compiled(parallel=True)
+def take_elements(values, indices, out) -> None:
+    """Write values[indices] to `out` for values [N], on all cores."""
+    for i in numba.prange(indices.size):
+        out[i] = values[indices[i]]
+
+
+@compiled(parallel=True)
+def _count(bits, lowest, shift, chunks, counts):
+    """Count the Gaussians of each chunk that fall into each bucket."""
+    for chunk in numba.prange(chunks.size - 1):
+        for i in range(chunks[chunk], chunks[chunk + 1]):
+            counts[chunk, (bits[i] - lowest) >> shift] += 1
+
+
+@compiled(parallel=True)
+def _scatter(bits, visible, lowest, shift, chunks, positions, order, keys):
+    """Copy every chunk's Gaussians into their buckets, in input order."""
+    for chunk in numba.prange(chunks.size - 1):
+        for i in range(chunks[chunk], chunks[chunk + 1]):
+            bucket = (bits[i] - lowest) >> shift
+            position = positions[chunk, bucket]
+            order[position], keys[position] = visible[i], bits[i]
+            positions[chunk, bucket] = position + 1
+
+
+@compiled(parallel=True)
+def _sort_buckets(starts, bounds, keys, order):
+    """Sort each bucket by its keys, stably."""
+    for thread in numba.prange(bounds.size - 1):
+        for bucket in range(bounds[thread], bounds[thread + 1]):
+            start, end = starts[bucket], starts[bucket + 1]
+            if end - start > _INSERTED:
+                sorted_ = np.argsort(keys[start:end], kind="mergesort")
+                order[start:end] = order[start:end][sorted_]
+                continue
+            for i in range(start + 1, end):
+                key, gaussian = keys[i], order[i]
+                j = i
+                while j > start and keys[j - 1] > key:
+                    keys[j], order[j] = keys[j - 1], order[j - 1]
+                    j -= 1
+                keys[j], order[j] = key, gaussian
+
+
+#: Maximum number of pairs of Gaussian and raster tile, since their positions are 32-bit integers.
+MAX_INTERSECTIONS = 2**31 - 1
+#: Bytes per pair of Gaussian and raster tile: rank, slot, and the slot's gradient in the backward pass.
+_PAIR_BYTES = 4 + 4 + 12
+#: Number of chunks of the scene that each thread processes, one after the other.
+_CHUNKS_OF_TILES = 4
+_TILE = RASTER_TILE
+
+
+@dataclass(frozen=True)
+class TileIntersections:
+    """Tile intersections of a view.
+
+    A Gaussian intersects a raster tile if its support overlaps a pixel row of the tile within the tile's columns. Every
+    pair of Gaussian and tile has an *entry*, its index in tile order, and a *slot*, its index in Gaussian order: the
+    slots of one Gaussian are contiguous.
+
+    Attributes:
+        projection: V Gaussians, front to back. The index of a Gaussian in this depth order is its *rank*.
+        starts: [tiles + 1] int64, first entry of each tile; tiles are in row-major order.
+        ranks: [E] int32, rank of each entry's Gaussian, front to back within a tile.
+        slots: [E] int32, slot of each entry.
+        first_slots: [V + 1] int64, first slot of each rank.
+    """
+
+    projection: Projection
+    starts: NDArray[np.int64]
+    ranks: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    first_slots: NDArray[np.int64]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory use in bytes, including the projection."""
+        projection = self.projection.gaussians, self.projection.values
+        return sum(array.nbytes for array in (*projection, self.starts, self.ranks, self.slots, self.first_slots))
+
+
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """Return the number of raster tiles of a view as (across, down)."""
+    return -(-camera.width // RASTER_TILE), -(-camera.height // RASTER_TILE)
+
+
+def build_tile_intersections(
+    scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes | None = None
+) -> TileIntersections:
+    """Project a scene, sort its Gaussians by depth, and compute the tile intersections.
+
+    Args:
+        shapes: Shapes of the scene from an earlier view; None to compute them.
+
+    Raises:
+        TooManyIntersectionsError: If there are more pairs of Gaussian and tile than 32-bit positions can address or
+            free memory can hold. The pairs are counted before memory for them is allocated.
+    """
+    projection = project(scene, camera, near=near, shapes=shapes)
+    values, size = projection.values, (camera.width, camera.height)
+    across, down = tile_grid(camera)
+    counts = np.empty(len(values), dtype=np.int64)
+    with kernel_threads():
+        threads = numba.get_num_threads()
+        chunks = np.linspace(0, len(values), threads * _CHUNKS_OF_TILES + 1).astype(np.int64)
+        positions = np.zeros((len(chunks) - 1, across * down), dtype=np.int64)
+        _count_tiles(values, *size, chunks, threads, counts, positions)
+    first_slots = run_starts(counts)
+    total = int(first_slots[-1])
+    check_intersections(total, len(counts), camera, free=container.memory().available)
+    starts = run_starts(positions.sum(axis=0))
+    # First position that each chunk writes to in each tile: after the entries of all preceding chunks.
+    positions = starts[:-1] + np.cumsum(positions, axis=0) - positions
+    ranks, slots = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
+    with kernel_threads():
+        _fill_tiles(values, *size, chunks, threads, first_slots, positions, ranks, slots)
+    return TileIntersections(projection, starts, ranks, slots, first_slots)
+
+
+def intersections_of_subset(isects: TileIntersections, indices: NDArray[np.int32]) -> TileIntersections:
+    """Restrict tile intersections to a subset of the Gaussians.
+
+    The arrays are the same as those of `build_tile_intersections` for the subset.
+
+    Args:
+        indices: [N] int32, each Gaussian's index in the subset, in unchanged order; -1 if it is not in the subset.
+    """
+    projection = isects.projection
+    with kernel_threads():
+        gaussians = np.empty(len(projection.gaussians), dtype=np.int32)
+        take_elements(indices, projection.gaussians, gaussians)
+        remains = gaussians >= 0
+        # For each Gaussian in depth order: its new rank (-1 if removed), and by how much its slots move down.
+        ranks = np.where(remains, np.cumsum(remains, dtype=np.int32) - np.int32(1), np.int32(-1))
+        first_slots = run_starts(np.where(remains, np.diff(isects.first_slots), 0))
+        shifts = (isects.first_slots - first_slots)[:-1]
+        counts = np.empty(len(isects.starts) - 1, dtype=np.int64)
+        _count_remaining(isects.ranks, isects.starts, ranks, counts)
+        starts = run_starts(counts)
+        values = np.empty((int(remains.sum()), projection.values.shape[1]))
+        take_rows(projection.values, np.flatnonzero(remains), values)
+        subset_ranks, subset_slots = np.empty(starts[-1], dtype=np.int32), np.empty(starts[-1], dtype=np.int32)
+        _copy_remaining(isects.ranks, isects.slots, isects.starts, ranks, shifts, starts, subset_ranks, subset_slots)
+    subset = Projection(gaussians[remains], values)
+    return TileIntersections(
+        subset, starts, subset_ranks, subset_slots, np.append(first_slots[:-1][remains], first_slots[-1])
+    )
+
+
+def run_starts(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the start offsets of consecutive runs with these lengths, and the end of the last one."""
+    return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
+
+
+def check_intersections(total: int, gaussians: int, camera: Camera, *, free: int | None = None) -> None:
+    """Raise TooManyIntersectionsError if `total` pairs of Gaussian and raster tile cannot be addressed.
+
+    If the number of free bytes is given, raise it also if they do not fit. Without this check, the allocation would
+    succeed, and the process would be killed when it writes to the memory.
+    """
+    needed = total * _PAIR_BYTES
+    if total > MAX_INTERSECTIONS:
+        reason = f"more than the {MAX_INTERSECTIONS:,} that can be addressed"
+    elif free is not None and needed > free:
+        reason = f"which takes {needed / 1e9:.1f} GB where {free / 1e9:.1f} GB are free"
+    else:
+        return
+    raise TooManyIntersectionsError(
+        f"view {camera.name!r} ({camera.width}x{camera.height}): its {gaussians:,} visible Gaussians touch raster "
+        f"tiles {total:,} times, {reason}. Render at a lower resolution, or remove Gaussians so large that they cover "
+        "much of the view."
+    )
+
+
+@compiled()
+def _tile_rows(value, height):
+    """Return the pixel rows (first, last) of the image within a Gaussian's extents; last < first if there are none."""
+    # Use np.ceil: in compiled code, math.ceil returns int64, which overflows for extents above 9e18 pixels.
+    first = max(0.0, np.ceil(value[1] - value[7] - 0.5))
+    last = min(height - 1.0, np.floor(value[1] + value[7] - 0.5))
+    return int(first), int(max(last, -1.0))
+
+
+@compiled()
+def _tile_span(value, first, last, width):
+    """Return the range (begin, end) of tile columns that a Gaussian's support reaches in pixel rows first..last.
+
+    These rows must be within the Gaussian's extents. The right edge of an ellipse is concave in y, with its maximum at
+    dy = SKEW * EXTENT_Y^2 / EXTENT_X; the left edge is its point reflection. In an interval of rows, an edge is extreme
+    at this point or, if it is outside the interval, at the nearer end.
+    """
+    top, bottom = first + 0.5 - value[1], last + 0.5 - value[1]
+    widest = value[2] * value[7] * (value[7] / value[6]) if value[6] > 0 else 0.0
+    support = value[5] - LOG2_ALPHA_MIN
+    right = min(max(widest, top), bottom)
+    left = min(max(-widest, top), bottom)
+    half_right = math.sqrt(max(support - (right * value[4]) ** 2, 0.0)) / value[3]
+    half_left = math.sqrt(max(support - (left * value[4]) ** 2, 0.0)) / value[3]
+    begin = max(0.0, np.ceil(value[0] + value[2] * left - half_left - 0.5))
+    end = min(width - 1.0, np.floor(value[0] + value[2] * right + half_right - 0.5))
+    if end < begin:
+        return 0, 0
+    return int(begin) // _TILE, int(end) // _TILE + 1
+
+
+@compiled()
+def _chunk_of(step, threads):
+    """Return the chunk of the Gaussians for a step of a parallel loop.
+
+    Every thread gets chunks from all depths, because nearer chunks take more work.
+    """
+    return step % _CHUNKS_OF_TILES * threads + step // _CHUNKS_OF_TILES
+
+
+@compiled(parallel=True)
+def _count_tiles(values, width, height, chunks, threads, counts, positions):
+    """Count the tiles that each Gaussian intersects, and the Gaussians of each chunk that intersect each tile."""
+    across = (width + _TILE - 1) // _TILE
+    for step in numba.prange(chunks.size - 1):
+        chunk = _chunk_of(step, threads)
+        for rank in range(chunks[chunk], chunks[chunk + 1]):
+            first, last = _tile_rows(values[rank], height)
+            total = 0
+            for down in range(first // _TILE, last // _TILE + 1):
+                top, bottom = max(first, down * _TILE), min(last, down * _TILE + _TILE - 1)
+                begin, end = _tile_span(values[rank], top, bottom, width)
+                total += end - begin
+                for tile in range(down * across + begin, down * across + end):
+                    positions[chunk, tile] += 1
+            counts[rank] = total
+
+
+@compiled(parallel=True)
+def _fill_tiles(values, width, height, chunks, threads, first_slots, positions, ranks, slots):
+    """Sort all pairs of Gaussian and tile by tile (counting sort).
+
+    Gaussians are processed in depth order, so the entries of every tile are sorted by depth.
+    """
+    across = (width + _TILE - 1) // _TILE
+    for step in numba.prange(chunks.size - 1):
+        chunk = _chunk_of(step, threads)
+        for rank in range(chunks[chunk], chunks[chunk + 1]):
+            first, last = _tile_rows(values[rank], height)
+            slot = first_slots[rank]
+            for down in range(first // _TILE, last // _TILE + 1):
+                top, bottom = max(first, down * _TILE), min(last, down * _TILE + _TILE - 1)
+                begin, end = _tile_span(values[rank], top, bottom, width)
+                for tile in range(down * across + begin, down * across + end):
+                    position = positions[chunk, tile]
+                    ranks[position], slots[position] = rank, slot
+                    positions[chunk, tile] = position + 1
+                    slot += 1
+
+
+@compiled(parallel=True)
+def _count_remaining(ranks, starts, new_ranks, counts):
+    """Count the remaining entries of each tile."""
+    for tile in numba.prange(starts.size - 1):
+        total = 0
+        for position in range(starts[tile], starts[tile + 1]):
+            total += new_ranks[ranks[position]] >= 0
+        counts[tile] = total
+
+
+@compiled(parallel=True)
+def _copy_remaining(ranks, slots, starts, new_ranks, shifts, new_starts, out_ranks, out_slots):
+    """Copy the remaining entries of each tile with their new ranks and slots."""
+    for tile in numba.prange(starts.size - 1):
+        target = new_starts[tile]
+        for position in range(starts[tile], starts[tile + 1]):
+            rank = ranks[position]
+            if new_ranks[rank] >= 0:
+                out_ranks[target], out_slots[target] = new_ranks[rank], slots[position] - shifts[rank]
+                target += 1

@@ -16,8 +16,7 @@ from torch import Tensor
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, NEAR, RASTER_TILE, TRANSMITTANCE_MIN
 from sgsst_core.rasterizer.base import CameraKey, Rasterizer, camera_key
 from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.rotations import unit_rotations
+from sgsst_core.scene.gaussians import Scene, unit_rotations
 
 #: Number of (pixel, Gaussian) pairs per batch; a batch holds about ten tensors of this size.
 _BATCH_PAIRS = 1 << 20

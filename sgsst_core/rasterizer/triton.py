@@ -7,7 +7,7 @@ Tile intersections are computed on the device: a projection kernel, a sort of th
 be the tile alone, because pairs are generated in depth order. This takes half the bits of a combined key, and Gaussians
 of equal float32 depth keep the order of their float64 depths.
 
-Cached blend weights are pieces of 4 x 4 pixels; see `triton_cached_kernels` for the layout. A piece takes 40 bytes in
+Cached blend weights are pieces of 4 x 4 pixels; see `triton_kernels` for the layout. A piece takes 40 bytes in
 half precision and 72 in float32. Including data per tile, Gaussian and pixel, a weight takes 3.0 to 3.4 bytes in half
 precision and 5.3 to 6.1 bytes in float32 for a scene of large Gaussians, and 7.1 and 12.2 bytes for a scene whose
 Gaussians cover few pixels.
@@ -24,9 +24,8 @@ from torch import Tensor
 from sgsst_core.constants import ALPHA_MAX, ALPHA_MIN, LOG2_ALPHA_MIN, TO_POWER_OF_TWO, TRANSMITTANCE_MIN
 from sgsst_core.devices import on_device
 from sgsst_core.errors import SettingsError
-from sgsst_core.rasterizer.base import CountedWeights, Precision
-from sgsst_core.rasterizer.tile_intersections import check_intersections, tile_grid
-from sgsst_core.rasterizer.tiled import TiledRasterizer
+from sgsst_core.rasterizer.base import CountedWeights, Precision, TiledRasterizer
+from sgsst_core.rasterizer.projection import check_intersections, tile_grid
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 
@@ -273,7 +272,7 @@ class CountedPieces:
     """
 
     def __init__(self, rasterizer: TritonRasterizer, camera: Camera) -> None:
-        from sgsst_core.rasterizer import triton_cached_kernels as kernels
+        from sgsst_core.rasterizer import triton_kernels as kernels
         from sgsst_core.rasterizer.triton_kernels import SUMMING_WARPS
 
         self.rasterizer, self.camera = rasterizer, camera
@@ -299,7 +298,7 @@ class CountedPieces:
 
     def nbytes(self, precision: Precision) -> int:
         """Return the size of the weights in bytes."""
-        from sgsst_core.rasterizer import triton_cached_kernels as kernels
+        from sgsst_core.rasterizer import triton_kernels as kernels
 
         index, visible = self.index_type.itemsize, len(self.intersections.gaussians)
         pixels = self.camera.height * self.camera.width
@@ -319,14 +318,14 @@ class WeightPieces:
         block_starts: [16 tiles + 1], first piece of each block.
         piece_gaussians: [P] int32, indices into the scene.
         piece_slots: [P], slot of each piece's gradient; the slots of one Gaussian are contiguous.
-        weights: [16 P] float32, or float16 multiplied by `triton_cached_kernels.HALF_SCALE`.
+        weights: [16 P] float32, or float16 multiplied by `triton_kernels.HALF_SCALE`.
         first_slots: [V + 1], first slot of each rank.
         gaussians: [V] int32, index into the scene of each rank.
         transmittance: [h, w] float32, final transmittance.
     """
 
     def __init__(self, counted: CountedPieces, precision: Precision) -> None:
-        from sgsst_core.rasterizer import triton_cached_kernels as kernels
+        from sgsst_core.rasterizer import triton_kernels as kernels
         from sgsst_core.rasterizer.triton_kernels import PIXEL_WARPS
 
         rasterizer, isects, index_type = counted.rasterizer, counted.intersections, counted.index_type
@@ -363,7 +362,7 @@ class WeightPieces:
 
     def render(self, colors: Tensor) -> Tensor:
         """Return the image [h, w, 3] of colors [N, 3] over the background."""
-        from sgsst_core.rasterizer import triton_cached_kernels as kernels
+        from sgsst_core.rasterizer import triton_kernels as kernels
 
         image = torch.empty((*self.transmittance.shape, 3), device=colors.device)
         with on_device(colors.device):
@@ -376,7 +375,7 @@ class WeightPieces:
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
         """Return W^T dL/dimage, [N, 3], given the image gradient [h, w, 3]."""
-        from sgsst_core.rasterizer import triton_cached_kernels as kernels
+        from sgsst_core.rasterizer import triton_kernels as kernels
 
         gradient = torch.zeros((len(self._rasterizer.scene), 3), device=image_gradient.device)
         if not len(self.piece_slots):

@@ -111,7 +111,7 @@ def reference_rest_colors(
 def _compiled_rest_colors(sh_rest: Tensor, means: Tensor, camera: Camera, degree: int) -> Tensor:
     """Compute `rest_colors` for float32 on all CPU cores. The last bit may differ from the reference."""
     from sgsst_core.compiled import kernel_threads
-    from sgsst_core.scene import spherical_harmonics_kernels as kernels
+    from sgsst_core.scene import kernels as kernels
 
     colors = torch.empty((len(sh_rest), 3))
     values, points = (tensor.detach().cpu().contiguous().numpy() for tensor in (sh_rest, means))
@@ -125,7 +125,7 @@ def _stored_rest_colors(sh_rest: StoredHarmonics, means: Tensor, camera: Camera,
 
     Each block of the file is used while it is in a core's cache.
     """
-    from sgsst_core.scene import spherical_harmonics_kernels as kernels
+    from sgsst_core.scene import kernels as kernels
 
     colors = torch.empty((len(sh_rest), 3))
     points, center, out = means.detach().cpu().contiguous().numpy(), camera.center.numpy(), colors.numpy()
@@ -149,7 +149,7 @@ def kernel_rest_colors(
     Directions are float64 differences; basis and sum are float32, which differs from `rest_colors` by up to 1e-6 of
     the sum of the coefficients' magnitudes. Runs on a GPU, or on the CPU if Triton's interpreter is on.
     """
-    from sgsst_core.scene import spherical_harmonics_triton_kernels as kernels
+    from sgsst_core.scene import triton_kernels as kernels
 
     count, block = len(sh_rest), kernels.BLOCK.value
     colors = torch.empty((count, 3), device=sh_rest.device)

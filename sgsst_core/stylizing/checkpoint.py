@@ -30,8 +30,8 @@ from sgsst_core.planning.plan import Plan, Work
 from sgsst_core.planning.survey import Survey
 from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import Decision
-from sgsst_core.refine.split import Refinement
-from sgsst_core.regions.definition import Regions
+from sgsst_core.refine import Refinement
+from sgsst_core.regions import Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC

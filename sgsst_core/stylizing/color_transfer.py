@@ -25,7 +25,7 @@ from torch import Tensor
 from sgsst_core.compiled import compiled, kernel_threads
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.scene.colors import luminance, on_screen
-from sgsst_core.scene.rotations import unit_rotations
+from sgsst_core.scene.gaussians import unit_rotations
 from sgsst_core.style import Style, color_moments, mixed_moments, some_pixels, square_root, style_moments
 
 #: A direction counts as flat if the variance of the colors along it is less than this fraction of their largest

@@ -30,12 +30,10 @@ from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.base import Color
 from sgsst_core.rasterizer.cached import CachedRasterizer
-from sgsst_core.regions.definition import Regions
-from sgsst_core.regions.maps import ContentMaps, RegionMaps
+from sgsst_core.regions import ContentMaps, RegionMaps, Regions
 from sgsst_core.scene.camera import Camera, fit_cameras, spread
-from sgsst_core.scene.colors import ColorSubspace, color_subspace_of
+from sgsst_core.scene.colors import ColorSubspace, color_subspace_of, style_size
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import style_size
 from sgsst_core.settings import MAX_RESOLUTION, Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.color_transfer import in_colors_of, in_luminance_of, luminance_start, warm_start

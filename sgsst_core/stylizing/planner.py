@@ -28,7 +28,7 @@ from sgsst_core.files.atomic import write_json
 from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import has_statistics
-from sgsst_core.orbit.choice import Orbit, orbit_decisions
+from sgsst_core.orbit import Orbit, orbit_decisions
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning import plan as choices
 from sgsst_core.planning.facts import (
@@ -44,9 +44,8 @@ from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import ShowPlanning, Survey, survey_views
 from sgsst_core.planning.time_budget import Pace, SecondsLeft, TimeChoice, choosable, choose, ending_seconds
 from sgsst_core.progress import ANOTHER_LOSS, Decision
-from sgsst_core.refine.choice import refine_decision
-from sgsst_core.refine.split import Refinement
-from sgsst_core.regions.definition import Regions, region_decisions
+from sgsst_core.refine import Refinement, refine_decision
+from sgsst_core.regions import Regions, region_decisions
 from sgsst_core.scene.camera import Camera, fit_cameras, resized, spread
 from sgsst_core.scene.colors import color_subspace_of
 from sgsst_core.scene.gaussians import Scene

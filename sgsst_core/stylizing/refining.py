@@ -29,9 +29,20 @@ from sgsst_core.planning.facts import PlanningContext, equip
 from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.refine.choice import MIN_PSNR, Footprints, candidates, choose_pieces, finest_size, max_children
-from sgsst_core.refine.split import Refinement, can_be_split, parents_of, piece_counts, split
-from sgsst_core.regions.definition import Regions
+from sgsst_core.refine import (
+    MIN_PSNR,
+    Footprints,
+    Refinement,
+    can_be_split,
+    candidates,
+    choose_pieces,
+    finest_size,
+    max_children,
+    parents_of,
+    piece_counts,
+    split,
+)
+from sgsst_core.regions import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors

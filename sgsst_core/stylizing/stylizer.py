@@ -30,7 +30,7 @@ from sgsst_core.parallel.collectives import ALONE, Collectives, Traffic
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.regions.definition import Regions
+from sgsst_core.regions import Regions
 from sgsst_core.scene.camera import Camera, checked_cameras
 from sgsst_core.scene.colors import ColorSubspace, on_screen, on_screen_by_luminance, with_chroma_of
 from sgsst_core.scene.gaussians import Scene, checked_scene

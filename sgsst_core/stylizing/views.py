@@ -22,7 +22,7 @@ from sgsst_core.loss.terms import ContentFeatures, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, ShownGaussians
 from sgsst_core.parallel.division import Divider, Division, Piece, ScaledView, Shares, ViewImages
 from sgsst_core.rasterizer import Rasterizer
-from sgsst_core.regions.maps import ContentMaps, RegionMaps
+from sgsst_core.regions import ContentMaps, RegionMaps
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors, view_colors_gradient

@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 
 from sgsst_core.files.formats import by_name
-from sgsst_core.files.formats.frame import Y_UP, Frame
+from sgsst_core.files.formats.scene_format import Y_UP, Frame
 from sgsst_core.files.scene_file import read_scene, write_scene, write_sog_folder
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sgsst_core.features import pooling, statistics
+from sgsst_core.features import layers, statistics
 from sgsst_core.loss import terms as terms
 
 
@@ -12,4 +12,4 @@ def leave_out_kernels(patch: pytest.MonkeyPatch) -> None:
     """Compute statistics and style loss with PyTorch operations instead of Triton kernels."""
     for module in (statistics, terms):
         patch.setattr(module, "has_kernels", lambda device, channels: False)
-    patch.setattr(pooling, "has_kernel", lambda source: False)
+    patch.setattr(layers, "has_pooling_kernel", lambda source: False)

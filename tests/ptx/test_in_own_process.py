@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 COMPARISONS = (
     "tests/sgsst_core/rasterizer/test_triton.py",
     "tests/sgsst_core/rasterizer/test_triton_cached.py",
-    "tests/sgsst_core/features/test_first_layer.py",
+    "tests/sgsst_core/features/test_layers.py",
     "tests/sgsst_core/loss/test_fused.py",
     "tests/sgsst_core/scene/test_spherical_harmonics.py",
 )

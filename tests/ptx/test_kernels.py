@@ -12,8 +12,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sgsst_core.constants import ALPHA_MIN
-from sgsst_core.features.first_layer import convolve_pixels, pixel_gradient
-from sgsst_core.features.pooling import fused_max_pool, fused_max_pool_backward, max_pool_backward_reference
+from sgsst_core.features.layers import (
+    convolve_pixels,
+    fused_max_pool,
+    fused_max_pool_backward,
+    max_pool_backward_reference,
+    pixel_gradient,
+)
 from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
 from sgsst_core.loss.terms import StyleGradient, fused_add_content_gradient, fused_add_style_gradient, fused_content_sum
 from sgsst_core.rasterizer import make_rasterizer

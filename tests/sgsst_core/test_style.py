@@ -14,7 +14,7 @@ from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.files.images import load_image
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import MAX_VECTORS, LayerTarget, layers_of, positions_per_image
-from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.regions import Region, Regions
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style, image_of, mixed_moments, normalized, some_pixels
 from sgsst_core.stylizing.stylizer import Stylizer

@@ -20,7 +20,7 @@ from sgsst_core.progress import warnings_of
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
 from tests.sgsst_core.files.test_camera_files import colmap, views
-from tests.sgsst_core.orbit.objects import figure, ground, joined
+from tests.sgsst_core.objects import figure, ground, joined
 from tests.small_scenes import ball, cameras, wall, write_files
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
 from worker.inputs import read_scene_and_capture

@@ -1,5 +1,5 @@
 // @ts-check
-/** Reader of mkkellogg's .ksplat, as `sgsst_core/files/formats/ksplat.py` describes it. */
+/** Reader of mkkellogg's .ksplat, as `sgsst_core/files/formats/splat.py` describes it. */
 import { SceneError } from "./byte_reader.js";
 import { fromHalf } from "./half.js";
 import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, SH_C0, unpacked } from "./packed.js";

@@ -130,7 +130,7 @@ async function numbers(written, count, width) {
 }
 
 /**
- * Convolve Gaussians with the 3D filters of Mip-Splatting, as `sgsst_core/files/scene_columns.py` does.
+ * Convolve Gaussians with the 3D filters of Mip-Splatting, as `sgsst_core/files/scene_file.py` does.
  *
  * @param {Float32Array} rows
  * @param {number} width

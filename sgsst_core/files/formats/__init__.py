@@ -12,15 +12,12 @@ from typing import TYPE_CHECKING, Literal
 
 from sgsst_core.errors import OutputError, SceneError, reading_scene
 from sgsst_core.files.advice import SCENES, refuse_known, refuse_scene_folder
-from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
 from sgsst_core.files.formats.glb import GLB
-from sgsst_core.files.formats.ksplat import KSPLAT
-from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.ply import COMPRESSED_PLY, PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat, SceneHeader
-from sgsst_core.files.formats.sog import SOG
-from sgsst_core.files.formats.splat import SPLAT
+from sgsst_core.files.formats.sog import INDEX_NAME, SOG, STREAMED_SOG
+from sgsst_core.files.formats.splat import KSPLAT, SPLAT
 from sgsst_core.files.formats.spz import SPZ, SPZ_3
-from sgsst_core.files.formats.streamed_sog import INDEX_NAME, STREAMED_SOG
 
 #: All scene formats, in the order in which they are tried and listed. Formats without a magic number come last.
 FORMATS: tuple[SceneFormat, ...] = (PLY, COMPRESSED_PLY, SPZ, SPZ_3, STREAMED_SOG, SOG, GLB, KSPLAT, SPLAT)

@@ -32,11 +32,12 @@ from numpy.typing import NDArray
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
-from sgsst_core.files.formats.frame import Y_UP, Frame
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
+    Y_UP,
     Arrays,
     FileStart,
+    Frame,
     Limits,
     OpenScene,
     RenderTag,
@@ -47,12 +48,13 @@ from sgsst_core.files.formats.scene_format import (
     extras_of,
     extras_tag,
     json_numbers,
+    logarithms,
+    logits,
     read_bytes,
     read_rows,
     truncated,
 )
 from sgsst_core.files.formats.spz import SPZ_3
-from sgsst_core.files.formats.units import logarithms, logits
 from sgsst_core.scene.rendering import Rendering
 
 _MAGIC = b"glTF"

@@ -1,40 +1,67 @@
-"""PLY of 3DGS trainers: header check and writer. `scene_file` reads it.
+"""PLYs of 3DGS trainers (`scene_file` reads them), PlayCanvas' compressed PLYs, and the parser of their headers.
 
 The properties are those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023): x y z,
 f_dc_0..2, f_rest_* (channel-major: all coefficients of red first), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
 
 Two variants are read too: colors of 8 bits in red, green and blue instead of f_dc_* (nerfstudio), and a single scale.
+
+Headers are checked against the size of the file before anything is read or allocated. The format is that of Greg Turk,
+"The PLY Polygon File Format" (1994). The newer type names (`float32`, `int8`, ...) are accepted too, as are LF, CR LF
+and CR line ends.
+
+Comments state render modes: Brush's `SplatRenderMode: mip` (also of splat-transform and gsplat), Postshot's
+`postshot.anti_aliasing=1`, `antialiased 1`, fVDB's `fvdb_ply_af_8198767135antialias|int64|1` and `...eps2d|double|0.3`,
+and our own `eps2d 0.1`. Other comments that seem to state one give a warning.
+
+In a compressed PLY, a Gaussian takes 16 bytes, and one byte per SH coefficient above degree 0. Positions and log scales
+are quantized to 11, 10 and 11 bits, and colors to 8 bits per channel, within bounds shared by a chunk of 256 Gaussians.
+Opacities have 8 bits. Rotations have three components of 10 bits each. SH coefficients are bytes that cover the range
+-4 to 4. The layout is that of `splat-transform` (https://github.com/playcanvas/splat-transform).
 """
 
 from __future__ import annotations
 
+import math
+import mmap
 import re
-from dataclasses import dataclass
+import struct
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sgsst_core.constants import COLOR_OFFSET, EPS2D, SH_C0
 from sgsst_core.errors import SceneError
 from sgsst_core.files.advice import refuse_changed_meaning
-from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
-from sgsst_core.files.formats.ply_header import (
-    PlyHeader,
-    check_length,
-    comment_lines,
-    is_flat,
-    ply_tag,
-    read_header,
-    stated_up,
-)
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
+    OPACITY_LOGITS,
     STORED_COEFFICIENTS,
     Arrays,
     FileStart,
+    Limits,
+    OpenScene,
+    RenderTag,
     SceneFormat,
     SceneHeader,
+    about_part,
+    about_surplus,
+    along_curve,
     blocks,
+    opacity_bytes,
+    read_bytes,
+    read_rows,
+    refuse_text_transfer,
+    stated,
+    to_steps,
+    truncated,
+    usable_eps2d,
+    with_largest,
+    without_largest,
 )
 from sgsst_core.scene.rendering import Rendering
 
@@ -167,3 +194,565 @@ def _matches(start: FileStart) -> bool:
 
 
 PLY = SceneFormat("ply", "PLY", 248, _matches, _read_header, write=write_ply)
+
+#: Maximum size of a header. A 3DGS header takes 2 kB; a megabyte allows long comments. The limit avoids searching a
+#: whole file that is not a PLY for `end_header`.
+MAX_HEADER_BYTES = 1 << 20
+#: Maximum number of rows with lists, such as faces. Each is read to find its end, which takes a second for all.
+_MAX_LISTS = 1 << 21
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float32": "f4", "float64": "f8"},
+}
+#: Words before the type of a property: none, or those of a list.
+_LENGTHS = [[], *(["list", name] for name, kind in _TYPES.items() if kind[0] != "f")]
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+#: Property of Mip-Splatting: deviation of the 3D filter of each Gaussian, in world units.
+FILTER_3D = "filter_3D"
+#: Blur of Mip-Splatting and of Brush's antialiased scenes.
+_MIP_EPS2D = 0.1
+
+_MODES = {
+    "mip": "antialiased",
+    "default": "classic",
+    "2dgs": "2dgs",
+    "antialiased": "antialiased",
+    "classic": "classic",
+}
+_MODES |= dict.fromkeys(("1", "true", "yes", "on"), "antialiased") | dict.fromkeys(
+    ("0", "false", "no", "off"), "classic"
+)
+_IS = r"(?:\s*[:=]\s*|\s+|\|\w{1,9}\|)(\S+)"
+_MODE = re.compile(
+    r"[\w.|]*?(?:(?:render|raster)[a-z]{0,9}[-_ ]?mode|anti[-_ ]?alias(?:ed|ing)?|(?<![a-z])mip(?:[-_ ]?splatting)?)"
+    + _IS,
+    re.IGNORECASE,
+)
+_EPS2D = re.compile(r"[\w.|]*?(?:eps_?2d|kernel_?size)" + _IS, re.IGNORECASE)
+_UP = re.compile(r"vertical axis:(.{1,100})", re.IGNORECASE)
+#: Directions of up by the names of axes; in Brush, up is -y unless the data set states another.
+_NAMED_UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
+#: Comments that seem to state a render mode.
+_ABOUT_MODE = re.compile(
+    r"anti[-_ ]?alias|(?<![a-z])mip(?:map|[-_ ]?splat|(?![a-z]))|filter[-_ ]?3d|low[-_ ]?pass|eps_?2d|kernel"
+    r"|(?:render|raster)\w{0,9}[-_ ]?mode",
+    re.IGNORECASE,
+)
+_UNSCENTED = re.compile(r"\b3dgr?ut\b|\b3dgrt\b|\bunscented", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """Element of a PLY.
+
+    Attributes:
+        count_span: Start and end of the count in the bytes of the header.
+        byte_order: Byte order of its numbers; "" in text files.
+        kinds: NumPy type codes such as f4, by property; those of the items of a list.
+        lists: NumPy type codes of the lengths of lists, by property. Rows with lists differ in length.
+    """
+
+    name: str
+    count: int
+    count_span: tuple[int, int]
+    byte_order: str
+    kinds: dict[str, str] = field(default_factory=dict)
+    lists: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Return the dtype of a row in a binary file; only for elements without lists."""
+        return np.dtype([(name, self.byte_order + kind) for name, kind in self.kinds.items()])
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """Parsed header of a PLY file.
+
+    Attributes:
+        byte_order: "<" or ">"; "" for text files.
+        raw: Bytes of the header, including the line end of `end_header`; the data starts at len(raw).
+        elements: Elements by name, in the file's order.
+    """
+
+    byte_order: str
+    raw: bytes
+    elements: dict[str, PlyElement]
+
+    @property
+    def text(self) -> bool:
+        """Return whether the data is text ("ascii")."""
+        return not self.byte_order
+
+    @property
+    def newline(self) -> bytes:
+        """Return the line end of the header."""
+        return self.raw[3:5] if self.raw[3:5] == b"\r\n" else self.raw[3:4]
+
+    @property
+    def comments(self) -> list[str]:
+        """Return the comments, without their keyword."""
+        return [comment for line in self.raw.split(self.newline) if (comment := comment_of(line)) is not None]
+
+    @property
+    def has_double_positions(self) -> bool:
+        """Return whether positions are stored in double precision."""
+        return self.vertex.kinds.get("x") == "f8"
+
+    @property
+    def vertex(self) -> PlyElement:
+        """Return the element that holds the Gaussians; raise KeyError if there is none."""
+        return self.elements["vertex"]
+
+
+def comment_of(line: bytes) -> str | None:
+    """Return the text of a comment or information line of a header; None if the line is another."""
+    keyword, _, comment = line.strip().partition(b" ")
+    return comment.decode("latin-1").strip() if keyword in (b"comment", b"obj_info") else None
+
+
+def read_header(file: FileStart) -> PlyHeader:
+    """Parse the header of a PLY file without reading its data.
+
+    Raises:
+        SceneError: If the file cannot be read, has no PLY header, or its header has an invalid line.
+    """
+    path, start = file.path, read_bytes(file.path, 0, MAX_HEADER_BYTES)
+    opening = re.match(rb"ply(\r\n|\n|\r)", start)
+    if not opening:
+        raise SceneError(f"{path}: has no PLY header (it does not start with 'ply'). Give a 3DGS scene as .ply file.")
+    newline = opening[1]
+    end = start.find(newline + b"end_header" + newline)
+    if end < 0:
+        raise SceneError(f"{path}: the PLY header has no 'end_header' line: the file is truncated or no PLY.")
+    raw = start[: end + len(b"end_header") + 2 * len(newline)]
+    return _parse(path, raw, newline)
+
+
+def _parse(path: Path, raw: bytes, newline: bytes) -> PlyHeader:
+    byte_order: str | None = None
+    elements: list[PlyElement] = []
+    position = 0
+    for number, line in enumerate(raw.split(newline), start=1):
+        words = [word.decode("latin-1") for word in line.split()]
+        match words:
+            case [] | ["comment" | "obj_info", *_] | ["end_header"]:
+                pass
+            case ["ply"] if number == 1:
+                pass
+            case ["format", name, "1.0"] if name in _BYTE_ORDERS and byte_order is None:
+                byte_order = _BYTE_ORDERS[name]
+            # 18 digits are more than any file needs, and stay below the limit of int() on long strings
+            case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count) and byte_order is not None:
+                stop = position + len(line.rstrip())
+                elements.append(PlyElement(name, int(count), (stop - len(count), stop), byte_order))
+            case ["property", *lengths, kind, name] if elements and kind in _TYPES and lengths in _LENGTHS:
+                last = elements[-1]
+                if name in last.kinds:
+                    raise SceneError(
+                        f"{path}: the PLY header declares {last.name}.{name} twice. Export the scene again."
+                    )
+                last.kinds[name] = _TYPES[kind]
+                if lengths:
+                    last.lists[name] = _TYPES[lengths[1]]
+            case _:
+                shown = line[:80].decode("latin-1")
+                raise SceneError(f"{path}: line {number} of the PLY header is invalid: {shown!r}. Export it again.")
+        position += len(line) + len(newline)
+    if byte_order is None:
+        raise SceneError(f"{path}: the PLY header has no 'format' line. Export the scene again.")
+    uses = Counter(each.name for each in elements)
+    for each in elements:
+        if uses[each.name] > 1:
+            raise SceneError(f"{path}: the PLY header declares element {each.name!r} twice. Export the scene again.")
+        if each.count and not each.kinds:
+            raise SceneError(f"{path}: element {each.name!r} of the PLY header has no property. Export it again.")
+    return PlyHeader(byte_order, raw, {each.name: each for each in elements})
+
+
+def check_length(path: Path, header: PlyHeader) -> None:
+    """Check that a file is at least as long as its header declares, without allocating memory for the data.
+
+    Raises:
+        SceneError: If the file is shorter than declared.
+    """
+    least = 0
+    for element in header.elements.values():  # text values have at least a digit and a separator; lists may be empty
+        sizes = [np.dtype(kind).itemsize for kind in {**element.kinds, **element.lists}.values()]
+        least += element.count * (2 * len(sizes) if header.text else sum(sizes))
+    data = path.stat().st_size - len(header.raw)
+    if least - (1 if header.text else 0) > data:  # the last line may lack its line end
+        declared = ", ".join(f"{element.count} {name}" for name, element in header.elements.items())
+        needed = f"which takes at least {least} bytes, but only {data} follow it"
+        raise truncated(path, f"the header declares {declared}, {needed}")
+
+
+def element_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
+    """Return the byte offset of each element's rows in a binary file, by element name; nothing for a text file.
+
+    Rows of text have no fixed length, so their number is only checked when they are parsed.
+
+    Raises:
+        SceneError: If the file is shorter than declared.
+    """
+    check_length(path, header)
+    return {} if header.text else dict(zip(header.elements, _bounds(path, header), strict=False))
+
+
+def surplus(path: Path, header: PlyHeader) -> tuple[str, ...]:
+    """Return the note on what follows the last element of a file; nothing if only padding does.
+
+    Raises:
+        SceneError: If the file was probably transferred as text, or is shorter than declared.
+    """
+    if header.text:
+        with path.open(encoding="latin-1") as lines:
+            lines.seek(len(header.raw))
+            rows = sum(1 for line in lines if line.strip(" \t\r\n\x1a"))
+        rows -= sum(element.count for element in header.elements.values())
+        return about_surplus(max(0, rows), "row")
+    end, size = _bounds(path, header)[-1], path.stat().st_size
+    refuse_text_transfer(path, len(header.raw), header.newline, end, size)
+    last = [*header.elements.values()][-1]
+    return about_part(path, end, size, None if last.lists else last.dtype.itemsize)
+
+
+def _bounds(path: Path, header: PlyHeader) -> list[int]:
+    """Return the byte offset of each element's rows in a binary file, and that of their end."""
+    size, position = path.stat().st_size, len(header.raw)
+    bounds = [position]
+    for element in header.elements.values():
+        if element.lists and element.count:
+            position = _end_of_lists(path, element, position)
+        elif element.count:
+            position += element.count * element.dtype.itemsize
+        if position > size:
+            raise truncated(path, f"ends within element {element.name!r}")
+        bounds.append(position)
+    return bounds
+
+
+def _end_of_lists(path: Path, element: PlyElement, position: int) -> int:
+    """Return the byte offset at which an element with lists ends.
+
+    The length of each list is read, and checked against the size of the file.
+    """
+    if element.count > _MAX_LISTS:
+        raise SceneError(
+            f"{path}: element {element.name!r} has {element.count:,} rows with lists, of at most {_MAX_LISTS:,}. "
+            "Export the Gaussians without it."
+        )
+    steps = [
+        (struct.Struct(element.byte_order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
+        for kind, length in ((kind, element.lists.get(name)) for name, kind in element.kinds.items())
+    ]
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for _ in range(element.count):
+            for length, item_bytes in steps:
+                items = 1
+                if length is not None:
+                    if position + length.size > len(data):
+                        raise truncated(path, f"ends within element {element.name!r}")
+                    items = length.unpack_from(data, position)[0]
+                    if items < 0:
+                        raise SceneError(f"{path}: element {element.name!r} holds a list of length {items}: corrupt.")
+                    position += length.size
+                position += items * item_bytes
+        return position
+
+
+def ply_tag(header: PlyHeader) -> RenderTag:
+    """Return the render mode that the comments and properties of a PLY state; the last comment counts."""
+    names = header.vertex.kinds
+    mode, eps2d, reasons, warnings = None, None, [], []
+    for comment in header.comments:
+        if (match := _MODE.fullmatch(comment)) and match[1].lower() in _MODES:
+            mode = _MODES[match[1].lower()]
+        elif (match := _EPS2D.fullmatch(comment)) and (blur := usable_eps2d(match[1])):
+            eps2d = blur
+        elif _UNSCENTED.search(comment):
+            reason = f"the comment {comment!r} names another projection"
+            differs = "renders differ where Gaussians are large or lenses were distorted"
+            warnings.append(("by linearized projection (EWA)", f"{reason}; {differs}"))
+            continue
+        elif _ABOUT_MODE.search(comment):
+            advice = "if the scene was trained antialiased, add --render-mode antialiased"
+            warnings.append(("classic unless stated otherwise", f"the comment {comment[:80]!r} is unknown; {advice}"))
+            continue
+        else:
+            continue
+        reasons.append(f"the comment {comment!r}")
+    if mode is None and FILTER_3D in names:
+        mode = "antialiased"
+        reasons.append(f"the property {FILTER_3D} of Mip-Splatting")
+    if is_flat(names):
+        mode = "2dgs"
+        reasons.append("the missing property scale_2")
+    usual = _MIP_EPS2D if FILTER_3D in names or "Exported from Brush" in header.comments else EPS2D
+    if eps2d is None:
+        eps2d = usual if mode == "antialiased" else EPS2D
+    return stated(mode or "classic", ", ".join(reasons), eps2d, tuple(warnings))
+
+
+def stated_up(header: PlyHeader) -> tuple[float, float, float] | None:
+    """Return the direction of up that Brush's comment states; None for its default, which means nothing."""
+    up = None
+    for match in filter(None, map(_UP.fullmatch, header.comments)):
+        try:
+            x, y, z = map(float, _NAMED_UP.get(match[1].strip().lower()) or re.split(r"[\s,]+", match[1].strip(" []")))
+        except ValueError:
+            continue
+        up = (x, y, z) if 0 < math.hypot(x, y, z) < math.inf and (x, y, z) != _NAMED_UP["y"] else None
+    return up
+
+
+def is_flat(names: Collection[str]) -> bool:
+    """Return whether properties are those of 2D Gaussian Splatting, whose Gaussians have no third axis."""
+    return "scale_1" in names and "scale_2" not in names and "scale" not in names
+
+
+def comment_lines(rendering: Rendering) -> list[str]:
+    """Return the lines of a PLY header that state a render mode; empty for the default mode."""
+    mode, eps2d = _stating(rendering)
+    return [*([] if rendering.mode == "classic" else [mode]), *([] if rendering.eps2d == EPS2D else [eps2d])]
+
+
+def retagged(raw: bytes, header: PlyHeader, rendering: Rendering) -> bytes:
+    """Add comments that state a render mode to the bytes of a PLY header, unless the header already states that mode.
+
+    Args:
+        raw: Bytes of the header, which may differ from those of `header` in the number of Gaussians.
+    """
+    if ply_tag(header).rendering == rendering:
+        return raw
+    lines = [
+        line
+        for line in raw.split(header.newline)
+        if not any(pattern.fullmatch(comment_of(line) or "") for pattern in (_MODE, _EPS2D))
+    ]
+    after_format = next(i for i, line in enumerate(lines) if line.startswith(b"format")) + 1
+    lines[after_format:after_format] = [line.encode() for line in _stating(rendering)]
+    return header.newline.join(lines)
+
+
+def _stating(rendering: Rendering) -> tuple[str, str]:
+    """Return the lines of a PLY header that state mode and blur."""
+    name = next(name for name, mode in _MODES.items() if mode == rendering.mode)
+    return f"comment SplatRenderMode: {name}", f"comment eps2d {rendering.eps2d!r}"
+
+
+#: Number of Gaussians per chunk. Each chunk has its own quantization bounds.
+CHUNK_ROWS = 256
+
+
+def bounds(prefix: str, axes: str) -> tuple[str, ...]:
+    """Return the names of a compressed PLY's bounds, the lower bounds of all axes first."""
+    return tuple(f"{side}_{prefix}{axis}" for side in ("min", "max") for axis in axes)
+
+
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_BOUNDS = (*bounds("", "xyz"), *bounds("scale_", "xyz"), *bounds("", "rgb"))
+#: Maximum absolute log scale; other writers of the format clamp to it too.
+_LARGEST_SCALE = 20.0
+#: SH coefficient for each byte: the center of its quantization step, or an end of the range for 0 and 255.
+_HARMONICS = (8 * (np.array([0, *(np.arange(1, 255) + 0.5) / 256, 1]) - 0.5)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class CompressedPlyHeader(SceneHeader):
+    """Header of a compressed PLY."""
+
+    ply: PlyHeader
+
+
+def _matches_compressed(start: FileStart) -> bool:
+    return start.head.startswith(b"ply") and re.search(rb"[\r\n]property \w+ packed_position\s", start.head) is not None
+
+
+def _read_compressed_header(start: FileStart) -> CompressedPlyHeader:
+    path = start.path
+    header = read_header(start)
+    vertex, chunk, harmonics = map(header.elements.get, ("vertex", "chunk", "sh"))
+    if vertex is None:
+        raise SceneError(f"{path}: is a compressed PLY without element 'vertex'. Export it again.")
+    if header.text:
+        raise SceneError(f"{path}: is a compressed PLY as text, which no program writes. Export it again as binary.")
+    _check_kinds(path, vertex, "u4", _PACKED)
+    refuse_changed_meaning(path, vertex.kinds)
+    if chunk is None:
+        raise SceneError(f"{path}: is a compressed PLY without element 'chunk', its bounds. Export it again.")
+    _check_kinds(path, chunk, "f4", (*bounds("", "xyz"), *bounds("scale_", "xyz")))
+    if "min_r" in chunk.kinds:
+        _check_kinds(path, chunk, "f4", bounds("", "rgb"))
+    if not vertex.count:
+        raise SceneError(f"{path}: holds no Gaussians (element vertex 0). Export the scene again.")
+    expected = -(-vertex.count // CHUNK_ROWS)
+    if chunk.count != expected:
+        raise SceneError(
+            f"{path}: the header declares {chunk.count} chunks, but {vertex.count} Gaussians make {expected}: it is "
+            "wrong. Export the scene again."
+        )
+    number = len(harmonics.kinds) if harmonics else 0
+    if harmonics:
+        if number not in (9, 24, 45) or harmonics.count != vertex.count:
+            raise SceneError(
+                f"{path}: element 'sh' has {harmonics.count} rows of {number} properties; there should be "
+                f"{vertex.count} of 9, 24 or 45. Export the scene again."
+            )
+        _check_kinds(path, harmonics, "u1", tuple(f"f_rest_{i}" for i in range(number)))
+    element_offsets(path, header)
+    tag, up = ply_tag(header), stated_up(header)
+    return CompressedPlyHeader(COMPRESSED_PLY, vertex.count, number // 3, header, tag=tag, up=up)
+
+
+def _check_kinds(path: Path, element: PlyElement, kind: str, names: tuple[str, ...]) -> None:
+    wrong = [name for name in names if element.kinds.get(name) != kind or name in element.lists]
+    if wrong or element.lists:
+        what = f"{', '.join(wrong)} missing or of another type" if wrong else "a list"
+        raise SceneError(
+            f"{path}: is not a readable compressed PLY: element {element.name!r} has {what}. Export it again."
+        )
+
+
+def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
+    """Fill the arrays of a scene, and return the header with the note on bytes after the last element."""
+    assert isinstance(header, CompressedPlyHeader)
+    notes = surplus(file.path, header.ply)
+    starts = element_offsets(file.path, header.ply)
+    kinds = {name: element.dtype for name, element in header.ply.elements.items()}
+
+    def rows(name: str, first: int, count: int) -> NDArray[Any]:
+        return read_rows(file, kinds[name], starts[name] + first * kinds[name].itemsize, count)
+
+    for block in blocks(header.count):
+        start, count = block.start, block.stop - block.start
+        chunks = rows("chunk", start // CHUNK_ROWS, -(-count // CHUNK_ROWS))
+        _unpack(rows("vertex", start, count), chunks, {name: array[block] for name, array in into.items()})
+        if header.coefficients:
+            harmonics = rows("sh", start, count)
+            for i in range(3 * header.coefficients):
+                channel, index = divmod(i, header.coefficients)
+                into["sh_rest"][block, index, channel] = _HARMONICS[harmonics[f"f_rest_{i}"]]
+    return replace(header, notes=(*header.notes, *notes))
+
+
+def _unpack(rows: NDArray[Any], chunks: NDArray[Any], into: Arrays) -> None:
+    position, rotation, scale, color = (rows[name].astype(np.uint32) for name in _PACKED)
+    chunk = np.arange(len(rows)) // CHUNK_ROWS
+
+    def between(prefix: str, axes: str, fraction: NDArray[np.float64]) -> NDArray[np.float64]:
+        names = bounds(prefix, axes)
+        low, high = (
+            np.stack([chunks[name].astype(np.float64) for name in side], axis=1)[chunk]
+            for side in (names[:3], names[3:])
+        )
+        with np.errstate(invalid="ignore", over="ignore"):  # non-finite results are reported later
+            return low * (1 - fraction) + high * fraction
+
+    with np.errstate(over="ignore"):
+        into["means"][:] = between("", "xyz", _three(position))
+        into["scales"][:] = between("scale_", "xyz", _three(scale))
+        fraction = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
+        colors = between("", "rgb", fraction) if "min_r" in (chunks.dtype.names or ()) else fraction
+        into["sh_dc"][:] = (colors - COLOR_OFFSET) / SH_C0
+    into["opacities"][:] = OPACITY_LOGITS[color & 255]
+    components = np.stack([(rotation >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023
+    into["quats"][:] = with_largest(rotation >> 30, (components - 0.5) * np.sqrt(2))
+
+
+def _three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Unpack 11, 10 and 11 bits to values in 0..1, [n, 3]."""
+    return np.stack([(packed >> 21) / 2047, ((packed >> 11) & 1023) / 1023, (packed & 2047) / 2047], axis=1)
+
+
+def _write(output: BinaryIO, arrays: Arrays, rendering: Rendering) -> None:
+    """Write a compressed PLY.
+
+    Gaussians are sorted along a space-filling curve, so that chunks are compact and their bounds are tight.
+    """
+    count, coefficients = arrays["sh_rest"].shape[:2]
+    order = along_curve(arrays["means"])
+    output.write(_header(count, coefficients, rendering))
+    parts = [order[block] for block in blocks(count)]
+    packed = []
+    for rows in parts:
+        bounds_of, values = _pack({name: array[rows] for name, array in arrays.items() if name != "sh_rest"})
+        output.write(bounds_of.astype("<f4").tobytes())
+        packed.append(values.astype("<u4"))
+    for values in packed:
+        output.write(values.tobytes())
+    if coefficients:
+        for rows in parts:
+            # channel-major, as in PLY
+            rest = arrays["sh_rest"][rows].astype(np.float64).transpose(0, 2, 1)
+            output.write(np.clip(np.floor(rest * 32 + 128), 0, 255).astype(np.uint8).tobytes())
+
+
+def _header(count: int, coefficients: int, rendering: Rendering) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", *comment_lines(rendering)]
+    lines += [f"element chunk {-(-count // CHUNK_ROWS)}"]
+    lines += [f"property float {name}" for name in _BOUNDS]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
+    if coefficients:
+        lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(3 * coefficients))]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+def _pack(arrays: Arrays) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return the bounds [chunks, 18] and compressed values [n, 4] of Gaussians that start at a chunk boundary."""
+    starts = np.arange(0, len(arrays["means"]), CHUNK_ROWS)
+    chunk = np.arange(len(arrays["means"])) // CHUNK_ROWS
+    scales = np.clip(arrays["scales"], -_LARGEST_SCALE, _LARGEST_SCALE)
+    bounds_of, fractions = [], []
+    for values in (
+        arrays["means"],
+        scales,
+        (arrays["sh_dc"].astype(np.float64) * SH_C0 + COLOR_OFFSET).astype(np.float32),
+    ):
+        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        bounds_of += [low, high]
+        extent = high.astype(np.float64) - low
+        fractions.append((values.astype(np.float64) - low[chunk]) / np.where(extent > 0, extent, 1)[chunk])
+    color = [to_steps(fractions[2][:, i], 255) for i in range(3)]
+    packed = np.stack(
+        [
+            _pack_three(fractions[0]),
+            _pack_rotations(arrays["quats"]),
+            _pack_three(fractions[1]),
+            color[0] << 24 | color[1] << 16 | color[2] << 8 | opacity_bytes(arrays["opacities"]).astype(np.uint32),
+        ],
+        axis=1,
+    )
+    return np.concatenate(bounds_of, axis=1), packed
+
+
+def _pack_three(fractions: NDArray[np.float64]) -> NDArray[Any]:
+    x, y, z = (to_steps(fractions[:, i], maximum) for i, maximum in enumerate((2047, 1023, 2047)))
+    packed: NDArray[np.uint32] = x << np.uint32(21) | y << np.uint32(11) | z
+    return packed
+
+
+def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[Any]:
+    largest, three = without_largest(quats)
+    a, b, c = (to_steps(three[:, i] / np.sqrt(2) + 0.5, 1023) for i in range(3))
+    packed: NDArray[np.uint32] = largest.astype(np.uint32) << np.uint32(30)
+    packed |= a << np.uint32(20) | b << np.uint32(10) | c
+    return packed
+
+
+def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the largest distance between positions that can be stored in the chunk of each Gaussian, [n]."""
+    order = along_curve(means)
+    starts = np.arange(0, len(means), CHUNK_ROWS)
+    ends = (side.reduceat(means[order].astype(np.float64), starts) for side in (np.maximum, np.minimum))
+    steps = np.empty(len(means))
+    steps[order] = (np.subtract(*ends) / (2047, 1023, 2047)).max(axis=1)[np.arange(len(means)) // CHUNK_ROWS]
+    return steps
+
+
+COMPRESSED_PLY = SceneFormat(
+    *("compressed.ply", "compressed PLY", 61, _matches_compressed, _read_compressed_header, _read, _write),
+    limits=Limits({"scales": (-_LARGEST_SCALE, _LARGEST_SCALE), "sh_rest": (-4.0, 4.0)}, _step),
+)

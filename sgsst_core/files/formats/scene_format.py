@@ -1,6 +1,14 @@
-"""Registry entry of a scene format, the types of its functions' arguments, and what several formats need.
+"""Registry entry of a scene format, and what several formats need: units, quantization, axes.
 
 A file may state its render mode, and may hold content beyond what its header declares, which is counted and reported.
+
+Programs confuse logarithms of scales and logits of opacities with the values themselves, which gives plausible numbers.
+Formats that store deviations and opacities convert them here, and all scenes are checked after they were read.
+
+Compressed formats share the bytes of opacities, rotations by their three smallest components, and an order. All
+computations use float64, so that the format's own rounding is the only loss.
+
+A PLY has the axes of its cameras: x right, y down, z forward. A `Frame` converts others.
 """
 
 from __future__ import annotations
@@ -15,7 +23,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sgsst_core.constants import EPS2D, SH_DEGREES
+from sgsst_core.constants import EPS2D, SH_DEGREES, spherical_harmonics
 from sgsst_core.errors import SceneError, reading_scene
 from sgsst_core.scene.rendering import CLASSIC, MAX_EPS2D, Rendering
 
@@ -312,3 +320,260 @@ def _is_utf8(data: bytes) -> bool:
         return not codecs.getincrementaldecoder("utf-8")().decode(data).isascii()
     except UnicodeDecodeError:
         return False
+
+
+#: Fraction of values outside their range, above which they have other units.
+_MAX_OUTSIDE = 0.2
+#: Number of Gaussians below which values in an unusual range say nothing, and maximum number that is sampled.
+_MIN_GAUSSIANS, _SAMPLE = 16, 100_000
+#: SH coefficient of degree 0 above which colors are not those of 3DGS: eight times as bright as white.
+_LARGEST_COLOR = 26.0
+#: Range of the largest logit that is doubtful if none is negative: more than trainers reach, at most a byte.
+_DOUBTFUL_LOGITS = (40.0, 255.0)
+#: Ends of the range that coefficients fill if they are colors of 0 to 1.
+_COLOR_ENDS = (0.1, 0.9)
+_HINT = "Export the scene again with logarithms of scales and logits of opacities, as 3DGS trainers write them."
+
+
+def logarithms(path: Path, deviations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the logarithms of stored standard deviations; those of negative ones are NaN.
+
+    Raises:
+        SceneError: If many are negative, because they are logarithms themselves.
+    """
+    if (deviations < 0).mean() > _MAX_OUTSIDE:
+        raise SceneError(
+            f"{path}: its scales are negative, so they are logarithms, but the format stores standard deviations. "
+            "Export the scene again."
+        )
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
+        result: NDArray[np.float64] = np.log(deviations)
+    return result
+
+
+def logits(path: Path, opacities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the logits of stored opacities; those outside 0..1 are NaN.
+
+    Raises:
+        SceneError: If many are outside, because they are logits themselves.
+    """
+    if ((opacities < 0) | (opacities > 1)).mean() > _MAX_OUTSIDE:
+        raise SceneError(
+            f"{path}: its opacities are not in 0..1, so they are logits, but the format stores opacities. "
+            "Export the scene again."
+        )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        result: NDArray[np.float64] = np.log(opacities) - np.log1p(-opacities)
+    return result
+
+
+def check_units(path: Path, arrays: Arrays, flat: float, *, logits_stored: bool) -> tuple[str, ...]:
+    """Check that values are logarithms, logits and SH coefficients, and return notes on doubtful ones.
+
+    Args:
+        arrays: Arrays of the scene, whose invalid Gaussians are ignored.
+        flat: Log scale of axes that the file does not have.
+        logits_stored: Whether the format stores logits. Opacities of others may be in any part of 0..1.
+
+    Raises:
+        SceneError: If scales, opacities or colors were stored as they are.
+    """
+    if len(arrays["means"]) < _MIN_GAUSSIANS:
+        return ()
+    scales, opacities, colors = (_range(arrays[name]) for name in ("scales", "opacities", "sh_dc"))
+    axes = arrays["scales"][:, [axis for axis in range(3) if arrays["scales"][:1, axis] != flat]]
+    scales = _range(axes) if axes.shape[1] else scales
+    activated = opacities[0] >= 0 and 0 < opacities[1] <= 1
+    large = scales[0] >= 0 and scales[1] > 0
+    if large and (activated or _fits_as_deviations(arrays["means"], axes)):
+        also = f", and its opacities from {opacities[0]:.3g} to {opacities[1]:.3g}" if activated else ""
+        raise SceneError(
+            f"{path}: its log scales go from {scales[0]:.3g} to {scales[1]:.3g}{also}: they seem to be stored as they "
+            f"are (activated). {_HINT}"
+        )
+    if activated and logits_stored:
+        raise SceneError(
+            f"{path}: its logits of opacities go from {opacities[0]:.3g} to {opacities[1]:.3g}: they seem to be "
+            f"opacities (activated). {_HINT}"
+        )
+    if colors[0] >= 0 and colors[1] > _LARGEST_COLOR:
+        raise SceneError(
+            f"{path}: its colors (f_dc) go from {colors[0]:.3g} to {colors[1]:.3g}: they seem to be colors of 0 to "
+            "255, not SH coefficients. Export the scene again with (color / 255 - 0.5) / 0.2821."
+        )
+    notes = []
+    if opacities[0] >= 0 and _DOUBTFUL_LOGITS[0] < opacities[1] <= _DOUBTFUL_LOGITS[1]:
+        notes.append(
+            f"logits of opacities go from {opacities[0]:.3g} to {opacities[1]:.3g}, which is opaque; if they are "
+            "opacities of 0 to 100 or 255, export the scene again with logits"
+        )
+    if 0 <= colors[0] < _COLOR_ENDS[0] and _COLOR_ENDS[1] < colors[1] <= 1:
+        notes.append(
+            f"colors (f_dc) go from {colors[0]:.3g} to {colors[1]:.3g}, which is gray to light; if they are colors of "
+            "0 to 1, export the scene again with (color - 0.5) / 0.2821"
+        )
+    return tuple(notes)
+
+
+def _range(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the smallest and the largest of values that are not NaN."""
+    with np.errstate(invalid="ignore"):
+        return float(np.fmin.reduce(values, axis=None)), float(np.fmax.reduce(values, axis=None))
+
+
+def _fits_as_deviations(means: NDArray[np.float32], scales: NDArray[np.float32]) -> bool:
+    """Return whether sizes fit the distance between neighbors better as they are than as logarithms.
+
+    Args:
+        means: Positions [N, 3].
+        scales: Scales [N, axes], at least 0.
+    """
+    step = -(-len(means) // _SAMPLE)
+    low, high = np.nanquantile(means[::step], (0.05, 0.95), axis=0)
+    extent = float((high - low).max())
+    size = float(np.nanmedian(scales[::step].max(axis=1)))
+    if not 0 < size < extent:
+        return False
+    distance = np.log(extent / np.sqrt(len(means)))
+    return bool(abs(np.log(size) - distance) < abs(size - distance))
+
+
+#: Opacities of exactly 0 and 1 have no finite logit, so they are read as 0.25/255 and 1 - 0.25/255. The difference is
+#: below the rounding of these formats, and invisible in 8-bit images.
+_MIN_OPACITY = 0.25 / 255
+_OTHER_THREE = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+_OPACITIES = np.clip(np.arange(256) / 255, _MIN_OPACITY, 1 - _MIN_OPACITY)
+#: Logit of the opacity i / 255 for each byte i, [256] float32.
+OPACITY_LOGITS: NDArray[np.float32] = np.log(_OPACITIES / (1 - _OPACITIES)).astype(np.float32)
+
+
+def opacity_bytes(logits: NDArray[Any]) -> NDArray[Any]:
+    """Convert logits [n] to opacities in 255ths, [n] uint8. Infinite logits become 0 and 255."""
+    # tanh neither overflows nor loses small values
+    return np.rint(127.5 * (1 + np.tanh(0.5 * logits.astype(np.float64)))).astype(np.uint8)
+
+
+def to_steps(values: NDArray[Any], maximum: int) -> NDArray[np.uint32]:
+    """Quantize values to uint32 steps 0..maximum, which cover the range 0..1. Values outside it are clamped."""
+    steps: NDArray[np.uint32] = np.rint(np.clip(values, 0, 1) * maximum).astype(np.uint32)
+    return steps
+
+
+def with_largest(index: NDArray[Any], three: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Restore unit quaternions [n, 4] from three components [n, 3] and the index [n] of the omitted one.
+
+    The omitted component is positive, and follows from the unit length.
+    """
+    rows = np.arange(len(index))
+    quats = np.empty((len(index), 4))
+    quats[rows[:, None], _OTHER_THREE[index]] = three
+    quats[rows, index] = np.sqrt(np.maximum(0, 1 - (three**2).sum(axis=1)))
+    return quats
+
+
+def without_largest(quats: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the index [n] of the largest component of quaternions [n, 4], and the other three components [n, 3].
+
+    Quaternions are normalized, and their sign is chosen so that the largest component is positive. A quaternion of
+    length 0 is restored as (1, 0, 0, 0), which is the identity if the real part comes first.
+    """
+    values = quats.astype(np.float64)
+    largest = np.abs(values).argmax(axis=1)
+    rows = np.arange(len(values))
+    length = np.linalg.norm(values, axis=1) * np.where(values[rows, largest] < 0, -1, 1)
+    values = values / np.where(length == 0, 1, length)[:, None]
+    return largest, values[rows[:, None], _OTHER_THREE[largest]]
+
+
+def along_curve(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the indices that sort Gaussians along a Z-order curve with 21 bits per axis."""
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    cells = np.where(high > low, high - low, 1)
+    code = np.zeros(len(means), np.uint64)
+    for axis in range(3):
+        values = to_steps((means[:, axis] - low[axis]) / cells[axis], (1 << 21) - 1).astype(np.uint64)
+        # insert two empty bits after each bit
+        for shift, mask in (
+            (32, 0x1F00000000FFFF),
+            (16, 0x1F0000FF0000FF),
+            (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3),
+            (2, 0x1249249249249249),
+        ):
+            values = (values | (values << np.uint64(shift))) & np.uint64(mask)
+        code |= values << np.uint64(axis)
+    return code.argsort(kind="stable")
+
+
+#: Rotation by 180 degrees about z, [4, 4], which converts between a PLY and axes with y up and z forward, as of glTF.
+Y_UP = np.diag([-1.0, -1.0, 1.0, 1.0])
+#: Number of directions from which the matrices of spherical harmonics are computed; 15 determine degree 3.
+_DIRECTIONS = 64
+#: Decimals of a matrix of spherical harmonics: float64 leaves more, and a rotation by 180 degrees gets exact signs.
+_DECIMALS = 12
+#: Largest factor, whose third power does not overflow.
+_LARGEST = 1e30
+#: Maximum deviation of a matrix from a rotation, relative to its scale.
+_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Similarity transformation of a scene: x becomes scale * rotation x + translation.
+
+    Attributes:
+        rotation: Rotation, [3, 3] float64.
+        scale: Positive factor.
+        translation: Translation, [3] float64.
+    """
+
+    rotation: NDArray[np.float64]
+    scale: float
+    translation: NDArray[np.float64]
+
+    @staticmethod
+    def of(matrix: NDArray[np.float64]) -> Frame:
+        """Split an affine transformation [4, 4].
+
+        Raises:
+            ValueError: If it mirrors or distorts.
+        """
+        linear = matrix[:3, :3]
+        if not np.isfinite(matrix).all() or np.abs(linear).max() > _LARGEST:
+            raise ValueError("the transformation is not finite")
+        scale = float(np.cbrt(np.linalg.det(linear)))
+        if scale <= 0 or np.abs(linear @ linear.T - scale**2 * np.eye(3)).max() > _TOLERANCE * scale**2:
+            raise ValueError("the transformation mirrors or distorts the scene")
+        return Frame(linear / scale, scale, matrix[:3, 3])
+
+    def apply(self, arrays: Arrays) -> None:
+        """Transform the arrays of a scene in place. Computes in float64; rotations by 180 degrees are exact."""
+        from scipy.spatial.transform import Rotation  # not for the API process, which only reads headers
+
+        x, y, z, w = Rotation.from_matrix(self.rotation).as_quat()
+        turn = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])  # left multiplication, wxyz
+        harmonics = harmonics_matrix(self.rotation, arrays["sh_rest"].shape[1])
+        for part in blocks(len(arrays["means"])):
+            block = {name: array[part] for name, array in arrays.items()}
+            means = block["means"].astype(np.float64)
+            block["means"][:] = self.scale * (means @ self.rotation.T) + self.translation
+            if self.scale != 1:
+                block["scales"] += np.float32(np.log(self.scale))
+            block["quats"][:] = block["quats"].astype(np.float64) @ turn.T
+            rest = block["sh_rest"].astype(np.float64)
+            block["sh_rest"][:] = np.einsum("ij,njc->nic", harmonics, rest)
+
+
+def harmonics_matrix(rotation: NDArray[np.float64], coefficients: int) -> NDArray[np.float64]:
+    """Return the matrix of SH coefficients above degree 0, [coefficients, coefficients], of a rotation or reflection.
+
+    A rotated function has the value at d that the original has at the inversely rotated d, for all directions d.
+    """
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    values = (spherical_harmonics(*each.T)[:coefficients] for each in (directions, directions @ rotation))
+    new, old = (np.reshape(each, (coefficients, _DIRECTIONS)).T for each in values)
+    matrix: NDArray[np.float64] = np.round(np.linalg.lstsq(new, old, rcond=None)[0], _DECIMALS)
+    return matrix

@@ -1,4 +1,4 @@
-"""Reader and writer of PlayCanvas' SOG: a ZIP archive, or a folder, with meta.json and WebP images, or PNGs.
+"""PlayCanvas' SOG, a ZIP archive or a folder with meta.json and WebP images, or PNGs, and streamed SOG.
 
 Pixel i of each image belongs to Gaussian i; pixels after the last one mean nothing. Positions are 16-bit steps on a
 logarithmic scale, in two images. Scales and colors are indices into codebooks of 256 values. Rotations have three
@@ -6,6 +6,16 @@ components of 8 bits. SH coefficients are a palette of up to 65,536 vectors. Ver
 in place of codebooks. The layout is that of https://developer.playcanvas.com/user-manual/gaussian-
 splatting/formats/sog. Axes are those of the PLY. The field `model` of meta.json is the render mode, as splat-transform
 writes it; `antialias` was its older form. Written files have their blur in `extras`, which is for programs' own values.
+
+Codebook and palette are found by Lloyd's algorithm (k-means) from deterministic starts. If there are no more distinct
+values than entries, the codebook holds them exactly, in an order that depends on the values alone, so a scene that was
+read from codebooks is written without further loss.
+
+A streamed SOG is read at its finest level, and written with other colors. lod-meta.json lists SOG scenes in folders of
+their own, each with Gaussians of one level of detail, and has a tree whose leaves refer to ranges of them. The layout
+is that of https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog; early files lack its
+version and counts. The environment, which is drawn beside any level, is part of the scene. All files may be in a ZIP
+archive.
 """
 
 from __future__ import annotations
@@ -16,8 +26,14 @@ import math
 import re
 import struct
 import zipfile
-from dataclasses import dataclass
-from typing import Any, BinaryIO
+import zlib
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import IO, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,30 +42,309 @@ from PIL import Image
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files.advice import SCENES, converted, known_kind, refuse_changed_meaning
-from sgsst_core.files.formats.archive import ZIP_MAGIC, FilesOfScene
-from sgsst_core.files.formats.codebooks import VALUES, nearest_entries, palette, value_codebook
-from sgsst_core.files.formats.quantized import (
-    OPACITY_LOGITS,
-    along_curve,
-    opacity_bytes,
-    to_steps,
-    with_largest,
-    without_largest,
-)
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
+    OPACITY_LOGITS,
     Arrays,
     FileStart,
     Limits,
     OpenScene,
     SceneFormat,
     SceneHeader,
+    about_surplus,
+    along_curve,
     blocks,
     extras_of,
     extras_tag,
     json_numbers,
+    opacity_bytes,
+    read_bytes,
+    to_steps,
+    with_largest,
+    without_largest,
+    without_padding,
 )
 from sgsst_core.scene.rendering import Rendering
+
+ZIP_MAGIC = b"PK\x03\x04"
+#: Record at the end of a ZIP archive, and its signature; archives above 4 GB have a locator of another record before.
+_END = struct.Struct("<4s4H2LH")
+_END_MAGIC, _LOCATOR_MAGIC, _LOCATOR_BYTES = b"PK\x05\x06", b"PK\x06\x07", 20
+_MAX_COMMENT_BYTES = 1 << 16
+#: Maximum number of files in the archive of a scene, and bytes of their list.
+_MAX_ENTRIES = 256
+_MAX_DIRECTORY_BYTES = 1 << 18
+
+
+class FilesOfScene:
+    """Files of a scene: those of an archive, or those beside one of them.
+
+    Args:
+        path: Path of the archive, or of a file in the folder.
+        folder: Prefix of all names, such as "0_0/".
+        archive: Archive that is open already; None opens it for each file.
+
+    Attributes:
+        surplus: Note on bytes before or after the archive.
+    """
+
+    def __init__(self, path: Path, folder: str = "", archive: zipfile.ZipFile | None = None) -> None:
+        self.path, self.folder, self._archive = path, folder, archive
+        self.is_archived = read_bytes(path, 0, 4) == ZIP_MAGIC
+        self.surplus: tuple[str, ...] = ()
+        if self.is_archived and archive is None:
+            end = archive_end(path)
+            if end.entries > _MAX_ENTRIES or end.list_bytes > _MAX_DIRECTORY_BYTES:
+                raise SceneError(f"{path}: is a ZIP archive of {end.entries} files, so no SOG scene. Unpack it first.")
+            self.surplus = end.surplus
+
+    def size(self, name: str) -> int:
+        """Return an upper bound for the bytes of a file: its size, or that of the archive, whose list may be wrong."""
+        try:
+            return (self.path if self.is_archived else self.path.parent / (self.folder + name)).stat().st_size
+        except OSError as error:
+            raise self._unreadable(name, error) from error
+
+    def load(self, name: str, limit: int, *, whole: bool = True) -> bytes:
+        """Return the content of a file of at most `limit` bytes, or its first `limit` bytes if `whole` is False."""
+        where = self.folder + name
+        try:
+            with self._open(where) as file:
+                data = file.read(limit + whole)
+        except KeyError as error:
+            if self._archive is not None:
+                raise SceneError(f"{self.path}: {where} is missing. Archive or export the scene again.") from error
+            raise SceneError(
+                f"{self.path}: is a ZIP archive without {name}, so no SOG scene. Unpack it, and give the scene in it."
+            ) from error
+        except OSError as error:
+            raise self._unreadable(name, error) from error
+        except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, struct.error) as error:
+            raise SceneError(f"{self.path}: {where} is damaged: {error}. Copy or export the scene again.") from error
+        if len(data) > limit:
+            raise SceneError(
+                f"{self.path}: {where} has more than {limit} bytes, too many for this scene. Export it again."
+            )
+        return data
+
+    def _unreadable(self, name: str, error: OSError) -> SceneError:
+        return SceneError(
+            f"{self.path}: {self.folder}{name} cannot be read: {error.strerror}. Give the whole folder, or an archive."
+        )
+
+    @contextmanager
+    def _open(self, name: str) -> Iterator[IO[bytes]]:
+        if not self.is_archived:
+            with (self.path.parent / name).open("rb") as file:
+                yield file
+        elif self._archive is not None:
+            with _opened_member(self._archive, name) as file:
+                yield file
+        else:
+            with zipfile.ZipFile(self.path) as archive, _opened_member(archive, name) as file:
+                yield file
+
+
+def _opened_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise zipfile.BadZipFile("its compression is not supported")
+    return archive.open(name)
+
+
+class ArchiveEnd(NamedTuple):
+    """Statement at the end of an archive.
+
+    Attributes:
+        list_start, list_bytes: Position of their list, and its size.
+        surplus: Note on bytes before or after the archive.
+    """
+
+    entries: int
+    list_start: int
+    list_bytes: int
+    surplus: tuple[str, ...]
+
+
+def archive_end(path: Path) -> ArchiveEnd:
+    """Read the end of an archive, before its list of files is read.
+
+    Raises:
+        SceneError: If it is truncated, or larger than 4 GB.
+    """
+    with path.open("rb") as file:
+        size = file.seek(0, io.SEEK_END)
+        file.seek(max(0, size - _LOCATOR_BYTES - _END.size - _MAX_COMMENT_BYTES))
+        tail = file.read()
+    position = tail.rfind(_END_MAGIC)
+    if position < 0 or position + _END.size > len(tail):
+        raise SceneError(f"{path}: is a truncated ZIP archive. Copy or export the scene again.")
+    entries, list_bytes, list_offset, comment_bytes = _END.unpack_from(tail, position)[4:]
+    if tail[max(0, position - _LOCATOR_BYTES) : position].startswith(_LOCATOR_MAGIC):
+        raise SceneError(f"{path}: is a ZIP archive of more than 4 GB, which cannot be read. Unpack it first.")
+    list_start = size - len(tail) + position - list_bytes
+    after = without_padding(tail[position + _END.size + comment_bytes :])
+    surplus = about_surplus(max(0, list_start - list_offset) + len(after), "byte")
+    return ArchiveEnd(entries, max(0, list_start), list_bytes, surplus)
+
+
+#: Number of values of a codebook, one per byte.
+VALUES = 256
+_VALUE_ITERATIONS = 60
+#: Maximum number of starts of a codebook. Only numbers with extreme values need more than one.
+_VALUE_STARTS = 4
+
+#: Clusters of the first level of a palette, rows that they are fitted to, and iterations per level.
+_COARSE = 256
+_COARSE_ROWS = 1 << 16
+_COARSE_ITERATIONS = 8
+_FINE_ITERATIONS = 6
+#: Number of rows whose distances to all centers are in memory at a time.
+_BLOCK_ROWS = 1 << 14
+
+
+def value_codebook(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the codebook of numbers of any shape, [VALUES] float32 in ascending order, padded with its largest value.
+
+    Lloyd's algorithm on sorted numbers: a cluster is an interval, whose mean follows from two cumulative sums. It
+    starts with entries whose density is the cube root of that of the numbers, which is best for a fine quantizer. While
+    extreme numbers leave most entries unused, these are moved to where the error is.
+    """
+    ordered = np.sort(values, axis=None).astype(np.float64)
+    distinct = ordered[np.concatenate([[True], ordered[1:] != ordered[:-1]])]
+    if len(distinct) <= VALUES:
+        return _padded(distinct.astype(np.float32))
+    origin = ordered.mean()  # sums of differences from the mean cancel less
+    sums = np.concatenate([[0.0], np.cumsum(ordered - origin)])
+    codebook = _companded(ordered)
+    for _ in range(_VALUE_STARTS):
+        for _ in range(_VALUE_ITERATIONS):
+            edges = np.concatenate([[0], np.searchsorted(ordered, _middles(codebook)), [len(ordered)]])
+            counts = np.diff(edges)
+            means = origin + np.diff(sums[edges]) / np.maximum(counts, 1)
+            codebook = np.sort(np.where(counts > 0, means, codebook))
+        entries = codebook.astype(np.float32)
+        used = entries[np.unique(nearest_entries(ordered, entries))]
+        if len(used) >= VALUES // 2:
+            break
+        codebook = _with_unused_entries(ordered, used)
+    return _padded(used)
+
+
+def _with_unused_entries(ordered: NDArray[np.float64], used: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Add entries up to VALUES, in each cluster of sorted numbers in proportion to the cube root of its squared error.
+
+    They are evenly spaced within the numbers of a cluster.
+    """
+    labels = nearest_entries(ordered, used)
+    first = np.searchsorted(labels, np.arange(len(used)))
+    last = np.append(first[1:], len(ordered)) - 1
+    cumulative = np.cumsum(np.cbrt(np.bincount(labels, (ordered - used[labels]) ** 2)))
+    bounds = np.repeat(np.append(0.0, cumulative), 2)[1:-1]
+    shares = (np.arange(VALUES - len(used)) + 0.5) / (VALUES - len(used))
+    added = np.interp(shares * cumulative[-1], bounds, np.stack([ordered[first], ordered[last]], axis=1).ravel())
+    return np.sort(np.concatenate([used, added]))
+
+
+def _padded(entries: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.pad(entries, (0, VALUES - len(entries)), mode="edge")
+
+
+def _companded(ordered: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return VALUES entries whose density is the cube root of that of sorted numbers."""
+    bins = 4096
+    counts, edges = np.histogram(ordered, bins)
+    cumulative = np.concatenate([[0.0], np.cumsum(np.cbrt(counts))])
+    shares = (np.arange(VALUES) + 0.5) / VALUES
+    entries: NDArray[np.float64] = np.interp(shares * cumulative[-1], cumulative, edges)
+    return entries
+
+
+def _middles(codebook: NDArray[Any]) -> NDArray[np.float64]:
+    wide = codebook.astype(np.float64)
+    return (wide[1:] + wide[:-1]) / 2
+
+
+def nearest_entries(values: NDArray[Any], codebook: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return the index of the nearest entry of an ascending codebook for each number, as uint8."""
+    return np.searchsorted(_middles(codebook), values.astype(np.float64)).astype(np.uint8)
+
+
+def palette(rows: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return at most `size` vectors [K, D] that represent rows [n, D], and the index of each row's vector, [n].
+
+    Rows are clustered in two levels: each of `_COARSE` clusters is divided into a number of clusters that is
+    proportional to its squared error. A row is compared with some hundred centers rather than with all of them.
+    """
+    distinct, labels = _distinct_rows(rows, size)
+    if distinct is not None:
+        return distinct, labels
+    sample = rows[:: max(1, len(rows) // _COARSE_ROWS)]
+    coarse = _lloyd(sample, _start(sample, _COARSE), _COARSE_ITERATIONS)
+    groups, distances = _nearest_rows(rows, coarse)
+    counts = np.bincount(groups, minlength=len(coarse))
+    errors = np.bincount(groups, weights=distances, minlength=len(coarse))
+    shares = np.minimum(counts, np.maximum(1, np.floor((size - _COARSE) * errors / max(errors.sum(), 1e-30)) + 1))
+    order = np.argsort(groups, kind="stable")
+    centers: list[NDArray[np.float32]] = []
+    first = 0
+    for members, share in zip(np.split(order, np.cumsum(counts)[:-1]), shares.astype(int), strict=True):
+        if not len(members):
+            continue
+        own = rows[members]
+        own_centers = _lloyd(own, _start(own, share), _FINE_ITERATIONS)
+        labels[members] = first + _nearest_rows(own, own_centers)[0]
+        centers.append(own_centers)
+        first += len(own_centers)
+    return np.concatenate(centers), labels
+
+
+def _distinct_rows(rows: NDArray[np.float32], size: int) -> tuple[NDArray[np.float32] | None, NDArray[np.int64]]:
+    """Return the distinct rows and each row's index among them; None and zeros if there are more than `size`."""
+    none = None, np.zeros(len(rows), np.int64)
+    keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).reshape(-1)
+    if len(np.unique(keys[: 2 * size])) > size:
+        return none
+    _, first, labels = np.unique(keys, return_index=True, return_inverse=True)
+    return none if len(first) > size else (rows[first], labels.reshape(-1).astype(np.int64))
+
+
+def _start(rows: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    """Return `count` rows that are spread evenly along the direction of the largest variance."""
+    middle = rows - rows.mean(axis=0)
+    _, vectors = np.linalg.eigh(middle.T.astype(np.float64) @ middle)
+    order = np.argsort(middle @ vectors[:, -1].astype(np.float32), kind="stable")
+    return rows[order[((np.arange(count) + 0.5) / count * len(rows)).astype(np.int64)]]
+
+
+def _lloyd(rows: NDArray[np.float32], centers: NDArray[np.float32], iterations: int) -> NDArray[np.float32]:
+    """Return centers after some iterations of Lloyd's algorithm. Centers without rows stay."""
+    if len(rows) <= len(centers):
+        return centers
+    for _ in range(iterations):
+        labels, _ = _nearest_rows(rows, centers)
+        order = np.argsort(labels, kind="stable")
+        used, first = np.unique(labels[order], return_index=True)
+        sums = np.add.reduceat(rows[order].astype(np.float64), first, axis=0)
+        centers = centers.copy()
+        centers[used] = sums / np.diff(np.append(first, len(rows)))[:, None]
+    return centers
+
+
+def _nearest_rows(
+    rows: NDArray[np.float32], centers: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the index of each row's nearest center, and its squared distance."""
+    labels = np.empty(len(rows), np.int64)
+    distances = np.empty(len(rows), np.float32)
+    lengths = (centers**2).sum(axis=1)
+    for start in range(0, len(rows), _BLOCK_ROWS):
+        block = rows[start : start + _BLOCK_ROWS]
+        scores = lengths - 2 * (block @ centers.T)
+        nearest = scores.argmin(axis=1)
+        labels[start : start + len(block)] = nearest
+        distances[start : start + len(block)] = ((block - centers[nearest]) ** 2).sum(axis=1)
+    return labels, distances
+
 
 #: Name of the file that describes a scene, in an archive or a folder.
 META_NAME = "meta.json"
@@ -427,3 +722,260 @@ def _step(means: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 SOG = SceneFormat("sog", "SOG", 14, _matches, _read_header, _read, _write, limits=Limits(step=_step))
+
+
+#: Name of the index in a folder or an archive.
+INDEX_NAME = "lod-meta.json"
+_MAX_INDEX_BYTES = 1 << 21
+#: Maximum bytes of the list of an archive's files, and number of SOG scenes; usual ones have half a million Gaussians.
+_MAX_LIST_BYTES, _MAX_PARTS = 1 << 21, 1024
+#: Path of the meta.json of a part: in folders below the index, so that no other files are read.
+_PART = re.compile(rf"((?:[\w-][\w.-]{{0,99}}/){{1,4}}){re.escape(META_NAME)}")
+
+
+@dataclass(frozen=True)
+class _Part:
+    """SOG scene with the Gaussians of one level, or of the environment, whose level is None."""
+
+    folder: str
+    level: int | None
+    header: SogHeader
+
+
+@dataclass(frozen=True)
+class StreamedHeader(SceneHeader):
+    """Header of a streamed SOG.
+
+    Attributes:
+        parts: All parts, those of the scene first.
+        ends: End of the Gaussians of each part of the scene among those of the scene, after a 0.
+    """
+
+    parts: tuple[_Part, ...]
+    ends: tuple[int, ...]
+
+    @property
+    def rows(self) -> list[tuple[_Part, slice]]:
+        """Return the parts of the scene with the slices of their Gaussians."""
+        return [(part, slice(*span)) for part, span in zip(self.parts, pairwise(self.ends), strict=False)]
+
+
+class _Opened:
+    """Open streamed SOG.
+
+    Attributes:
+        surplus: Note on bytes around an archive.
+    """
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile | None) -> None:
+        self._path, self._archive, self._above = path, archive, ""
+        self.surplus: tuple[str, ...] = ()
+        if archive is not None:
+            names = [name for name in archive.namelist() if f"/{name}".endswith(f"/{INDEX_NAME}")]
+            self._above = min(names, key=len, default="").removesuffix(INDEX_NAME)  # an archive may hold the folder
+            self.surplus = archive_end(path).surplus
+        name = INDEX_NAME if archive is not None else path.name
+        self.index = FilesOfScene(path, self._above, archive).load(name, _MAX_INDEX_BYTES)
+
+    def part(self, folder: str) -> SogFiles:
+        """Return the files of a part."""
+        return SogFiles(self._path, self._above + folder, self._archive)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Opened]:
+    if read_bytes(path, 0, 4) != ZIP_MAGIC:
+        yield _Opened(path, None)
+        return
+    try:
+        archive = zipfile.ZipFile(path)
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+        raise SceneError(f"{path}: is a damaged ZIP archive: {error}. Copy or export the scene again.") from error
+    with archive:
+        yield _Opened(path, archive)
+
+
+def _matches_streamed(start: FileStart) -> bool:
+    if not start.head.startswith(ZIP_MAGIC):
+        return start.head.lstrip().startswith(b"{") and b'"lodLevels"' in start.head
+    if known_kind(start.path, start.head, SCENES):
+        return False
+    try:
+        end = archive_end(start.path)
+    except SceneError:  # raised again by the reader of SOG
+        return False
+    names = read_bytes(start.path, end.list_start, end.list_start + min(end.list_bytes, _MAX_LIST_BYTES + 1))
+    return len(names) <= _MAX_LIST_BYTES and INDEX_NAME.encode() in names
+
+
+def _read_streamed_header(start: FileStart) -> StreamedHeader:
+    with _opened(start.path) as opened:
+        try:
+            index = json.loads(opened.index)
+            folders = _levels(index)
+        except WRONG_JSON as error:
+            raise SceneError(
+                f"{start.path}: {INDEX_NAME} is not that of a streamed SOG ({repr(error)[:200]}). Export the scene "
+                "again."
+            ) from error
+        parts = [_part(start.path, opened, folder, *entry) for folder, entry in folders.items()]
+    levels = sorted({part.level for part in parts if part.level is not None})
+    if not levels:
+        raise SceneError(f"{start.path}: {INDEX_NAME} refers to no Gaussians. Export the scene again.")
+    scene = [part for part in parts if part.level in (levels[0], None)]
+    ends = (0, *accumulate(part.header.count for part in scene))
+    if read_bytes(start.path, 0, 4) == ZIP_MAGIC and ends[-1] > GAUSSIANS_PER_BYTE * start.size:
+        raise SceneError(f"{start.path}: declares {ends[-1]} Gaussians, more than it can hold. Export the scene again.")
+    notes = (f"the finest of {len(levels)} levels of detail is read; a .zip of it has all of them, with its colors",)
+    return StreamedHeader(
+        STREAMED_SOG,
+        ends[-1],
+        max(part.header.coefficients for part in scene),
+        (*scene, *(part for part in parts if part.level not in (levels[0], None))),
+        ends,
+        notes=opened.surplus + (notes if len(levels) > 1 else ()),
+        tag=scene[0].header.tag,
+    )
+
+
+def _levels(index: dict[str, Any]) -> dict[str, tuple[int | None, list[tuple[int, int]]]]:
+    """Return the level of each part, and the ranges of it that the tree refers to, by the part's folder.
+
+    Errors of `WRONG_JSON` mean that a value is missing or wrong.
+    """
+    if index.get("version", 1) != 1:
+        raise ValueError(f"version: {index['version']}")
+    names, most = index["filenames"], index["lodLevels"]
+    if len(names) > _MAX_PARTS:
+        raise ValueError(f"{len(names)} files, of at most {_MAX_PARTS}")
+    ranges: dict[tuple[str, int], list[tuple[int, int]]] = defaultdict(list)
+    nodes = [index["tree"]]
+    while nodes:
+        node = nodes.pop()
+        nodes += node.get("children", [])
+        for level, range_ in node.get("lods", {}).items():
+            file, offset, count = numbers = [range_[name] for name in ("file", "offset", "count")]
+            if not all(type(value) is int and value >= 0 for value in numbers) or not 0 <= int(level) < most:
+                raise ValueError(f"level {level} of {most}: {range_}")
+            ranges[_folder(names[file]), int(level)].append((offset, count))
+    totals: dict[int, int] = defaultdict(int)
+    for (_, own), spans in ranges.items():
+        totals[own] += sum(size for _, size in spans)
+    for own, count in enumerate(index.get("counts", [])):
+        if totals[own] != count:
+            raise ValueError(f"level {own} has {totals[own]} Gaussians in place of {count}")
+    order = {name: number for number, name in enumerate(map(_folder, names))}
+    parts: dict[str, tuple[int | None, list[tuple[int, int]]]] = {
+        folder: (level, spans) for (folder, level), spans in sorted(ranges.items(), key=lambda item: order[item[0][0]])
+    }
+    if len(parts) != len(ranges):
+        raise ValueError("a file has several levels")
+    if index.get("environment"):
+        folder = _folder(index["environment"])
+        if folder in parts:
+            raise ValueError(f"environment: {folder}")
+        parts[folder] = None, []
+    return parts
+
+
+def _folder(name: str) -> str:
+    """Return the folder of a part, with a slash at its end, given the path of its meta.json."""
+    match = _PART.fullmatch(name)
+    if match is None:
+        raise ValueError(f"file {name[:100]!r}: not the {META_NAME} of a folder beside {INDEX_NAME}")
+    return match[1]
+
+
+def _part(path: Path, opened: _Opened, folder: str, level: int | None, ranges: list[tuple[int, int]]) -> _Part:
+    """Return a part, after checking that the tree refers to each of its Gaussians once."""
+    header = sog_header(opened.part(folder))
+    end = 0
+    for offset, count in sorted(ranges):
+        end = end + count if offset == end else -1
+    if level is not None and end != header.count:
+        raise SceneError(
+            f"{path}: {folder}{META_NAME} has {header.count} Gaussians, but {INDEX_NAME} does not refer to each once. "
+            "Export the scene again."
+        )
+    return _Part(folder, level, header)
+
+
+def _read_streamed(file: OpenScene, header: SceneHeader, into: Arrays) -> SceneHeader:
+    assert isinstance(header, StreamedHeader)
+    with _opened(file.path) as opened:
+        for part, rows in header.rows:
+            arrays = {name: array[rows] for name, array in into.items()}
+            if "sh_rest" in arrays:
+                arrays["sh_rest"][:, part.header.coefficients :] = 0
+                arrays["sh_rest"] = arrays["sh_rest"][:, : part.header.coefficients]
+            read_sog(opened.part(part.folder), part.header, arrays)
+    notes = (note for part, _ in header.rows for note in part.header.notes)
+    return replace(header, notes=tuple(dict.fromkeys((*header.notes, *notes))))
+
+
+def pack(index: Path, target: Path) -> None:
+    """Write a streamed SOG to an archive, given its index in a folder.
+
+    Raises:
+        SceneError: If it is no streamed SOG, or a file is missing.
+    """
+    header = _read_streamed_header(FileStart(index, b"", index.stat().st_size))
+    with _opened(index) as opened, zipfile.ZipFile(target, "w") as archive:
+        for part in header.parts:
+            unchanged = np.zeros((part.header.count, 3), np.float32)
+            for name, data in recolored(opened.part(part.folder), part.header, unchanged).items():
+                archive.writestr(zipfile.ZipInfo(part.folder + name), data)
+        archive.writestr(zipfile.ZipInfo(INDEX_NAME), opened.index)
+
+
+def write_recolored(
+    original: Path,
+    header: StreamedHeader,
+    means: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    archive: zipfile.ZipFile,
+) -> None:
+    """Archive a streamed SOG with the colors of a scene that is its finest level with other colors.
+
+    A Gaussian of a coarser level takes the change of the nearest one of the finest level. All but colors keeps its
+    bytes, and everything does in parts in which none changes.
+
+    Args:
+        original: Streamed SOG: its index or an archive.
+        means, colors: Positions and SH coefficients of degree 0 of the scene, [n, 3].
+        archive: Open archive that gets the files; the index comes last.
+
+    Raises:
+        SceneError: If `original` cannot be read.
+        OutputError: If the scene has other Gaussians.
+    """
+    from scipy.spatial import cKDTree
+
+    with _opened(original) as opened:
+        own: Arrays = {name: np.empty((header.count, 3), np.float32) for name in ("means", "sh_dc")}
+        for part, rows in header.rows:
+            read_positions(opened.part(part.folder), part.header, own["means"][rows])
+            read_colors(opened.part(part.folder), part.header, own["sh_dc"][rows])
+        if not np.array_equal(means, own["means"]):
+            raise OutputError(
+                f"the scene's Gaussians are not those of the finest level of {original}, in the same order. Give that "
+                "level with other colors, as a PLY, without --refine."
+            )
+        change, tree = colors - own["sh_dc"], cKDTree(means)
+        rows_of = {part.folder: rows for part, rows in header.rows}
+        for part in header.parts:
+            files = opened.part(part.folder)
+            if part.folder in rows_of:
+                changed = change[rows_of[part.folder]]
+            else:
+                positions = np.empty((part.header.count, 3), np.float32)
+                read_positions(files, part.header, positions)
+                changed = change[tree.query(np.nan_to_num(positions))[1]]
+            for name, data in recolored(files, part.header, changed).items():
+                archive.writestr(zipfile.ZipInfo(part.folder + name), data)
+        archive.writestr(zipfile.ZipInfo(INDEX_NAME), opened.index)
+
+
+STREAMED_SOG = SceneFormat(
+    "zip", "streamed SOG", 14, _matches_streamed, _read_streamed_header, _read_streamed, media_type="application/zip"
+)

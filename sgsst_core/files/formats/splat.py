@@ -1,17 +1,41 @@
-"""Reader of antimatter15's .splat format: 32 bytes per Gaussian, without spherical harmonics above degree 0.
+"""Readers of antimatter15's .splat and mkkellogg's .ksplat.
 
-Positions and standard deviations are float32. The components of color, opacity and rotation (wxyz) have 8 bits each.
+A .splat has 32 bytes per Gaussian, without spherical harmonics above degree 0. Positions and standard deviations are
+float32. The components of color, opacity and rotation (wxyz) have 8 bits each.
+
+A .ksplat has sections of Gaussians, at one of three compression levels. At level 0, values are float32. At level 1 and
+2, positions are 16-bit steps about the center of a bucket of up to some hundred Gaussians, and other values are 16-bit
+floats; level 2 stores SH coefficients in 8 bits. Colors and opacities have 8 bits at all levels. SH coefficients have
+degree 0 to 2, one band after the other, channel-major in each. Axes are those of the PLY. The layout is that of
+https://github.com/mkkellogg/GaussianSplats3D.
 """
 
 from __future__ import annotations
 
+import math
+import struct
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import SceneError
-from sgsst_core.files.formats.quantized import OPACITY_LOGITS
-from sgsst_core.files.formats.scene_format import Arrays, FileStart, OpenScene, SceneFormat, SceneHeader, row_blocks
-from sgsst_core.files.formats.units import logarithms
+from sgsst_core.files.formats.scene_format import (
+    COEFFICIENTS,
+    OPACITY_LOGITS,
+    Arrays,
+    FileStart,
+    OpenScene,
+    SceneFormat,
+    SceneHeader,
+    about_part,
+    logarithms,
+    read_bytes,
+    read_rows,
+    row_blocks,
+    truncated,
+)
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 
@@ -51,3 +75,173 @@ def _read(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
 
 
 SPLAT = SceneFormat("splat", ".splat", 32, _matches, _read_header, _read)
+
+#: Version 0.1, the only one.
+_MAGIC = b"\0\1\0\0"
+_HEADER_BYTES, _SECTION_BYTES = 4096, 1024
+_MAX_SECTIONS = 1024
+_MAX_DEGREE = 2
+#: NumPy type codes of positions, of scales and rotations, and of SH coefficients, by compression level.
+_TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}
+#: Default of the largest position step and of the range of SH coefficients at level 2.
+_STEPS, _RANGE = 32767, 1.5
+#: Log scale of those that 16-bit floats round to 0: half of the smallest positive one.
+_MIN_LOG_SCALE = math.log(2.0**-25)
+
+
+@dataclass(frozen=True)
+class KsplatSection:
+    """Section of a .ksplat file.
+
+    Attributes:
+        degree: SH degree, 0 to 2.
+        lengths_offset: Byte offset of the numbers of Gaussians in buckets that are not full (uint32).
+        full: Number of full buckets, which come first.
+        partial: Number of other buckets.
+        bucket_size: Number of Gaussians in a full bucket.
+        centers_offset: Byte offset of the centers of the buckets, three float32 each.
+        step: Position step.
+        steps: Steps from the least position in a bucket to its center.
+    """
+
+    count: int
+    degree: int
+    lengths_offset: int
+    full: int
+    partial: int
+    bucket_size: int
+    centers_offset: int
+    step: float
+    steps: int
+    data_offset: int
+
+
+@dataclass(frozen=True)
+class KsplatHeader(SceneHeader):
+    """Header of a .ksplat file.
+
+    Attributes:
+        level: Compression level, 0 to 2.
+        harmonics: Lowest and highest SH coefficient at level 2.
+        sections: Sections that hold Gaussians.
+    """
+
+    level: int
+    harmonics: tuple[float, float]
+    sections: list[KsplatSection]
+
+
+def _matches_ksplat(start: FileStart) -> bool:
+    """Return whether the data looks like a .ksplat header. The format has no magic number beyond its version."""
+    head = start.head
+    if not head.startswith(_MAGIC) or len(head) < _HEADER_BYTES:
+        return False
+    sections, filled, _, count, level = struct.unpack_from("<IIIIH", head, 4)
+    center = struct.unpack_from("<3f", head, 24)
+    return sections > 0 and filled <= sections and count > 0 and level in _TYPES and all(map(math.isfinite, center))
+
+
+def _read_ksplat_header(start: FileStart) -> KsplatHeader:
+    path, head = start.path, start.head
+    sections, _, _, count, level = struct.unpack_from("<IIIIH", head, 4)
+    low, high = struct.unpack_from("<2f", head, 36)
+    table_end = _HEADER_BYTES + _SECTION_BYTES * sections
+    if sections > _MAX_SECTIONS or table_end > start.size:
+        declared = f"the .ksplat header declares {sections} sections in {start.size} bytes"
+        raise truncated(path, f"{declared}; at most {_MAX_SECTIONS} can be read")
+    table = read_bytes(path, _HEADER_BYTES, table_end)
+    read, position = [], table_end
+    for index in range(sections):
+        section, position = _section(table[index * _SECTION_BYTES :][:_SECTION_BYTES], level, position)
+        if section is None or position > start.size:
+            raise truncated(path, f"section {index} of the .ksplat file is wrong, or ends after its {start.size} bytes")
+        read.append(section)
+    if sum(section.count for section in read) != count:
+        raise SceneError(
+            f"{path}: the .ksplat header declares {count} Gaussians, but its sections hold "
+            f"{sum(section.count for section in read)}: it was not written completely. Export it again."
+        )
+    coefficients = COEFFICIENTS[max(section.degree for section in read)]
+    notes = about_part(path, position, start.size)
+    return KsplatHeader(KSPLAT, count, coefficients, level, (low or -_RANGE, high or _RANGE), read, notes=notes)
+
+
+def _section(entry: bytes, level: int, start: int) -> tuple[KsplatSection | None, int]:
+    """Parse the entry of the section that starts at a byte offset.
+
+    Returns:
+        The section, None if it is wrong, and the byte offset of the next one.
+    """
+    count, most, bucket_size, buckets, block, center_bytes, _, steps = struct.unpack_from("<IIIIfHHI", entry)
+    full, partial, degree = struct.unpack_from("<IIH", entry, 32)
+    if degree > _MAX_DEGREE or count > most or not math.isfinite(block):
+        return None, start
+    if level and count and (center_bytes != 12 or full + partial > buckets):
+        return None, start
+    steps = steps or _STEPS
+    centers = start + 4 * partial
+    data = centers + center_bytes * buckets
+    end = data + _row(level, degree).itemsize * most
+    return KsplatSection(count, degree, start, full, partial, bucket_size, centers, block / 2 / steps, steps, data), end
+
+
+def _row(level: int, degree: int) -> np.dtype:
+    """Return the dtype of a Gaussian."""
+    position, value, harmonic = _TYPES[level]
+    fields = [("position", position, 3), ("scale", value, 3), ("rotation", value, 4), ("color", "u1", 4)]
+    return np.dtype([*fields, ("harmonics", harmonic, 3 * COEFFICIENTS[degree])])
+
+
+def _read_ksplat(file: OpenScene, header: SceneHeader, into: Arrays) -> None:
+    """Fill the arrays of a scene. A standard deviation of 0 at level 0 becomes a log scale of minus infinity."""
+    assert isinstance(header, KsplatHeader)
+    into["sh_rest"][:] = 0
+    first = 0
+    for section in header.sections:
+        buckets = _buckets(file, section) if header.level and section.count else None
+        kind = _row(header.level, section.degree)
+        for part, rows in row_blocks(file, kind, section.data_offset, section.count):
+            block = slice(first + part.start, first + part.stop)
+            positions = rows["position"].astype(np.float64)
+            if buckets is not None:
+                ends, centers = buckets
+                owners = np.searchsorted(ends, np.arange(part.start, part.stop), side="right")
+                if owners[-1] >= len(ends):
+                    raise SceneError(
+                        f"{file.path}: holds Gaussians beyond its buckets: it is damaged. Export it again."
+                    )
+                positions = (positions - section.steps) * section.step + centers[owners]
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # invalid values are reported later
+                into["means"][block] = positions
+                scales = logarithms(file.path, rows["scale"].astype(np.float64))
+                into["scales"][block] = np.maximum(scales, _MIN_LOG_SCALE) if header.level else scales
+                into["quats"][block] = rows["rotation"]
+                into["sh_dc"][block] = (rows["color"][:, :3] / 255 - COLOR_OFFSET) / SH_C0
+                into["opacities"][block] = OPACITY_LOGITS[rows["color"][:, 3]]
+                into["sh_rest"][block, : COEFFICIENTS[section.degree]] = _harmonics(rows["harmonics"], header, section)
+        first += section.count
+
+
+def _buckets(file: OpenScene, section: KsplatSection) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the end of each bucket, as an index of Gaussians, and the bucket's center, [buckets, 3]."""
+    lengths = read_rows(file, np.dtype("<u4"), section.lengths_offset, section.partial)
+    centers = read_rows(file, np.dtype("<f4"), section.centers_offset, 3 * (section.full + section.partial))
+    sizes = np.concatenate([np.full(section.full, section.bucket_size, np.int64), lengths.astype(np.int64)])
+    return sizes.cumsum(), centers.reshape(-1, 3).astype(np.float64)
+
+
+def _harmonics(values: NDArray[np.generic], header: KsplatHeader, section: KsplatSection) -> NDArray[np.float64]:
+    """Return SH coefficients [n, coefficients, 3]."""
+    numbers = values.astype(np.float64)
+    if header.level == 2:
+        low, high = header.harmonics
+        numbers = low + (high - low) * (numbers / 255)
+    bands, first = [np.zeros((len(numbers), 0, 3))], 0
+    for degree in range(1, section.degree + 1):
+        width = 2 * degree + 1
+        bands.append(numbers[:, first : first + 3 * width].reshape(-1, 3, width).transpose(0, 2, 1))
+        first += 3 * width
+    return np.concatenate(bands, axis=1)
+
+
+KSPLAT = SceneFormat("ksplat", ".ksplat", 44, _matches_ksplat, _read_ksplat_header, _read_ksplat)

@@ -33,10 +33,9 @@ from numpy.typing import NDArray
 
 from sgsst_core.constants import SH_DEGREES
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.formats.frame import harmonics_matrix
-from sgsst_core.files.formats.quantized import OPACITY_LOGITS, opacity_bytes, with_largest, without_largest
 from sgsst_core.files.formats.scene_format import (
     COEFFICIENTS,
+    OPACITY_LOGITS,
     STORED_COEFFICIENTS,
     UNTAGGED,
     Arrays,
@@ -49,11 +48,15 @@ from sgsst_core.files.formats.scene_format import (
     about_part,
     about_surplus,
     blocks,
+    harmonics_matrix,
     number_of,
+    opacity_bytes,
     read_bytes,
     read_rows,
     stated,
     truncated,
+    with_largest,
+    without_largest,
     without_padding,
 )
 from sgsst_core.scene.rendering import Rendering

@@ -33,7 +33,7 @@ from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.gaussians import TENSORS
-from tests.sgsst_core.files.formats.streamed import files_of, streamed, unpacked
+from tests.sgsst_core.files.formats.samples import files_of, streamed, unpacked
 from tests.sgsst_core.trainer_scenes import write_gsplat, write_nerfstudio
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 

@@ -32,7 +32,7 @@ from sgsst_core.files.atomic import temporary_path
 from tests.api.service import Service
 from tests.http_servers import serve
 from tests.nginx import Nginx
-from tests.sgsst_core.files.formats.streamed import archived, streamed, unpacked
+from tests.sgsst_core.files.formats.samples import archived, streamed, unpacked
 from tests.small_scenes import wall, write_files
 
 

@@ -17,7 +17,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from tests.api.page.actions import REFUSED, STEPS, Visit, choose, done, set_options, started
 from tests.api.page.browser import Watched
 from tests.api.service import Service
-from tests.sgsst_core.orbit.objects import box, joined, scene_of
+from tests.sgsst_core.objects import box, joined, scene_of
 from tests.small_scenes import write_files
 
 pytestmark = pytest.mark.slow

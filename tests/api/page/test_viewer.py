@@ -20,7 +20,7 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.splat import ROW
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.orbit.cameras import orbit
+from sgsst_core.orbit import orbit
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
@@ -28,10 +28,9 @@ from sgsst_core.scene.rendering import Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.page.browser import Watched, decoded, psnr, rendered, serve_files, view_script
 from tests.real_scenes import scene_path
-from tests.sgsst_core.files.formats.samples import ksplat
-from tests.sgsst_core.files.formats.streamed import archived, streamed
-from tests.sgsst_core.files.test_filtered_and_flat_scenes import with_filter, without_thickness
-from tests.sgsst_core.orbit.objects import joined
+from tests.sgsst_core.files.formats.samples import archived, ksplat, streamed
+from tests.sgsst_core.files.test_scene_file import with_filter, without_thickness
+from tests.sgsst_core.objects import joined
 from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.slow

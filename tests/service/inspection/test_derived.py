@@ -40,7 +40,7 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.service import PATIENCE
 from tests.raised import raises_problem
 from tests.service.store.helpers import usage_of
-from tests.sgsst_core.orbit.objects import figure, joined, moved
+from tests.sgsst_core.objects import figure, joined, moved
 from tests.small_scenes import wall, write_files
 from worker.derived import video_cameras
 from worker.inputs import read_job_capture

@@ -11,7 +11,7 @@ from sgsst_core.features.partition import (
     scaled_region,
 )
 from sgsst_core.features.vgg import STYLE_LAYERS, layer_stride
-from sgsst_core.scene.pyramid import downscale
+from sgsst_core.scene.colors import downscale
 
 
 @pytest.mark.parametrize("size", [(500, 730), (333, 517), (256, 1031), (64, 64), (15, 17), (1, 1)])

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sgsst_core.features import pooling, vgg
+from sgsst_core.features import layers, vgg
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_bfloat16, has_tf32, use_whole_float32
 
@@ -315,7 +315,7 @@ class Launches(TorchDispatchMode):
 def test_gpu_passes_have_the_expected_launches(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
     """The forward pass has one launch per convolution with its ReLU and per pool, the backward pass two."""
     network = FeatureNetwork(tiny_weights, tf32=True)
-    monkeypatch.setattr(pooling, "_is_compiled_for", lambda values: False)
+    monkeypatch.setattr(layers, "_is_compiled_for", lambda values: False)
     pools = sum(isinstance(step, vgg._Pool) for step in network._steps)
     convolved, image = len(network._steps) - pools, synthetic_image()
     with operator_on_cpu(fused):

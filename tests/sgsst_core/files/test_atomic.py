@@ -1,17 +1,21 @@
-"""Tests that output files are written completely or not at all."""
+"""Tests of atomic files and of JSON files."""
 
 from __future__ import annotations
 
 import errno
+import json
+import math
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sgsst_core.errors import OutputError
 from sgsst_core.files import atomic
-from sgsst_core.files.atomic import HeldOpenError, atomic_path, ensure_writable_folder, remove_leftovers
+from sgsst_core.files.atomic import HeldOpenError, atomic_path, ensure_writable_folder, remove_leftovers, write_json
+from sgsst_core.files.formats.scene_format import json_numbers
 
 
 def test_target_appears_only_when_complete(tmp_path: Path) -> None:
@@ -142,3 +146,28 @@ def test_file_that_cannot_replace_its_target_is_kept(tmp_path: Path, monkeypatch
     assert target.read_text() == "old"
     assert (tmp_path / "scene.new.ply").read_text() == "new"
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_non_unicode_names_are_written_as_json(tmp_path: Path) -> None:
+    write_json(tmp_path / "r.json", {"path": "caf\udce9.ply"})
+    assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8")) == {"path": "caf\udce9.ply"}
+
+
+def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        write_json(tmp_path / "missing" / "r.json", {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_are_accepted() -> None:
+    assert json_numbers([1, 2.5, 10**30], 3).tolist() == [1, 2.5, 1e30]
+    assert json_numbers(7, 1).tolist() == [7]
+    assert math.isnan(json_numbers([None], 1)[0])
+
+
+@pytest.mark.parametrize(
+    "values", [[], [1], [1, 2, 3], ["1_0", 2], [True, 2], [[1], [2]], [{}, 2], "12", {"a": 1, "b": 2}]
+)
+def test_other_values_are_refused(values: Any) -> None:
+    with pytest.raises(ValueError, match="in place of 2 numbers"):
+        json_numbers(values, 2)

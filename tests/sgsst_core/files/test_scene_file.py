@@ -1,12 +1,15 @@
-"""Tests of 3DGS PLY files: reading, compared with a second reader in this module, and writing with new f_dc."""
+"""Tests of scene files: exact round trips, hostile files, SH attenuation, filtered and flat scenes, USD, colors."""
 
 from __future__ import annotations
 
 import math
 import os
+import pickle
+import re
 import struct
+import sys
 import tracemalloc
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +18,24 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
+from torch import Tensor
 
+from sgsst_core.constants import SH_C0
 from sgsst_core.errors import OutputError, SceneError
 from sgsst_core.files import stylized_ply
-from sgsst_core.files.formats import scene_format
-from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.files.stylized_ply import write_stylized
-from sgsst_core.refine.split import Refinement, parents_of, piece_counts
-from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.stored_harmonics import held
+from sgsst_core.files.formats import by_name, scene_format
+from sgsst_core.files.formats.spz import SPZ
+from sgsst_core.files.scene_file import USD_SUFFIXES, apply_filter, check_usd, read_scene, write_scene, write_usd
+from sgsst_core.files.stylized_ply import write_colors, write_stylized
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.refine import Refinement, parents_of, piece_counts
+from sgsst_core.scene import stored_harmonics
+from sgsst_core.scene.gaussians import Scene, attenuation_factor
+from sgsst_core.scene.rendering import CLASSIC, Rendering
+from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
+from tests.sgsst_core.splat_scenes import cloud
+from tests.small_scenes import cameras, wall
 
 CODES = {"char": "b", "uchar": "B", "int16": "h", "ushort": "H", "int": "i", "uint32": "I", "float": "f", "double": "d"}
 BASE = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
@@ -532,3 +543,366 @@ def test_stylized_real_scenes_differ_only_in_colors(shared_data: Path, tmp_path:
     for index in (0, 1, len(old) // 2, len(old) - 1):
         values = struct.unpack_from(f"<{len(names)}f", after, start + index * row)
         assert [values[names.index(f"f_dc_{c}".encode())] for c in range(3)] == colors[index].tolist()
+
+
+ATTENUATIONS = (1e-9, 0.25, 0.7, 1.0)
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored_harmonics, "BLOCK_BYTES", 2000)
+    for module in (scene_format, stylized_ply):
+        monkeypatch.setattr(module, "BLOCK_ROWS", 17)
+
+
+def written(folder: Path, degree: int = 3) -> Path:
+    write_scene(folder / "scene.ply", cloud(60, degree=degree))
+    return folder / "scene.ply"
+
+
+def in_another_encoding(path: Path, form: str) -> Path:
+    """Write the same scene as ASCII, as big-endian, with doubles, or with another property between the coefficients."""
+    vertices = PlyData.read(path)["vertex"].data
+    kinds = [(name, "<f8" if form == "doubles" and "rest" in name else "<f4") for name in vertices.dtype.names]
+    if form == "mixed up":
+        kinds.insert(20, ("extra", "u1"))
+        kinds.append(kinds.pop(12))
+    rows = np.zeros(len(vertices), kinds)
+    for name in vertices.dtype.names:
+        rows[name] = vertices[name]
+    target = path.with_name("other.ply")
+    PlyData([PlyElement.describe(rows, "vertex")], text=form == "text", byte_order=">" if form == "big" else "<").write(
+        target
+    )
+    return target
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("form", ["plain", "text", "big", "doubles", "mixed up"])
+@pytest.mark.parametrize("attenuation", ATTENUATIONS)
+def test_file_contains_the_attenuated_coefficients(tmp_path: Path, form: str, attenuation: float) -> None:
+    path = written(tmp_path)
+    if form != "plain":
+        path = in_another_encoding(path, form)
+    source = read_scene(path)
+    wanted = source.scene.attenuated(attenuation)
+    colors = source.scene.sh_dc + 1
+    write_stylized(source, tmp_path / "out.ply", colors, sh_attenuation=attenuation)
+    loaded = read_scene(tmp_path / "out.ply").scene
+    rest = torch.zeros_like(held(loaded.sh_rest)) if attenuation == 1 else held(wanted.sh_rest)
+    assert torch.equal(held(loaded.sh_rest), rest)
+    if attenuation == 1:
+        assert wanted.sh_degree == 0
+        assert not torch.signbit(held(loaded.sh_rest)).any()
+    assert torch.equal(loaded.sh_dc, colors)
+    for name in ("means", "quats", "scales", "opacities"):
+        assert torch.equal(getattr(loaded, name), getattr(source.scene, name))
+    before, after = (PlyData.read(each)["vertex"].data for each in (path, tmp_path / "out.ply"))
+    assert before.dtype == after.dtype
+    for name in set(before.dtype.names) - {"f_dc_0", "f_dc_1", "f_dc_2"}:
+        if "rest" not in name:
+            assert np.array_equal(before[name], after[name])
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_file_is_bit_identical_without_attenuation(tmp_path: Path) -> None:
+    source = read_scene(written(tmp_path))
+    for attenuation in (0.0, 1e-9):
+        path = tmp_path / f"{attenuation}.ply"
+        write_stylized(source, path, source.scene.sh_dc, sh_attenuation=attenuation)
+        assert path.read_bytes() == source.path.read_bytes()
+    assert source.scene.attenuated(0) is source.scene
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("attenuation", ATTENUATIONS)
+def test_stored_coefficients_match_those_in_memory(tmp_path: Path, attenuation: float) -> None:
+    path = written(tmp_path)
+    stored, plain = (read_scene(path, held_bytes=limit).scene.attenuated(attenuation) for limit in (0, None))
+    assert isinstance(plain.sh_rest, Tensor)
+    if attenuation == 1:
+        assert stored.sh_rest.shape == plain.sh_rest.shape == (60, 0, 3)
+        return
+    assert isinstance(stored.sh_rest, StoredHarmonics)
+    rows = torch.arange(0, 60, 3)
+    for harmonics in (stored.sh_rest, pickle.loads(pickle.dumps(stored.sh_rest))):
+        assert torch.equal(harmonics.tensor(), plain.sh_rest)
+        assert torch.equal(held(harmonics[rows]), plain.sh_rest[rows])
+        assert torch.equal(harmonics.first(8).tensor(), plain.sh_rest[:, :8])
+        assert torch.equal(harmonics.largest(), plain.sh_rest.abs().amax((1, 2)))
+    assert stored.used_degree() == 3
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_dropped_rows_are_absent_and_others_are_attenuated(tmp_path: Path) -> None:
+    scene = cloud(60, degree=2)
+    scene.means[5] = torch.nan
+    write_scene(tmp_path / "scene.ply", scene)
+    source = read_scene(tmp_path / "scene.ply", drop_invalid=True)
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
+    loaded = read_scene(tmp_path / "out.ply").scene
+    assert len(loaded) == 59
+    assert torch.equal(held(loaded.sh_rest), held(source.scene.sh_rest) * 0.5)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_attenuation_ignores_scenes_of_degree_0(tmp_path: Path) -> None:
+    source = read_scene(written(tmp_path, degree=0))
+    assert source.scene.attenuated(0.5) is source.scene
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
+    assert (tmp_path / "out.ply").read_bytes() == source.path.read_bytes()
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_compressed_scenes_are_attenuated_in_their_ply(tmp_path: Path) -> None:
+    write_scene(tmp_path / "scene.spz", cloud(60, degree=1), SPZ)
+    source = read_scene(tmp_path / "scene.spz")
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.25)
+    assert torch.equal(held(read_scene(tmp_path / "out.ply").scene.sh_rest), held(source.scene.sh_rest) * 0.75)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_integer_coefficients_cannot_be_attenuated(tmp_path: Path) -> None:
+    vertices = PlyData.read(written(tmp_path, 1))["vertex"].data
+    kinds = [(name, "i4" if "rest" in name else "<f4") for name in vertices.dtype.names]
+    PlyData([PlyElement.describe(vertices.astype(kinds), "vertex")], byte_order="<").write(tmp_path / "whole.ply")
+    source = read_scene(tmp_path / "whole.ply")
+    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
+    with pytest.raises(SceneError, match="f_rest_0 is stored as integers, which cannot be attenuated"):
+        write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_attenuation_factor_is_a_float32() -> None:
+    assert attenuation_factor(0) == 1
+    assert attenuation_factor(1) == 0
+    assert np.float32(attenuation_factor(0.3)) == attenuation_factor(0.3)
+
+
+def with_filter(path: Path, scene: Scene, deviations: torch.Tensor, *, text: bool = False) -> Path:
+    """Write a PLY with the property filter_3D."""
+    write_scene(path, scene)
+    old = PlyData.read(path)["vertex"].data
+    rows = np.empty(len(old), [*old.dtype.descr, ("filter_3D", "<f4")])
+    for name in old.dtype.names:
+        rows[name] = old[name]
+    rows["filter_3D"] = deviations.numpy()
+    PlyData([PlyElement.describe(rows, "vertex")], text=text, byte_order="=" if text else "<").write(str(path))
+    return path
+
+
+def without_thickness(path: Path, scene: Scene) -> Path:
+    """Write a PLY without the property scale_2."""
+    write_scene(path, scene)
+    old = PlyData.read(path)["vertex"].data
+    kinds = [each for each in old.dtype.descr if each[0] != "scale_2"]
+    rows = np.empty(len(old), kinds)
+    for name, *_ in kinds:
+        rows[name] = old[name]
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+    return path
+
+
+def deviations_of(scene: Scene) -> torch.Tensor:
+    return torch.linspace(0, 0.1, len(scene))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_filter_is_applied_and_preserved(tmp_path: Path, text: bool) -> None:
+    scene = wall(sh_degree=1)
+    path, out = with_filter(tmp_path / "scene.ply", scene, deviations_of(scene), text=text), tmp_path / "out.ply"
+    file = read_scene(path)
+    variances, added = scene.scales.double().exp().square(), deviations_of(scene).double().square()[:, None]
+    opacities = scene.opacities.double().sigmoid() * (variances / (variances + added)).prod(dim=1).sqrt()
+    assert torch.allclose(file.scene.scales.double().exp().square(), variances + added, rtol=1e-5)
+    assert torch.allclose(file.scene.opacities.double().sigmoid(), opacities, rtol=1e-5)
+    assert file.scene.opacities[0] == scene.opacities[0]
+    assert file.scene.rendering == file.tag.rendering == Rendering("antialiased", 0.1)
+    assert "filter_3D" in file.tag.reason
+    write_stylized(file, out, torch.zeros_like(file.scene.sh_dc))
+    before, after = (PlyData.read(each)["vertex"].data for each in (path, out))
+    assert (after["f_dc_0"] == 0).all()
+    for name in set(before.dtype.names) - {"f_dc_0", "f_dc_1", "f_dc_2"}:
+        assert np.array_equal(before[name], after[name]), name
+
+
+def test_comment_outweighs_the_property(tmp_path: Path) -> None:
+    path = with_filter(tmp_path / "scene.ply", wall(), deviations_of(wall()))
+    path.write_bytes(path.read_bytes().replace(b"element vertex", b"comment SplatRenderMode: default\nelement vertex"))
+    file = read_scene(path)
+    assert file.scene.rendering == CLASSIC
+    assert not torch.equal(file.scene.scales, wall().scales)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_split_gaussians_have_no_filter(tmp_path: Path, text: bool) -> None:
+    scene, out = wall(), tmp_path / "out.ply"
+    file = read_scene(with_filter(tmp_path / "scene.ply", scene, deviations_of(scene), text=text))
+    pieces = torch.ones(len(scene), 3, dtype=torch.uint8)
+    pieces[::2, 0] = 3
+    refined = file.refined(Refinement(pieces, len(scene) // 2, 2 * len(scene)))
+    write_stylized(refined, out, refined.scene.sh_dc)
+    again, view = read_scene(out).scene, cameras()[1]
+    assert not PlyData.read(out)["vertex"].data["filter_3D"].any()
+    assert again.rendering == file.scene.rendering
+    first, second = (make_rasterizer("cpu", each).coverage(view) for each in (refined.scene, again))
+    assert torch.allclose(first, second, atol=1e-6)
+
+
+def test_filter_becomes_part_of_the_shapes_in_other_formats(tmp_path: Path) -> None:
+    file = read_scene(with_filter(tmp_path / "scene.ply", wall(), deviations_of(wall())))
+    write_scene(tmp_path / "scene.glb", file.scene, by_name("glb"))
+    again = read_scene(tmp_path / "scene.glb").scene
+    assert again.rendering == file.scene.rendering
+    assert torch.allclose(again.scales, file.scene.scales, atol=1e-5)
+
+
+def test_filters_of_any_size_are_exact() -> None:
+    scales = np.array([[-80.0, -80, -80], [80, 80, 80], [0, 0, 0], [0, 0, 0], [-5, 0, 5]], np.float32)
+    logits = np.array([np.inf, 90, -90, 3, 3], np.float32)
+    filters = np.array([1e-30, 1e-30, 1.0, 0.0, -1.0])
+    filtered, opacities = scales.copy(), logits.copy()
+    apply_filter(filtered, opacities, filters)
+    assert filtered[0] == pytest.approx(np.log(1e-30), rel=1e-6)
+    assert np.array_equal(filtered[[1, 3]], scales[[1, 3]])
+    assert opacities[[1, 3]].tolist() == [90, 3]
+    assert opacities[0] == pytest.approx(3 * (-80 - np.log(1e-30)), rel=1e-5)  # a logit of -33 is the logarithm
+    assert opacities[2] == pytest.approx(-90 - 1.5 * np.log(2), rel=1e-6)
+    assert filtered[4] == pytest.approx(np.log(np.exp(2 * scales[4].astype(np.float64)) + 1) / 2, rel=1e-6)
+
+
+def test_invalid_filters_are_reported(tmp_path: Path) -> None:
+    filters = deviations_of(wall())
+    filters[7] = torch.nan
+    path = with_filter(tmp_path / "scene.ply", wall(), filters)
+    with pytest.raises(SceneError, match=re.escape("1 of 616 Gaussians hold NaN")):
+        read_scene(path)
+    assert read_scene(path, drop_invalid=True).dropped == 1
+
+
+def test_flat_scene_is_rendered_without_thickness_and_preserved(tmp_path: Path) -> None:
+    scene, out = wall(sh_degree=1), tmp_path / "out.ply"
+    path = without_thickness(tmp_path / "scene.ply", scene)
+    file = read_scene(path)
+    assert file.scene.rendering == Rendering("2dgs")
+    assert torch.equal(file.scene.scales[:, :2], scene.scales[:, :2])
+    assert "thickness" in file.tag.warnings[0][0]
+    thin = replace(scene, scales=scene.scales - torch.tensor([0.0, 0.0, 60.0]))
+    for view in cameras():
+        first, second = (make_rasterizer("cpu", each).coverage(view) for each in (file.scene, thin))
+        assert torch.equal(first, second)
+    write_stylized(file, out, torch.zeros_like(scene.sh_dc))
+    names = PlyData.read(out)["vertex"].data.dtype.names
+    assert "scale_2" not in names
+    assert read_scene(out).scene.rendering == Rendering("2dgs")
+
+
+@pytest.mark.parametrize("name", ["spz", "sog", "glb", "compressed.ply", "ply"])
+def test_flat_scene_is_written_in_every_format(tmp_path: Path, name: str) -> None:
+    file = read_scene(without_thickness(tmp_path / "scene.ply", wall()))
+    write_scene(tmp_path / "out", file.scene, by_name(name))
+    again, view = read_scene(tmp_path / "out").scene, cameras()[1]
+    first, second = (make_rasterizer("cpu", each).coverage(view) for each in (file.scene, again))
+    assert torch.allclose(first, second, atol=0.02)
+
+
+def test_flat_gaussians_can_be_split(tmp_path: Path) -> None:
+    file, out = read_scene(without_thickness(tmp_path / "scene.ply", wall())), tmp_path / "out.ply"
+    pieces = torch.ones(616, 3, dtype=torch.uint8)
+    pieces[:, :2] = 3
+    refined = file.refined(Refinement(pieces, 616, 9 * 616))
+    write_stylized(refined, out, refined.scene.sh_dc)
+    assert torch.equal(read_scene(out).scene.scales, refined.scene.scales)
+
+
+def test_isotropic_gaussians_are_not_flat(tmp_path: Path) -> None:
+    write_scene(tmp_path / "scene.ply", wall())
+    old = PlyData.read(tmp_path / "scene.ply")["vertex"].data
+    kinds = [each for each in old.dtype.descr if each[0] not in ("scale_1", "scale_2")]
+    rows = np.empty(len(old), kinds)
+    for name, *_ in kinds:
+        rows[name] = old[name]
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(tmp_path / "round.ply"))
+    assert read_scene(tmp_path / "round.ply").scene.rendering == CLASSIC
+
+
+pxr = pytest.importorskip("pxr", reason="usd-core is not installed")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("suffix", USD_SUFFIXES)
+def test_written_values_match_the_scene(tmp_path: Path, suffix: str, degree: int) -> None:
+    """Values are linear, axes have y up, and coefficients follow each other by Gaussian."""
+    from pxr import Usd, UsdGeom, UsdVol
+
+    scene, path = cloud(300, degree=degree), tmp_path / f"scene{suffix}"
+    write_usd(path, scene)
+    stage = Usd.Stage.Open(str(path))
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1)
+    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    assert splats
+
+    def values(name: str) -> np.ndarray:
+        return np.array(stage.GetDefaultPrim().GetAttribute(name).Get())
+
+    flip = np.array([-1, -1, 1])
+    np.testing.assert_array_equal(values("positions"), scene.means.numpy() * flip)
+    np.testing.assert_allclose(values("scales"), scene.scales.double().exp(), rtol=1e-6)
+    np.testing.assert_allclose(values("opacities"), scene.opacities.double().sigmoid(), rtol=1e-6)
+    assert int(values("radiance:sphericalHarmonicsDegree")) == degree
+    harmonics = values("radiance:sphericalHarmonicsCoefficients").reshape(300, -1, 3)
+    assert harmonics.shape == (300, (degree + 1) ** 2, 3)
+    np.testing.assert_array_equal(harmonics[:, 0], scene.sh_dc.numpy())
+    signs = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1])[: harmonics.shape[1] - 1, None]
+    np.testing.assert_array_equal(harmonics[:, 1:], held(scene.sh_rest).numpy() * signs)
+    quats = scene.quats.double().numpy()
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    for index, actual in enumerate(splats.GetOrientationsAttr().Get()):
+        expected = (-z[index], -y[index], x[index], w[index])  # a rotation by 180 degrees about z comes first
+        assert (actual.GetReal(), *actual.GetImaginary()) == pytest.approx(expected, abs=1e-6)
+    low, high = splats.GetExtentAttr().Get()
+    assert bool((np.array(low) < values("positions")).all() and (np.array(high) > values("positions")).all())
+
+
+def test_missing_extra_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [*sys.modules]:
+        if name.partition(".")[0] == "pxr":
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "path", [])
+    with pytest.raises(OutputError, match=r"pip install 'sgsst-service\[usd\]'"):
+        check_usd(Path("scene.usdc"))
+
+
+def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="does not exist"):
+        write_usd(tmp_path / "missing" / "scene.usdc", cloud(10))
+    assert not [*tmp_path.iterdir()]
+
+
+def test_colors_round_trip_within_the_error_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_format, "BLOCK_ROWS", 100)
+    generator = torch.Generator().manual_seed(1)
+    size = torch.rand(1003, 3, generator=generator) * 14 - 9  # from 1e-9 to 1e5
+    sh_dc = torch.randn(1003, 3, generator=generator).sign() * 10.0**size
+    sh_dc[0] = torch.tensor([1e30, -65520.0, 65519.0])
+    path = tmp_path / "stylized_ply.f16"
+    write_colors(path, sh_dc)
+    assert path.stat().st_size == 6 * 1003
+    actual = np.fromfile(path, "<f2").reshape(-1, 3).astype(np.float64)
+    exact = sh_dc.double().clamp(-65504, 65504).numpy()
+    assert (np.abs(actual - exact) <= np.maximum(2.0**-11 * np.abs(exact), 2.0**-25)).all()
+    assert actual[0].tolist() == [65504, -65504, 65504]
+
+
+def test_colors_between_black_and_white_keep_their_gray_level(tmp_path: Path) -> None:
+    levels = torch.linspace(0, 1, 3 * 10_001, dtype=torch.float64).reshape(-1, 3)
+    write_colors(tmp_path / "c", ((levels - 0.5) / SH_C0).float())
+    colors = 0.5 + SH_C0 * np.fromfile(tmp_path / "c", "<f2").astype(np.float64).reshape(-1, 3)
+    assert 255 * np.abs(colors - levels.numpy()).max() < 0.04
+
+
+def test_empty_scene_is_written_and_missing_folder_is_an_error(tmp_path: Path) -> None:
+    write_colors(tmp_path / "c", torch.zeros(0, 3))
+    assert (tmp_path / "c").read_bytes() == b""
+    with pytest.raises(OutputError):
+        write_colors(tmp_path / "c" / "d", torch.zeros(1, 3))

@@ -13,9 +13,9 @@ import torch
 
 from sgsst_core import load_scene, save
 from sgsst_core.errors import OutputError, SceneError
-from sgsst_core.files.formats.quantized import OPACITY_LOGITS
+from sgsst_core.files.formats.scene_format import OPACITY_LOGITS
+from sgsst_core.files.library import TrainerCheckpoint, scene_of_splats
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.files.trainer_checkpoints import TrainerCheckpoint, scene_of_splats
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from tests.sgsst_core.trainer_scenes import splats_of, write_gsplat, write_nerfstudio
 from tests.small_scenes import wall

@@ -13,8 +13,8 @@ if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
 
 from sgsst_core.devices import Timer
+from sgsst_core.features.layers import convolve_pixels, relu_backward
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.features.pooling import relu_backward
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, can_use_graphs
 from sgsst_core.loss.sos import SosLoss, SosResult
@@ -37,6 +37,12 @@ SCALES = [0, 1]
 def without_triton(counts: Counts, monkeypatch: pytest.MonkeyPatch) -> None:
     """Disable Triton's kernels, so that the slow interpreter is not needed."""
     leave_out_kernels(monkeypatch)
+
+
+def lines_of(function: Any) -> list[str]:
+    """Return the lines of a function of `layers` as in the counts of launches."""
+    lines, first = inspect.getsourcelines(function)
+    return [f"sgsst_core/features/layers.py:{first + number}" for number in range(len(lines))]
 
 
 def image(seed: int, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
@@ -114,10 +120,11 @@ def test_kernels_agree_with_tensor_functions_and_pass_relus(
             leave_out_kernels(monkeypatch)
         counts.clear()
         results.append(loss.evaluate(pixels, style, view, SCALES))
-        used.append(any("features/first_layer.py" in line for line in counts.launches))
-        lines = inspect.getsourcelines(relu_backward)
-        places = {f"sgsst_core/features/pooling.py:{lines[1] + number}" for number in range(len(lines[0]))}
-        relus.append(sum(counts.launches[line] for line in places))
+        first_layer, relu = (
+            sum(counts.launches[line] for line in lines_of(function)) for function in (convolve_pixels, relu_backward)
+        )
+        used.append(first_layer > 0)
+        relus.append(relu)
     fast, plain = (result.image_gradient for result in results)
     assert fast is not None
     assert plain is not None

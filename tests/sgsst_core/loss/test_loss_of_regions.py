@@ -9,8 +9,8 @@ from sgsst_core.features.statistics import layer_statistics, merge
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import combined, layers_of
-from sgsst_core.regions.definition import Region, Regions, check_regions
-from sgsst_core.scene.pyramid import resize_area, style_size
+from sgsst_core.regions import Region, Regions, check_regions
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.style import Style
 from tests.networks import comparing_pixels
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image

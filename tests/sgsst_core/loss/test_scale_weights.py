@@ -15,7 +15,7 @@ from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.planning.facts import check_scales
 from sgsst_core.scales import EVEN, ScaleWeights
-from sgsst_core.scene.pyramid import resize_area, style_size
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.steps import drawn_scales

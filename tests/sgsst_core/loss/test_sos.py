@@ -10,7 +10,7 @@ from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, Activat
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import StyleTarget, layers_of
 from sgsst_core.scales import scale_count
-from sgsst_core.scene.pyramid import resize_area, style_size
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.style import Style
 from tests.networks import comparing_pixels
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image

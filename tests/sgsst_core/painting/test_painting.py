@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import CameraError
-from sgsst_core.orbit.cameras import orbit
+from sgsst_core.orbit import orbit
 from sgsst_core.painting import solver
 from sgsst_core.painting.solver import PaintedColors, PaintedView, paint
 from sgsst_core.painting.spreading import Spreading

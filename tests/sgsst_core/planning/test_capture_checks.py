@@ -19,7 +19,7 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import save_png
 from sgsst_core.files.photos import Photo, check_photos
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.orbit.choice import OrbitRequest, make_orbit
+from sgsst_core.orbit import OrbitRequest, make_orbit
 from sgsst_core.planning.survey import compare_photos, fitted_psnr, frame_warnings, implausible, shown_by
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread

@@ -29,10 +29,10 @@ from sgsst_core.quality.judge import (
 )
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.style import Style

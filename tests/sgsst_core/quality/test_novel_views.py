@@ -34,8 +34,8 @@ from sgsst_core.quality.novel_views import (
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.camera import Camera, between, look_at
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.scene.gaussians import TENSORS, Scene, sampled
-from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Style
 from tests.small_scenes import ball, blind_camera, cameras, style, wall

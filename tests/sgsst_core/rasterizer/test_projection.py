@@ -1,19 +1,32 @@
-"""Tests of the compiled projection against plain PyTorch and against exact rational arithmetic."""
+"""Tests of the projection and of tile intersections."""
 
 from __future__ import annotations
 
+import gc
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from sgsst_core.constants import ALPHA_MIN, EPS2D
-from sgsst_core.rasterizer.projection import Column, project
+from sgsst_core.rasterizer.cpu import CpuRasterizer
+from sgsst_core.rasterizer.projection import (
+    Column,
+    TileIntersections,
+    build_tile_intersections,
+    depth_order,
+    intersections_of_subset,
+    project,
+)
 from sgsst_core.rasterizer.reference import splat
-from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, rotated_pose, single, together
+from sgsst_core.scene.camera import Camera
+from sgsst_core.scene.gaussians import Scene
+from tests.sgsst_core.splat_scenes import camera, cloud, empty_scene, has_intersections, rotated_pose, single, together
 
 _HALF_LOG2_E = 0.5 * math.log2(math.e)
 
@@ -120,3 +133,154 @@ def test_scene_far_from_origin_projects_alike() -> None:
     there = project(replace(scene, means=scene.means + offset.float()), replace(view, world_to_camera=pose))
     assert here.gaussians.tolist() == there.gaussians.tolist()
     assert np.allclose(here.values, there.values, rtol=1e-6, atol=1e-6)
+
+
+_RANDOM = np.random.default_rng(0)
+DEPTHS: dict[str, NDArray[np.float64]] = {
+    "spread": np.exp(_RANDOM.normal(size=5000)),
+    "many equal": _RANDOM.integers(1, 40, 5000).astype(np.float64),
+    "all equal": np.full(3000, 3.0),
+    "nearly equal": 1 + 1e-13 * _RANDOM.random(3000),
+    "one far off": np.append(1 + 1e-6 * _RANDOM.random(3000), 1e300),
+    "all magnitudes": 10.0 ** _RANDOM.uniform(-300, 300, 3000),
+    "infinite": np.array([2.0, np.inf, 5e-324, np.inf, 1e300]),
+    "one": np.array([2.0]),
+}
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("name", DEPTHS)
+def test_depth_order_equals_a_stable_sort(name: str, threads: None) -> None:
+    depths = DEPTHS[name]
+    visible = np.flatnonzero(_RANDOM.random(len(depths)) < 0.8)
+    order = depth_order(depths, visible)
+    assert order.dtype == np.int32
+    assert np.array_equal(order, visible[np.argsort(depths[visible], kind="stable")])
+
+
+def test_projected_values_are_in_depth_order(threads: None) -> None:
+    scene, view = cloud(700, seed=31), camera()
+    projection = project(scene, view)
+    pose = view.world_to_camera.double()
+    depths = (scene.means.double() @ pose[2, :3] + pose[2, 3]).numpy()[projection.gaussians]
+    assert np.all(np.diff(depths) >= -1e-12)
+    first = projection.gaussians[0]
+    alone = project(scene.subset(torch.tensor([int(first)])), view)
+    assert np.array_equal(projection.values[0], alone.values[0])
+
+
+def intersections_one_by_one(scene: Scene, view: Camera) -> list[list[int]]:
+    """Return the depth-order indices in each raster tile, from intersections of one Gaussian at a time."""
+    gaussians = project(scene, view).gaussians
+    tiles: list[list[int]] = [[] for _ in range(-(-view.width // 16) * -(-view.height // 16))]
+    for rank, gaussian in enumerate(gaussians):
+        alone = build_tile_intersections(scene.subset(torch.tensor([int(gaussian)])), view)
+        for tile in np.flatnonzero(np.diff(alone.starts)):
+            tiles[tile].append(rank)
+    return tiles
+
+
+def check_slots(isects: TileIntersections) -> None:
+    """Check that each pair has a slot, and that the slots of a Gaussian are adjacent and ordered by tile."""
+    order = np.argsort(isects.slots, kind="stable")
+    assert np.array_equal(isects.slots[order], np.arange(len(isects.slots)))
+    assert np.array_equal(
+        isects.ranks[order], np.repeat(np.arange(len(isects.first_slots) - 1), np.diff(isects.first_slots))
+    )
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 150])
+def test_tile_intersections_equal_a_loop_over_gaussians(count: int, threads: None) -> None:
+    scene, view = cloud(count, seed=32), camera(97, 61)
+    scene.scales[:10] += 4  # as large as the view
+    isects = build_tile_intersections(scene, view)
+    expected = intersections_one_by_one(scene, view)
+    assert np.array_equal(np.diff(isects.starts), [len(tile) for tile in expected])
+    assert isects.ranks.tolist() == [rank for tile in expected for rank in tile]
+    check_slots(isects)
+
+
+def check_same(actual: TileIntersections, expected: TileIntersections) -> None:
+    """Check that all arrays are bit-identical."""
+    for name in ("starts", "ranks", "slots", "first_slots"):
+        own, other = getattr(actual, name), getattr(expected, name)
+        assert own.dtype == other.dtype
+        assert np.array_equal(own, other), name
+    assert np.array_equal(actual.projection.gaussians, expected.projection.gaussians)
+    assert np.array_equal(actual.projection.values, expected.projection.values)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.6, 1.0])
+def test_tile_intersections_of_a_subset_equal_rebuilt_ones(share: float, threads: None) -> None:
+    scene, view = cloud(900, seed=33), camera(97, 61)
+    scene.scales[:10] += 4
+    chosen = torch.rand(900, generator=torch.Generator().manual_seed(1)) < share
+    places = torch.where(chosen, chosen.cumsum(0) - 1, -1).to(torch.int32).numpy()
+    subset = intersections_of_subset(build_tile_intersections(scene, view), places)
+    check_same(subset, build_tile_intersections(scene.subset(chosen), view))
+
+
+def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
+    scene = cloud(600, seed=34)
+    views = [camera(97, 61, pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
+    chosen = torch.arange(600) % 4 > 0
+    sizes = [build_tile_intersections(scene, view).nbytes for view in views]
+    whole = CpuRasterizer(scene, max_intersection_bytes=sum(sizes[:3]))
+    for view in views:
+        whole.intersections(view)
+    budget = sum(sizes[:3])
+    part = whole.for_subset(scene.subset(chosen), chosen, budget)
+    assert [has_intersections(part, view) for view in views] == [True, True, True, False]
+    for done, view in enumerate(views):
+        check_same(part.intersections(view), build_tile_intersections(scene.subset(chosen), view))
+        assert part._intersections.used <= budget
+        assert not has_intersections(whole, view)
+        assert [has_intersections(whole, other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
+    assert part.intersections(views[1]) is part.intersections(views[1])
+    with pytest.raises(ValueError, match="450 Gaussians are not the 600 chosen ones of 600"):
+        whole.for_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool), budget)
+
+
+def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
+    scene = cloud(300, seed=35)
+    views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
+    cpu = CpuRasterizer(scene)
+    sizes = [cpu.intersections(view).nbytes for view in views]
+    cpu.release_view(views[0], sizes[1])
+    assert [has_intersections(cpu, view) for view in views] == [False, True, False]
+
+
+def test_guests_use_the_rest_of_the_budget_for_tile_intersections() -> None:
+    scene = cloud(300, seed=36)
+    views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
+    sizes = [build_tile_intersections(scene, view).nbytes for view in views]
+    host = CpuRasterizer(scene, max_intersection_bytes=sum(sizes))
+    guests = [host.beside(scene) for _ in range(2)]
+
+    def cached_by_view() -> list[list[bool]]:
+        return [[has_intersections(one, view) for view in views] for one in (host, *guests)]
+
+    host.intersections(views[0])
+    guests[0].intersections(views[1])
+    guests[1].intersections(views[2])
+    guests[1].intersections(views[0])  # uses up all bytes
+    assert cached_by_view() == [[True, False, False], [False, True, False], [False, False, True]]
+    check_same(guests[1].intersections(views[0]), host.intersections(views[0]))
+    host.intersections(views[1])
+    host.intersections(views[2])
+    assert cached_by_view() == [[True] * 3, [False] * 3, [False] * 3]
+    host.release_view(views[0], sum(sizes))
+    guests[0].intersections(views[0])
+    assert cached_by_view()[1] == [True, False, False]
+    host.release_view(views[1], sizes[2])
+    assert cached_by_view()[:2] == [[False, False, True], [False] * 3]
+    del guests[1]
+    gc.collect()
+    assert len(host._intersections._guests) == 1

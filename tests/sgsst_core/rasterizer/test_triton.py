@@ -23,13 +23,13 @@ from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.projection import build_tile_intersections
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.rasterizer.tile_intersections import build_tile_intersections
 from sgsst_core.rasterizer.triton import TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
-from tests.sgsst_core.rasterizer.boundary_band import assert_close_outside_band, relative_error
+from tests.sgsst_core.rasterizer.references import assert_close_outside_band, relative_error
 from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, is_cached, pixels_like, rotated_pose
 
 pytest.importorskip("triton")
@@ -211,7 +211,7 @@ def test_weights_and_tile_intersections_share_a_budget() -> None:
 
 
 def test_too_many_intersections_are_refused_before_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sgsst_core.rasterizer.tile_intersections.MAX_INTERSECTIONS", 10)
+    monkeypatch.setattr("sgsst_core.rasterizer.projection.MAX_INTERSECTIONS", 10)
     with pytest.raises(TooManyIntersectionsError, match="raster tiles"):
         on_device(cloud(200)).intersections(camera())
 

@@ -1,4 +1,4 @@
-"""Tests of cameras derived from other cameras."""
+"""Tests of cameras, camera paths and lenses."""
 
 from __future__ import annotations
 
@@ -7,12 +7,35 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import pycolmap
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sgsst_core.errors import CameraError, SettingsError
-from sgsst_core.scene.camera import Camera, checked_cameras, fit_cameras, look_at, resized, spread
+from sgsst_core.files.camera_files import _colmap_lens
+from sgsst_core.files.camera_folder import ColmapCamera
+from sgsst_core.files.photos import undistort
+from sgsst_core.quality.novel_views import neighbors
+from sgsst_core.scene.camera import (
+    Camera,
+    CameraPath,
+    Lens,
+    catmull_rom_tangents,
+    checked_cameras,
+    fit_cameras,
+    framed,
+    in_path_order,
+    look_at,
+    moved,
+    resized,
+    spread,
+    undistorted,
+)
 from sgsst_core.settings import make_settings
 
 
@@ -141,3 +164,347 @@ def test_cameras_of_callers_are_checked() -> None:
             checked_cameras(wrong)  # type: ignore[arg-type]
     with pytest.raises(CameraError, match="a: its transform is not"):
         checked_cameras([replace(good, world_to_camera=torch.eye(3))])
+
+
+def posed(center, rotation=None, focal=100.0, size=(64, 48)):
+    """Return a camera at a center with a world-to-camera rotation."""
+    matrix = (Rotation.identity() if rotation is None else rotation).as_matrix()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(matrix)
+    pose[:3, 3] = torch.from_numpy(-matrix @ np.asarray(center, dtype=np.float64))
+    return Camera("view", *size, focal, focal, size[0] / 2, size[1] / 2, pose)
+
+
+def rotated(degrees, axis="y"):
+    """Return a rotation about an axis."""
+    return Rotation.from_euler(axis, degrees, degrees=True)
+
+
+def some_cameras(count=7, seed=0):
+    """Return cameras at irregular distances, with rotations and focal lengths of their own."""
+    rng = np.random.default_rng(seed)
+    centers = np.cumsum(rng.exponential(1.0, (count, 3)), axis=0)
+    return [posed(center, Rotation.from_rotvec(rng.normal(0, 0.5, 3)), rng.uniform(60, 200)) for center in centers]
+
+
+def barry_goldman(knots, points, time):
+    """Return a point of a Catmull-Rom spline by the pyramid of Barry and Goldman, for inner segments."""
+    first = np.searchsorted(knots, time, side="right") - 2
+    t, p = knots[first : first + 4], points[first : first + 4]
+
+    def mix(a, b, start, end):
+        return ((end - time) * a + (time - start) * b) / (end - start)
+
+    a = [mix(p[i], p[i + 1], t[i], t[i + 1]) for i in range(3)]
+    b = [mix(a[i], a[i + 1], t[i], t[i + 2]) for i in range(2)]
+    return mix(*b, t[1], t[2])
+
+
+def poses(cameras):
+    """Return the transforms [n, 4, 4] of cameras."""
+    return torch.stack([each.world_to_camera for each in cameras]).numpy()
+
+
+def test_path_passes_through_the_cameras():
+    cameras = some_cameras()
+    path = CameraPath(cameras)
+    positions_at_knots = path.at(path.knots)
+    assert np.allclose(poses(positions_at_knots), poses(cameras), rtol=0, atol=1e-12)
+    assert np.allclose([c.fx for c in positions_at_knots], [c.fx for c in cameras], rtol=1e-12)
+    assert {c.world_to_camera.dtype for c in positions_at_knots} == {torch.float64}
+
+
+def test_positions_are_those_of_the_barry_goldman_pyramid():
+    cameras = some_cameras()
+    path = CameraPath(cameras)
+    times = np.linspace(path.knots[1], path.knots[-2], 50)[:-1]
+    centers = np.stack([c.center.numpy() for c in cameras])
+    expected = np.stack([barry_goldman(path.knots, centers, time) for time in times])
+    assert np.allclose([c.center.numpy() for c in path.at(times)], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("origin", "jitter"), [(0.0, 1e-3), (4.2e6, 1e-10)])
+def test_jitter_at_stations_does_not_change_the_timing(origin, jitter):
+    noise = np.random.default_rng(0).normal(0, jitter, (24, 3))
+    still = [posed([origin + index // 8, 0, 0], rotated(45 * index)) for index in range(24)]
+    shaken = [posed([origin + index // 8, 0, 0] + noise[index], rotated(45 * index)) for index in range(24)]
+    assert np.allclose(CameraPath(shaken).knots, CameraPath(still).knots, rtol=1e-2)
+    assert len(neighbors(shaken)) == len(neighbors(still)) == 23
+
+
+def test_jitter_of_a_pan_does_not_count_as_motion():
+    noise = np.random.default_rng(0).normal(0, 1e-10, (24, 3))
+    pan = [posed([1.0, 2.0, 3.0] + noise[index], rotated(15 * index)) for index in range(24)]
+    assert np.allclose(np.diff(CameraPath(pan).knots), math.sqrt(0.5))
+    assert len(neighbors(pan)) == 23
+
+
+@pytest.mark.parametrize("count", [3, 5000])
+def test_every_camera_of_an_arc_has_moved(count):
+    angles = np.linspace(0, 2, count)
+    centers = 1e3 + np.stack([np.sin(angles), np.cos(angles), angles], axis=1)
+    assert moved(np.linalg.norm(np.diff(centers, axis=0), axis=1), centers).all()
+
+
+def test_knots_are_centripetal_where_cameras_move():
+    centers = np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0], [5, 9, 0]], dtype=np.float64)
+    steps = np.diff(CameraPath([posed(center) for center in centers]).knots)
+    assert np.allclose(steps, np.sqrt(np.array([1, 4, 9]) / 4))
+
+
+def test_positions_and_velocities_are_continuous_at_the_cameras():
+    path = CameraPath(some_cameras())
+    step = 1e-6
+    for knot in path.knots[1:-1]:
+        before, at, after = (c.center.numpy() for c in path.at(np.array([knot - step, knot, knot + step])))
+        assert np.linalg.norm(after - before) < 1e-4
+        assert np.allclose((at - before) / step, (after - at) / step, atol=1e-3)
+
+
+def test_rotations_are_rotations_at_constant_speed_between_cameras():
+    path = CameraPath([posed((0, 0, 0), rotated(10)), posed((1, 0, 0), rotated(70))])
+    frames = path.evenly(7)
+    rotations = np.stack([c.world_to_camera[:3, :3].numpy() for c in frames])
+    assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-12)
+    assert np.allclose(np.linalg.norm(Rotation.from_matrix(rotations).as_quat(), axis=1), 1)
+    angles = Rotation.from_matrix(rotations).as_euler("yxz", degrees=True)[:, 0]
+    assert np.allclose(angles, np.linspace(10, 70, 7))
+
+
+def test_rotation_takes_the_short_way_across_the_antipodal_sign():
+    """Rotations of 170 and 190 degrees have quaternions of opposite signs, but are 20 degrees apart."""
+    middle = CameraPath([posed((0, 0, 0), rotated(170)), posed((1, 0, 0), rotated(190))]).evenly(3)[1]
+    assert np.allclose(middle.world_to_camera[:3, :3].numpy(), rotated(180).as_matrix(), atol=1e-12)
+
+
+def test_half_turn_is_a_rotation_all_the_way():
+    frames = CameraPath([posed((0, 0, 0)), posed((1, 0, 0), rotated(180))]).evenly(5)
+    assert all(np.isclose(np.linalg.det(c.world_to_camera[:3, :3].numpy()), 1) for c in frames)
+    steps = [
+        (Rotation.from_matrix(a.world_to_camera[:3, :3].numpy()).inv()
+         * Rotation.from_matrix(b.world_to_camera[:3, :3].numpy())).magnitude()
+        for a, b in itertools.pairwise(frames)
+    ]  # fmt: skip
+    assert np.allclose(steps, math.pi / 4)
+
+
+def test_one_camera_stands_still():
+    only = posed((1, 2, 3), rotated(40))
+    frames = CameraPath([only]).evenly(4)
+    assert len(frames) == 4
+    assert all(np.allclose(c.world_to_camera, only.world_to_camera, atol=1e-15) and c.fx == only.fx for c in frames)
+
+
+def test_two_cameras_are_joined_by_a_straight_line():
+    frames = CameraPath([posed((0, 0, 0)), posed((4, 2, 0))]).evenly(5)
+    assert np.allclose([c.center.numpy() for c in frames], np.linspace((0, 0, 0), (4, 2, 0), 5))
+
+
+def test_coinciding_cameras_count_once():
+    a, b = posed((0, 0, 0)), posed((2, 0, 0), rotated(20))
+    path = CameraPath([a, a, b, replace(b, name="again"), b])
+    assert len(path.cameras) == 2
+    assert np.isfinite(poses(path.evenly(9))).all()
+    assert len(CameraPath([a, a]).evenly(3)) == 3
+
+
+def test_a_camera_that_turns_or_zooms_in_place_takes_time():
+    path = CameraPath([posed((0, 0, 0)), posed((0, 0, 0), rotated(30)), posed((0, 0, 0), rotated(30), focal=150)])
+    assert np.allclose(path.knots, [0, 1, 2])
+    assert np.isclose(path.at(np.array([1.5]))[0].fx, math.sqrt(100 * 150))
+
+
+def test_cameras_of_another_size_get_the_frame_of_most_cameras():
+    small = posed((1, 0, 0), focal=50.0, size=(32, 24))
+    path = CameraPath([posed((0, 0, 0)), small, posed((2, 0, 0))])
+    frame = path.at(path.knots[1:2])[0]
+    assert (frame.width, frame.height, frame.cx, frame.cy) == (64, 48, 32, 24)
+    assert frame.fx == pytest.approx(100)
+
+
+def test_no_cameras_are_refused():
+    with pytest.raises(CameraError, match="at least one"):
+        CameraPath([])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.tuples(*[st.sampled_from([0.0, 1e-12, 1e-3, 1.0, -5.0, 1e6])] * 3),
+            st.sampled_from([0, 1e-9, 1, 90, 179.999999, 180]),
+        ),
+        min_size=1,
+        max_size=6,
+    )
+)
+def test_any_cameras_make_a_finite_path(given_poses):
+    path = CameraPath([posed(center, rotated(angle)) for center, angle in given_poses])
+    path_poses = poses(path.evenly(20))
+    assert np.isfinite(path_poses).all()
+    assert np.allclose(path_poses[:, :3, :3] @ path_poses[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-9)
+
+
+def test_tangents_of_points_on_a_parabola_are_exact():
+    knots = np.array([0.0, 0.5, 2.0, 2.25])
+    tangents = catmull_rom_tangents(knots, (knots**2)[:, None])
+    assert np.allclose(tangents[1:-1, 0], 2 * knots[1:-1])
+
+
+def ring(count):
+    """Return cameras on half a circle."""
+    up, origin = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
+    angles = [math.pi * index / count for index in range(count)]
+    return [
+        look_at(str(i), torch.tensor([math.cos(a), 0.3, math.sin(a)]), origin, up, width=64, height=48, focal=50)
+        for i, a in enumerate(angles)
+    ]
+
+
+def test_order_of_the_file_is_kept_unless_it_jumps():
+    cameras = ring(20)
+    assert in_path_order(cameras) == cameras
+    assert in_path_order(cameras[::-1]) == cameras[::-1]
+    shuffled = [cameras[(index * 7) % 20] for index in range(20)]
+    assert [c.name for c in in_path_order(shuffled)] == [str(index) for index in range(20)]
+
+
+def test_framed_cameras_keep_what_they_show_but_for_one_pixel():
+    first = posed((0, 0, 0), size=(65, 49))
+    same = framed(first, None, even=True)
+    assert (same.width, same.height, same.fx, same.cx) == (64, 48, first.fx, first.cx)
+    double = framed(first, 130, even=False)
+    assert (double.width, double.height, double.fx, double.cx) == (130, 98, 200, 65)
+
+
+WIDTH, HEIGHT = 320, 240
+#: Parameters of real lenses: phone, wide angle (barrel), telephoto (pincushion), with decentering, and fisheyes.
+LENSES = {
+    "SIMPLE_RADIAL": [260.0, 163.0, 118.0, 0.03],
+    "RADIAL": [260.0, 163.0, 118.0, -0.21, 0.04],
+    "OPENCV": [260.0, 255.0, 163.0, 118.0, 0.09, -0.02, 0.003, -0.004],
+    "FULL_OPENCV": [260.0, 255.0, 163.0, 118.0, 0.4, 0.1, 0.001, -0.002, 0.02, 0.45, 0.12, 0.03],
+    "OPENCV_FISHEYE": [180.0, 178.0, 163.0, 118.0, 0.02, -0.01, 0.003, -0.001],
+    "SIMPLE_RADIAL_FISHEYE": [180.0, 163.0, 118.0, 0.04],
+    "RADIAL_FISHEYE": [180.0, 163.0, 118.0, 0.04, -0.01],
+    "FISHEYE": [180.0, 178.0, 163.0, 118.0],
+    "SIMPLE_FISHEYE": [180.0, 163.0, 118.0],
+}
+
+
+def lens(model: str, parameters: list[float] | None = None) -> Lens:
+    return _colmap_lens("", ColmapCamera(model, WIDTH, HEIGHT, tuple(parameters or LENSES[model])))
+
+
+def with_lens(lens: Lens) -> Camera:
+    pose = torch.eye(4, dtype=torch.float64)
+    return Camera("view", lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, pose, lens=lens)
+
+
+def of_colmap(model: str) -> pycolmap.Camera:
+    return pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=LENSES[model])
+
+
+def pattern(height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    """Return a smooth image [height, width, 3] uint8."""
+    y, x = np.mgrid[:height, :width] / width
+    waves = [np.sin(9 * x + 4 * y), np.cos(7 * y - 3 * x), np.sin(20 * x * y)]
+    return (127.5 + 120 * np.stack(waves, axis=2)).round().astype("u1")
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_projected_rays_match_colmap(model: str) -> None:
+    rays = np.random.default_rng(3).uniform(-0.6, 0.6, (200, 2))
+    rays[0] = 0
+    expected = np.array([of_colmap(model).img_from_cam(np.array([*ray, 1.0])) for ray in rays])
+    u, v = lens(model).positions(*torch.from_numpy(rays).unbind(1))
+    assert np.allclose(u.numpy() * WIDTH, expected[:, 0], rtol=0, atol=1e-9)
+    assert np.allclose(v.numpy() * HEIGHT, expected[:, 1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_undistorted_photos_match_colmap(model: str) -> None:
+    """Compare pixels in the frame that both show; COLMAP samples at 8 bits."""
+    view = undistorted(with_lens(lens(model)))
+    options = pycolmap.UndistortCameraOptions()
+    options.max_scale = 1.0
+    bitmap, expected = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(pattern()), of_colmap(model))
+    same = replace(
+        view,
+        width=expected.width,
+        height=expected.height,
+        cx=expected.principal_point_x,
+        cy=expected.principal_point_y,
+    )
+    photo = torch.from_numpy(pattern()).float() / 255
+    actual = undistort(photo, same)[2:-2, 2:-2] * 255
+    assert float((actual - torch.from_numpy(bitmap.to_array()).float()[2:-2, 2:-2]).abs().max()) < 1.5
+    assert (view.fx, view.fy) == (expected.focal_length_x, expected.focal_length_y)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_frames_shrink_just_enough_to_have_no_border(model: str) -> None:
+    whole = with_lens(lens(model))
+    view = undistorted(whole)
+    u, v = corners(view)
+    assert 0 <= float(min(u.min(), v.min())) <= float(max(u.max(), v.max())) <= 1
+    assert view.cx / view.width == pytest.approx(whole.cx / whole.width)
+    if view.width < WIDTH:
+        larger = replace(view, width=view.width + 3, height=view.height + 3)
+        larger = replace(larger, cx=whole.cx * larger.width / WIDTH, cy=whole.cy * larger.height / HEIGHT)
+        u, v = corners(larger)
+        assert float(min(u.min(), v.min())) < 0 or float(max(u.max(), v.max())) > 1
+    else:
+        assert view == whole
+
+
+def corners(view: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the positions in the photo of many points on the frame's border."""
+    along = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    zero = torch.zeros_like(along)
+    across = torch.cat([along, along, zero, zero + 1]) * view.width
+    down = torch.cat([zero, zero + 1, along, along]) * view.height
+    assert view.lens
+    return view.lens.positions((across - view.cx) / view.fx, (down - view.cy) / view.fy)
+
+
+def test_small_views_of_large_photos_do_not_alias() -> None:
+    stripes = torch.zeros(4 * HEIGHT, 4 * WIDTH, 3)
+    stripes[:, ::2] = 1
+    small = undistort(stripes, resized(undistorted(with_lens(lens("RADIAL"))), 80))
+    assert small.shape[1] == 80
+    assert float((small - 0.5).abs()[:, 2:-2].max()) < 0.03
+
+
+def test_coefficients_of_0_are_no_distortion() -> None:
+    for model in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"):
+        intrinsics = 3 if "RADIAL" in model else 4
+        parameters = LENSES[model][:intrinsics] + [0.0] * (len(LENSES[model]) - intrinsics)
+        assert not lens(model, parameters).distorts
+        assert lens(model).distorts
+    assert lens("FISHEYE").distorts  # equal angles are not equal lengths
+
+
+@pytest.mark.parametrize(
+    "values", [(float("inf"),), (-1e6,), (1e300, 1e300), (0, 0, 5.0, 5.0), (0, 0, 0, 0, 0, -900.0)]
+)
+def test_lenses_that_leave_no_image_are_refused(values: tuple[float, ...]) -> None:
+    hostile = Lens.of("OPENCV", values, (WIDTH, HEIGHT), (260.0, 260.0, 160.0, 120.0))
+    with pytest.raises(CameraError, match=r"'view': its distortion \(OPENCV .*leaves no image"):
+        undistorted(with_lens(hostile))
+
+
+def test_folded_borders_are_cropped() -> None:
+    """Beyond a radius of 0.58, this lens maps the image back onto itself, and its corners lie inside the photo."""
+    folding = with_lens(Lens.of("RADIAL", (-1.0,), (WIDTH, HEIGHT), (200.0, 200.0, 160.0, 120.0)))
+    u, v = corners(folding)
+    assert 0 < float(min(u.min(), v.min())) <= float(max(u.max(), v.max())) < 1
+    view = undistorted(folding)
+    radius = np.hypot(view.width / 2 / view.fx, view.height / 2 / view.fy)
+    assert 0.5 < radius <= 1 / np.sqrt(3) + 0.01
+
+
+def test_lenses_without_a_formula_are_refused() -> None:
+    view = with_lens(lens("FOV", [260.0, 260.0, 160.0, 120.0, 0.9]))
+    with pytest.raises(CameraError, match=r"photos of the camera model FOV cannot be undistorted here.*image_undist"):
+        undistorted(view)

@@ -11,7 +11,7 @@ from torch import Tensor
 from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.quality.judge import saturated
-from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.colors import LARGEST, ColorSubspace, gray
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings

@@ -16,7 +16,7 @@ from sgsst_core.loss.terms import TERMS, LossTerms
 from sgsst_core.planning.plan import Plan, Work
 from sgsst_core.planning.survey import Survey
 from sgsst_core.progress import Decision
-from sgsst_core.refine.split import Refinement
+from sgsst_core.refine import Refinement
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing import checkpoint

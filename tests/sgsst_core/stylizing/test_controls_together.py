@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.refine.split import parents_of, piece_counts
-from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.refine import parents_of, piece_counts
+from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.colors import luminance
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style

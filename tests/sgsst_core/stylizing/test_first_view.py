@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.regions import Region, Regions
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.stylizer import Stylizer, render_first_view

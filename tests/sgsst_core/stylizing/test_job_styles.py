@@ -10,7 +10,7 @@ from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.scene.pyramid import resize_area, style_size
+from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import _inside, check_style_size, prepared_style, rotated

@@ -14,7 +14,7 @@ from sgsst_core.constants import SH_C0
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.plan import Plan
 from sgsst_core.quality.measure import Float32Reference, Measurements
-from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.regions import Region, Regions
 from sgsst_core.report.images import write_contact_sheet
 from sgsst_core.scene.colors import on_screen_by_luminance
 from sgsst_core.scene.gaussians import Scene

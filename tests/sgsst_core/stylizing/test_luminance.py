@@ -14,9 +14,8 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.scene.colors import luminance
+from sgsst_core.scene.colors import luminance, resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.color_transfer import luminance_start

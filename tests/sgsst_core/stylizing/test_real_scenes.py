@@ -6,7 +6,7 @@ from sgsst_core import Stylizer, make_settings, run
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.orbit.cameras import orbit
+from sgsst_core.orbit import orbit
 from sgsst_core.scene.camera import resized, spread
 from tests.real_scenes import scene_path
 

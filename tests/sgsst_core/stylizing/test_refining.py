@@ -7,13 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sgsst_core import refine as choice
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.gradient_error import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.refine import choice
-from sgsst_core.refine.choice import MIN_PSNR, Footprints
-from sgsst_core.refine.split import Refinement, parents_of, piece_counts
+from sgsst_core.refine import MIN_PSNR, Footprints, Refinement, parents_of, piece_counts
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import Settings, make_settings
 from sgsst_core.style import Style

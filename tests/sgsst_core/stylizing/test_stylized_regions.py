@@ -15,8 +15,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.terms import ViewTarget
 from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.regions.definition import Region, Regions
-from sgsst_core.regions.maps import RegionMaps
+from sgsst_core.regions import Region, RegionMaps, Regions
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style

@@ -16,7 +16,7 @@ from sgsst_core.devices import Timer
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.progress import Progress
-from sgsst_core.rasterizer.tile_intersections import TileIntersections, build_tile_intersections
+from sgsst_core.rasterizer.projection import TileIntersections, build_tile_intersections
 from sgsst_core.scales import smoothed
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene

@@ -12,8 +12,8 @@ from sgsst_core.budget import Cache
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.images import Color
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
+from sgsst_core.scene.colors import downscale
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.pyramid import downscale
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions

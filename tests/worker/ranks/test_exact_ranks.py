@@ -20,7 +20,7 @@ from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange
 from sgsst_core.parallel.division import Divider, Piece, Shares, Tiling, divide
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.regions.definition import Region, Regions
+from sgsst_core.regions import Region, Regions
 from sgsst_core.scales import EVEN, ScaleWeights
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.colors import gray

@@ -26,8 +26,7 @@ from sgsst_core.loss.terms import LossTerms
 from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, Team, same_on_all
 from sgsst_core.planning.facts import Machine
 from sgsst_core.progress import Decision
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.lens import Lens
+from sgsst_core.scene.camera import Camera, Lens
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights

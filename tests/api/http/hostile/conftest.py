@@ -21,8 +21,7 @@ from sgsst_core.files.scene_file import write_scene
 from tests.api.conftest import Services
 from tests.api.http.sending import MB, Files, form
 from tests.api.service import Service, wait_for
-from tests.sgsst_core.files.formats.samples import ksplat
-from tests.sgsst_core.files.formats.streamed import archived, streamed
+from tests.sgsst_core.files.formats.samples import archived, ksplat, streamed
 from tests.small_scenes import wall
 
 #: Maximum growth in bytes of the API process during one test, at its peak.

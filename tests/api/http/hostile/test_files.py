@@ -25,7 +25,7 @@ from service.settings import ServiceSettings
 from service.store import Store
 from sgsst_core.files.formats import FORMATS
 from sgsst_core.files.formats.ply import PLY
-from sgsst_core.files.formats.streamed_sog import STREAMED_SOG
+from sgsst_core.files.formats.sog import STREAMED_SOG
 from tests.api.http.sending import (
     MB,
     NAMES,

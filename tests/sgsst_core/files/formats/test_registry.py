@@ -22,8 +22,7 @@ from sgsst_core.files.formats import (
     format_of_name,
     read_scene_header,
 )
-from sgsst_core.files.formats.compressed_ply import COMPRESSED_PLY
-from sgsst_core.files.formats.ply import PLY
+from sgsst_core.files.formats.ply import COMPRESSED_PLY, PLY
 from sgsst_core.files.formats.scene_format import FileStart, SceneFormat
 from sgsst_core.files.formats.sog import SOG
 from sgsst_core.files.formats.splat import SPLAT

@@ -1,1 +1,0 @@
-"""Refinement: split Gaussians that are large in the views into smaller ones."""

@@ -1,0 +1,611 @@
+"""Tests of what formats share: axes, stated render modes, surplus content, refused kinds of scenes."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import struct
+import warnings
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sgsst_core.errors import SceneError
+from sgsst_core.files.formats import RESULT_FORMATS, by_name, read_scene_header
+from sgsst_core.files.formats.scene_format import Frame, SceneFormat
+from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.gaussians import TENSORS, Scene
+from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
+from sgsst_core.scene.spherical_harmonics import scene_colors
+from tests.sgsst_core.files.formats.samples import encoded, ksplat, refused
+from tests.sgsst_core.splat_scenes import camera, cloud, rotated_pose
+from tests.small_scenes import wall
+
+
+def matrix(scale: float = 1.0) -> np.ndarray:
+    pose = rotated_pose(2.1).numpy()
+    pose[:3, :3] *= scale
+    return pose
+
+
+def applied(frame: Frame, scene: Scene) -> Scene:
+    arrays = {name: getattr(scene, name).numpy().copy() for name in TENSORS}
+    frame.apply(arrays)
+    return Scene(*(torch.from_numpy(array) for array in arrays.values()))
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_transformed_scene_and_camera_give_the_same_image(scale: float) -> None:
+    scene, view = cloud(300, degree=3), camera(90, 70)
+    moved = matrix(scale)
+    pose = view.world_to_camera.clone()
+    pose[:3, :3] = pose[:3, :3] @ torch.from_numpy(moved[:3, :3].T / scale)
+    pose[:3, 3] = scale * view.world_to_camera[:3, 3] - pose[:3, :3] @ torch.from_numpy(moved[:3, 3])
+    images = []
+    for each, seen in (
+        (scene, view),
+        (applied(Frame.of(moved), scene), replace(view, world_to_camera=pose)),
+    ):
+        near = 0.2 if seen is view else 0.2 * scale
+        images.append(make_rasterizer("reference", each, near=near).render(scene_colors(each, seen), seen))
+    assert float((images[0] - images[1]).abs().max()) < 2e-4
+
+
+def test_rotation_by_180_degrees_is_exact() -> None:
+    scene = cloud(100, degree=3)
+    frame = Frame.of(np.diag([-1.0, -1.0, 1.0, 1.0]))
+    once = applied(frame, scene)
+    assert torch.equal(once.means, scene.means * torch.tensor([-1.0, -1.0, 1.0]))
+    assert torch.equal(held_abs(once), held_abs(scene))
+    twice = applied(frame, once)
+    for name in ("means", "scales", "sh_rest"):
+        assert torch.equal(getattr(twice, name), getattr(scene, name))
+    assert torch.equal(twice.quats, -scene.quats)
+
+
+def held_abs(scene: Scene) -> torch.Tensor:
+    return torch.as_tensor(scene.sh_rest).abs()
+
+
+@pytest.mark.parametrize(
+    "linear", [np.diag([1.0, 1.0, -1.0]), np.diag([1.0, 2.0, 1.0]), np.zeros((3, 3)), np.full((3, 3), np.nan)]
+)
+def test_mirrors_and_distortions_are_refused(linear: np.ndarray) -> None:
+    distorted = np.eye(4)
+    distorted[:3, :3] = linear
+    with pytest.raises(ValueError, match="the transformation"):
+        Frame.of(distorted)
+
+
+AA, MIP = Rendering("antialiased", 0.3), Rendering("antialiased", 0.1)
+FVDB = "fvdb_ply_af_8198767135"
+
+
+def ply(tmp_path: Path, *comments: str, newline: bytes = b"\n") -> Path:
+    """Write a PLY with comments in its header."""
+    path = tmp_path / "scene.ply"
+    write_scene(path, wall())
+    head, end, data = path.read_bytes().partition(b"end_header\n")
+    lines = [*head.split(b"\n")[:2], *(f"comment {text}".encode() for text in comments), *head.split(b"\n")[2:]]
+    path.write_bytes(newline.join(lines) + end[:-1] + newline + data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("comments", "expected"),
+    [
+        (["SplatRenderMode: mip"], AA),
+        (["Exported from Brush", "SH degree: 0", "SplatRenderMode: mip"], MIP),
+        (["Exported from Brush", "SplatRenderMode: default"], CLASSIC),
+        (["splatrendermode:  MIP "], AA),
+        (["SplatRenderMode: 2dgs"], Rendering("2dgs")),
+        (["antialiased 1"], AA),
+        (["antialiased 0"], CLASSIC),
+        (["antialiased 1", "SplatRenderMode: default"], CLASSIC),
+        (["SplatRenderMode: default", "antialiased 1"], AA),
+        (["SplatRenderMode: mip", "eps2d 0.2"], Rendering("antialiased", 0.2)),
+        (["eps2d 0.05"], Rendering("classic", 0.05)),
+        ([f"{FVDB}eps2d|double|0.30000000000000004", f"{FVDB}antialias|int64|1"], replace(AA, eps2d=0.1 + 0.2)),
+        ([f"{FVDB}eps2d|double|0.3", f"{FVDB}antialias|int64|0"], CLASSIC),
+        (["SplatRenderMode: banana"], CLASSIC),
+        (["SplatRenderMode: mip", "eps2d nan"], AA),
+        (["SplatRenderMode: mip", "eps2d 1e9"], AA),
+        (["SplatRenderMode: mip", "eps2d -0.1"], AA),
+        (["not antialiased 1", "antialiased 12"], CLASSIC),
+        (["postshot.anti_aliasing=1"], AA),
+        (["postshot.anti_aliasing=0"], CLASSIC),
+        (["Anti-Aliasing: on"], AA),
+        (["rasterize_mode=antialiased", "kernel_size: 0.1"], MIP),
+        (["mip_splatting true"], AA),
+        ([], CLASSIC),
+    ],
+)
+def test_comments_of_programs_state_the_render_mode(tmp_path: Path, comments: list[str], expected: Rendering) -> None:
+    for newline in (b"\n", b"\r\n"):
+        file = read_scene(ply(tmp_path, *comments, newline=newline))
+        assert file.scene.rendering == file.tag.rendering == expected
+
+
+def test_doubtful_comments_give_warnings(tmp_path: Path) -> None:
+    for comment, said in (
+        ("SplatRenderMode: banana", "unknown"),
+        ("trained with anti-aliasing", "unknown"),
+        ("antialiased 12", "unknown"),
+        ("Mip-Splatting, 30,000 steps", "unknown"),
+        ("eps2d nan", "unknown"),
+        ("SplatRenderMode: 2dgs", "without thickness"),
+        ("trained with 3DGUT", "another projection"),
+        (f"{FVDB}projection_method|str|unscented", "another projection"),
+    ):
+        (warning,) = read_scene(ply(tmp_path, comment)).tag.warnings
+        assert said in " ".join(warning)
+    assert read_scene(ply(tmp_path, "gut feeling", "mipless", "SplatRenderMode: mip")).tag.warnings == ()
+
+
+@pytest.mark.parametrize("rendering", [CLASSIC, AA, MIP, Rendering("2dgs")], ids=lambda each: each.text)
+@pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
+def test_written_files_state_the_render_mode(tmp_path: Path, format: SceneFormat, rendering: Rendering) -> None:
+    path = tmp_path / "scene.any"
+    write_scene(path, replace(wall(sh_degree=1), rendering=rendering), format)
+    loaded = read_scene(path).scene.rendering
+    if format.name.endswith("spz"):  # has a flag for antialiased scenes only
+        rendering = AA if rendering.antialiased else CLASSIC
+    assert loaded == rendering
+
+
+@pytest.mark.parametrize("format", RESULT_FORMATS, ids=lambda format: format.name)
+def test_classic_scenes_state_no_render_mode(tmp_path: Path, format: SceneFormat) -> None:
+    path = tmp_path / "scene.any"
+    write_scene(path, wall(), format)
+    data = path.read_bytes()
+    if format.name == "sog":
+        with zipfile.ZipFile(path) as archive:
+            assert not {"model", "extras"} & json.loads(archive.read("meta.json")).keys()
+    elif format.name == "v3.spz":
+        assert gzip.decompress(data)[14] == 0
+    elif format.name == "spz":
+        assert data[14] == 2
+    else:
+        assert b"comment" not in data[:4000]
+    assert read_scene(path).tag.reason == ""
+
+
+def test_flag_of_old_spz_files_is_ignored(tmp_path: Path) -> None:
+    path = tmp_path / "scene.spz"
+    write_scene(path, replace(wall(), rendering=AA), by_name("v3.spz"))
+    data = bytearray(gzip.decompress(path.read_bytes()))
+    assert data[14] == 1
+    data[13] = 12  # as by Spark
+    path.write_bytes(gzip.compress(bytes(data)))
+    file = read_scene(path)
+    assert file.scene.rendering == CLASSIC
+    ((drawn, reason),) = file.tag.warnings
+    assert drawn == "classic"
+    assert "Spark" in reason
+
+
+def stylized(file: SceneFile, target: Path) -> SceneFile:
+    write_stylized(file, target, torch.zeros_like(file.scene.sh_dc))
+    return read_scene(target)
+
+
+@pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
+def test_stylized_ply_keeps_the_render_mode_of_its_source(tmp_path: Path, newline: bytes) -> None:
+    path = ply(tmp_path, "Exported from Brush", "SplatRenderMode: mip", newline=newline)
+    loaded = stylized(read_scene(path), tmp_path / "out.ply")
+    assert loaded.scene.rendering == MIP
+    size = path.read_bytes().index(b"end_header")
+    assert (tmp_path / "out.ply").read_bytes()[:size] == path.read_bytes()[:size]
+
+
+@pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
+@pytest.mark.parametrize("comments", [[], ["Exported from Brush", "SplatRenderMode: mip"], ["antialiased 1"]])
+@pytest.mark.parametrize("rendering", [CLASSIC, AA, MIP], ids=lambda each: each.text)
+def test_stylized_ply_states_the_requested_render_mode(
+    tmp_path: Path, rendering: Rendering, comments: list[str], newline: bytes
+) -> None:
+    mode: RenderMode = "antialiased" if rendering.antialiased else "classic"
+    file = read_scene(ply(tmp_path, *comments, newline=newline)).rendered(mode, rendering.eps2d)
+    result = stylized(file, tmp_path / "out.ply")
+    assert result.scene.rendering == file.scene.rendering == rendering
+    assert torch.equal(result.scene.means, file.scene.means)
+    again = stylized(result, tmp_path / "again.ply")
+    assert again.scene.rendering == rendering
+
+
+def test_requested_mode_is_stated_when_gaussians_are_dropped(tmp_path: Path) -> None:
+    scene = wall()
+    scene.means[3] = torch.nan
+    write_scene(tmp_path / "scene.ply", scene)
+    file = read_scene(tmp_path / "scene.ply", drop_invalid=True).rendered("antialiased", None)
+    result = stylized(file, tmp_path / "out.ply")
+    assert (len(result.scene), result.scene.rendering) == (len(scene) - 1, AA)
+
+
+def test_plys_from_other_formats_keep_the_render_mode(tmp_path: Path) -> None:
+    write_scene(tmp_path / "scene.sog", replace(wall(), rendering=MIP), by_name("sog"))
+    assert stylized(read_scene(tmp_path / "scene.sog"), tmp_path / "out.ply").scene.rendering == MIP
+
+
+NOTE = "the file has {} more than its header declares, which are not read; copy or export it again"
+
+
+def fewer(data: bytes, count: int = 600) -> bytes:
+    """Return a PLY whose header counts fewer Gaussians."""
+    return data.replace(b"element vertex 616", f"element vertex {count}".encode())
+
+
+def as_text(data: bytes) -> bytes:
+    """Return a binary PLY of floats as text."""
+    head, _, body = data.partition(b"end_header\n")
+    width = head.count(b"property float")
+    rows = np.frombuffer(body, "<f4").reshape(-1, width)
+    lines = [" ".join(f"{value:.9g}" for value in row) for row in rows]
+    return head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + "\n".join([*lines, ""]).encode()
+
+
+def with_elements(data: bytes) -> bytes:
+    """Return a PLY with faces and another element after its Gaussians."""
+    lines = b"element face 2\nproperty list uchar int i\nelement view 1\nproperty double focal\nend_header\n"
+    return data.replace(b"end_header\n", lines) + 2 * struct.pack("<B3i", 3, 0, 1, 2) + struct.pack("<d", 1)
+
+
+@pytest.mark.parametrize("change", [bytes, as_text, with_elements])
+def test_rows_beyond_the_declared_ones_are_counted(tmp_path: Path, change: Callable[[bytes], bytes]) -> None:
+    path, data = tmp_path / "scene.ply", change(encoded(tmp_path, by_name("ply")))
+    path.write_bytes(data + b"\n")
+    assert read_scene(path).notes == ()
+    if change is with_elements:
+        path.write_bytes(data + b"more bytes")
+        assert read_scene(path).notes == (NOTE.format("10 bytes"),)
+        return
+    path.write_bytes(fewer(data))
+    loaded = read_scene(path)
+    row_bytes = 26 * 4
+    counted = "16 rows" if change is as_text else f"{16 * row_bytes} bytes (16 rows)"
+    assert len(loaded.scene) == 600
+    assert loaded.notes == (NOTE.format(counted),)
+    write_stylized(loaded, tmp_path / "out.ply", torch.zeros(600, 3))
+    assert read_scene(tmp_path / "out.ply").notes == loaded.notes
+
+
+def text_transfer(data: bytes) -> bytes:
+    return data.replace(b"\n", b"\r\n")
+
+
+def text_transfer_of_the_end(data: bytes) -> bytes:
+    """Return a PLY of which the header and the last line end in the data became CR LF."""
+    head, _, body = data.partition(b"end_header\n")
+    before, _, after = body.rpartition(b"\n")
+    return text_transfer(head + b"end_header\n") + before + b"\r\n" + after
+
+
+def text_transfer_of_the_data(data: bytes) -> bytes:
+    head, _, body = data.partition(b"end_header\n")
+    return head + b"end_header\n" + text_transfer(body)
+
+
+def as_utf_8(data: bytes) -> bytes:
+    head, _, body = data.partition(b"end_header\n")
+    return head + b"end_header\n" + body.decode(errors="replace").encode()
+
+
+def from_latin_1_to_utf_8(data: bytes) -> bytes:
+    head, _, body = data.partition(b"end_header\n")
+    return head + b"end_header\n" + body.decode("latin-1").encode()
+
+
+@pytest.mark.parametrize("name", ["ply", "compressed.ply"])
+@pytest.mark.parametrize(
+    "change",
+    [text_transfer, text_transfer_of_the_end, text_transfer_of_the_data, as_utf_8, from_latin_1_to_utf_8],
+)
+def test_binary_plys_that_were_transferred_as_text_are_refused(
+    tmp_path: Path, name: str, change: Callable[[bytes], bytes]
+) -> None:
+    write_scene(tmp_path / "good", cloud(2000, degree=1), by_name(name))
+    data = (tmp_path / "good").read_bytes()
+    broken = change(data)
+    surplus = len(broken) - len(data) - (broken.index(b"end_header") - data.index(b"end_header"))
+    surplus -= broken.startswith(b"ply\r\n")
+    refused(tmp_path, broken, rf"has {surplus} bytes? more than its header declares\. Was it transferred as text")
+    with pytest.raises(SceneError, match="transferred as text"):
+        read_scene(tmp_path / "scene.ply", drop_invalid=True)
+
+
+def test_invalid_rows_before_a_surplus_are_not_dropped(tmp_path: Path) -> None:
+    """A byte too many shifts all values after it."""
+    write_scene(tmp_path / "good", cloud(2000, degree=1))
+    data = (tmp_path / "good").read_bytes()
+    middle = len(data) // 2
+    refused(tmp_path, data[:middle] + b"\x7f" + data[middle:], "not as the header declares: the file has 1 byte more")
+
+
+def test_signaling_nans_give_no_numpy_warning(tmp_path: Path) -> None:
+    data = encoded(tmp_path, by_name("ply"))
+    (tmp_path / "scene.ply").write_bytes(data[:-16] + struct.pack("<4I", 0x7F800001, 0, 0, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(SceneError, match=r"rot_0 \(1 NaN\)"):
+            read_scene(tmp_path / "scene.ply")
+
+
+def shorter_glb(data: bytes) -> bytes:
+    return data.replace(b'"count": 616', b'"count": 600')
+
+
+def longer_glb(data: bytes) -> bytes:
+    """Return a GLB whose binary chunk has 40 bytes more than its buffer declares."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    head, text, body = data[:20], data[20 : 20 + size], data[28 + size :] + b"x" * 40
+    whole = struct.pack("<I", len(data) + 40)
+    return head[:8] + whole + head[12:] + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+
+
+def trailing(count: int) -> Callable[[bytes], bytes]:
+    return lambda data: data + b"x" * count
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "surplus"),
+    [
+        *((name, trailing(20), "20 bytes") for name in ("compressed.ply", "spz", "v3.spz", "sog", "glb")),
+        ("sog", lambda data: b"PK\3\4" + bytes(6) + data, "10 bytes"),
+        ("glb", shorter_glb, f"{16 * 12} bytes"),
+        ("glb", longer_glb, "40 bytes"),
+        ("v3.spz", lambda data: gzip.compress(gzip.decompress(data) + b"12345"), "5 bytes"),
+    ],
+)
+def test_surplus_of_compressed_scenes_is_counted(
+    tmp_path: Path, name: str, change: Callable[[bytes], bytes], surplus: str
+) -> None:
+    path, data = tmp_path / "scene", encoded(tmp_path, by_name(name))
+    for harmless in (data, data + b"\r\n", data + bytes(100)):
+        path.write_bytes(harmless)
+        assert read_scene(path, spz_axes="rub").notes == ()
+    path.write_bytes(change(data))
+    assert read_scene(path, spz_axes="rub").notes == (NOTE.format(surplus),)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_surplus_of_ksplat_is_counted(tmp_path: Path, level: int) -> None:
+    path, data = tmp_path / "scene.ksplat", ksplat(wall(sh_degree=1), level)
+    path.write_bytes(data + bytes(64))
+    assert read_scene(path).notes == ()
+    path.write_bytes(data + b"x" * 64)
+    assert read_scene_header(path).notes == (NOTE.format("64 bytes"),)
+
+
+@pytest.mark.parametrize("compress", [gzip.compress, bytes])
+@pytest.mark.parametrize("extended", [True, False])
+def test_spz_that_counts_fewer_gaussians_is_refused(
+    tmp_path: Path, compress: Callable[[bytes], bytes], extended: bool
+) -> None:
+    """The attributes of all Gaussians follow each other, so that a wrong count shifts them."""
+    raw = bytearray(gzip.decompress(encoded(tmp_path, by_name("v3.spz"))))
+    raw[8:12] = struct.pack("<I", 600)
+    if not extended:
+        raw[14] = 0
+    refused(tmp_path, compress(bytes(raw)), r"continues by \d+ bytes after all Gaussians", "scene.spz")
+    data = bytearray(encoded(tmp_path, by_name("spz")))
+    data[8:12] = struct.pack("<I", 600)
+    refused(tmp_path, bytes(data), "belong to 600 Gaussians", "scene.spz")
+
+
+def units(scene: Scene, *, scales: bool, opacities: bool) -> Scene:
+    """Return a scene with activated scales or opacities in place of their logarithms and logits."""
+    return replace(
+        scene,
+        scales=scene.scales.exp() if scales else scene.scales,
+        opacities=scene.opacities.sigmoid() if opacities else scene.opacities,
+    )
+
+
+@pytest.mark.parametrize("scene", [wall(sh_degree=1), cloud(2000, degree=1)], ids=["wall", "cloud"])
+@pytest.mark.parametrize("name", ["ply", "compressed.ply", "spz", "v3.spz", "sog", "glb"])
+@pytest.mark.parametrize(("scales", "opacities"), [(True, True), (True, False), (False, True)])
+def test_activated_values_are_refused(tmp_path: Path, scene: Scene, name: str, scales: bool, opacities: bool) -> None:
+    """Formats that store opacities cannot show that logits of opacities were taken for logits."""
+    path = tmp_path / "scene"
+    write_scene(path, units(scene, scales=scales, opacities=opacities), by_name(name))
+    if opacities and not scales and name != "ply":
+        assert len(read_scene(path).scene) == len(scene)
+        return
+    expected = "its log scales go from .* stored as they are" if scales else "its logits of opacities go from"
+    with pytest.raises(SceneError, match=rf"{expected}.*activated.*Export the scene again"):
+        read_scene(path)
+
+
+def test_scenes_in_small_units_are_read(tmp_path: Path) -> None:
+    """In millimeters, all Gaussians may be larger than 1."""
+    scene = cloud(2000, degree=0)
+    shift = float(-scene.scales.min()) + 0.1
+    large = replace(scene, means=scene.means * float(np.exp(shift)), scales=scene.scales + shift)
+    write_scene(tmp_path / "scene.ply", large)
+    assert torch.equal(read_scene(tmp_path / "scene.ply").scene.scales, large.scales)
+
+
+def test_gaussians_larger_than_the_scene_are_read(tmp_path: Path) -> None:
+    """They are neither plausible as logarithms nor as they are."""
+    write_scene(tmp_path / "scene.ply", replace(wall(), scales=torch.full((616, 3), 6.0)))
+    assert len(read_scene(tmp_path / "scene.ply").scene) == 616
+
+
+def test_colors_in_place_of_coefficients_are_noticed(tmp_path: Path) -> None:
+    path, colors = tmp_path / "scene.ply", torch.rand(616, 3, generator=torch.Generator().manual_seed(1))
+    write_scene(path, replace(wall(), sh_dc=colors * 255))
+    with pytest.raises(SceneError, match=r"colors \(f_dc\) go from .* colors of 0 to 255"):
+        read_scene(path)
+    write_scene(path, replace(wall(), sh_dc=colors))
+    assert ["if they are colors of 0 to 1" in note for note in read_scene(path).notes] == [True]
+
+
+@pytest.mark.parametrize("largest", [100, 255])
+def test_opacities_of_0_to_100_or_255_are_noticed(tmp_path: Path, largest: int) -> None:
+    path, opacities = tmp_path / "scene.ply", torch.linspace(0, largest, 616)
+    write_scene(path, replace(wall(), opacities=opacities))
+    (note,) = read_scene(path).notes
+    assert note.startswith(f"logits of opacities go from 0 to {largest}, which is opaque; if they are opacities")
+    write_scene(path, replace(wall(), opacities=opacities - 3))
+    assert read_scene(path).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("attribute", "values", "message"),
+    [
+        ("SCALE", wall().scales.numpy(), "scales are negative, so they are logarithms"),
+        ("OPACITY", wall().opacities.numpy(), r"opacities are not in 0\.\.1, so they are logits"),
+    ],
+)
+def test_logarithms_in_a_glb_are_refused(tmp_path: Path, attribute: str, values: np.ndarray, message: str) -> None:
+    data = encoded(tmp_path, by_name("glb"))
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    index = document["meshes"][0]["primitives"][0]["attributes"][f"KHR_gaussian_splatting:{attribute}"]
+    start = 28 + size + document["bufferViews"][index]["byteOffset"]
+    raw = values.astype("<f4").tobytes()
+    refused(tmp_path, data[:start] + raw + data[start + len(raw) :], message, "scene.glb")
+
+
+def test_logarithms_in_a_splat_are_refused(tmp_path: Path) -> None:
+    row = struct.pack("<6f8B", 1, 2, 3, -4, -5, -2, 0, 255, 51, 128, 255, 128, 128, 128)
+    refused(tmp_path, 40 * row, "scales are negative", "scene.splat")
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_logarithms_in_a_ksplat_are_refused(tmp_path: Path, level: int) -> None:
+    scene = wall()
+    data = ksplat(replace(scene, scales=torch.full_like(scene.scales, 0.5)), level)
+    old, new = (np.full(3, value, "<f2" if level else "<f4").tobytes() for value in (np.exp(np.float32(0.5)), -2.0))
+    refused(tmp_path, re.sub(re.escape(old), new, data), "scales are negative", "scene.ksplat")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (("trbf_center", "trbf_scale", "motion_0"), "'trbf_center', so it is a dynamic scene.*Export one moment"),
+        (("motion_3",), "'motion_3', so it is a dynamic scene"),
+        (("t", "scale_t", "rot_r_0"), "'t', so it is a dynamic scene"),
+        (("rot_r_3",), "'rot_r_3', so it is a dynamic scene"),
+        (("velocity_x",), "'velocity_x', so it is a dynamic scene"),
+        (("motion_x",), "'motion_x', so it is a dynamic scene"),
+        (("opacity_t",), "'opacity_t', so it is a dynamic scene"),
+        (("t_start", "t_end"), "'t_start', so it is a dynamic scene"),
+        (("vx", "vy", "vz"), "'vx', so it is a dynamic scene"),
+        (("binding_0",), "'binding_0', .*relative to a mesh"),
+        (("beta",), "'beta', .*another kernel"),
+    ],
+)
+@pytest.mark.parametrize("name", ["ply", "compressed.ply"])
+def test_properties_that_change_the_meaning_are_refused(
+    tmp_path: Path, name: str, names: tuple[str, ...], message: str
+) -> None:
+    data = encoded(tmp_path, by_name(name))
+    end = b"element sh" if name == "compressed.ply" else b"end_header"
+    lines = "".join(f"property float {each}\n" for each in names).encode()
+    head, _, body = data.partition(end)
+    refused(tmp_path, head + lines + end + body + bytes(4 * 616 * len(names)), message)
+
+
+def test_properties_of_other_meanings_are_read(tmp_path: Path) -> None:
+    """Names that begin or end as those of dynamic scenes do."""
+    names = ("label", "confidence", "type", "tint", "weight", "variance", "rot_reference", "shading", "timestamp")
+    data = encoded(tmp_path, by_name("ply"))
+    lines = "".join(f"property float {each}\n" for each in names).encode()
+    head, _, body = data.partition(b"end_header\n")
+    row = len(body) // 616
+    rows = b"".join(body[i : i + row] + bytes(4 * len(names)) for i in range(0, len(body), row))
+    (tmp_path / "scene.ply").write_bytes(head + lines + b"end_header\n" + rows)
+    assert read_scene(tmp_path / "scene.ply").notes == ()
+
+
+OBJ = b"# Blender\nmtllib cube.mtl\no Cube\n" + b"".join(b"v %d 0 1.5\n" % i for i in range(500))
+
+
+@pytest.mark.parametrize(
+    ("data", "name", "message"),
+    [
+        (OBJ, "cube", "is an OBJ mesh"),
+        (b"\r\n" + OBJ.replace(b"\n", b"\r\n"), "cube", "is an OBJ mesh"),
+        (b"g empty", "mesh.obj", "is an OBJ mesh"),
+        (b'\n{"scenes": [], "asset": {"version": "2.0"}}', "scene", "Save it as one GLB"),
+        (b'{"scenes": []}', "scene.gltf", "Save it as one GLB"),
+        (b"", "scene.ply", "is empty"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "scene.ply", "Run `git lfs pull`"),
+        (b"\n<!DOCTYPE html>\n<html><body>404", "scene.ply", "is an HTML page.*Download the scene again"),
+        (b"<!DOCTYPE html>\n<title>SuperSplat Viewer</title>", "a.html", "a viewer of SuperSplat.*as PLY or SOG"),
+        (b'{"asset":{"version":"1.1"},"geometricError":5}', "tileset.json", "is a tileset of 3D Tiles"),
+        (b'{"version":"5.0","totalSplats":1}', "scene.lcc", "of XGRIDS.*`splat-transform scene.lcc scene.ply`"),
+        (b"PXR-USDC" + bytes(90), "a.usdc", "is OpenUSD, which is written but not read"),
+        (b"#usda 1.0\n", "a.usda", "is OpenUSD"),
+        (b"PK\x03\x04" + bytes(26) + b"default.usda#usda 1.0", "a.usdz", "is OpenUSD"),
+        (
+            b"PK\x03\x04" + bytes(26) + b"means3d.npy",
+            "scene.zip",
+            "NumPy arrays, such as those of gsplat.*export_splats",
+        ),
+        (b"PK\x03\x04" + bytes(90), "a.npz", "NumPy arrays"),
+        (b"PK\x03\x04" + bytes(90), "a.sog4d.zip", "is a dynamic scene.*Export one moment"),
+        (b'{"means": {"shape": [9, 3], "mins": [0], "maxs": [1]}}', "meta.json", "that gsplat compressed"),
+        (b"x,y,z,nx,ny,nz,f_dc_0\n1,2,3", "a.csv", "a table of splat-transform"),
+        (b"RAD0" + bytes(90), "a.rad", "of Spark"),
+        (b"spx" + bytes(90), "a.spx", "with gsbox"),
+        (b"\x80\x02}q\x00.", "model.pth", "is a checkpoint.*sgsst convert CHECKPOINT scene.ply.*ns-export"),
+    ],
+)
+def test_error_names_the_file_type(tmp_path: Path, data: bytes, name: str, message: str) -> None:
+    refused(tmp_path, data, message, name)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_checkpoints_are_refused_as_such(tmp_path: Path, legacy: bool) -> None:
+    path = tmp_path / "step-000029999.ckpt"
+    content = {"splats": {"means": torch.zeros(5, 3)}}
+    torch.save(content, path, _use_new_zipfile_serialization=not legacy)
+    with pytest.raises(SceneError, match="is a checkpoint, not a scene"):
+        read_scene(path)
+
+
+def test_text_is_not_taken_for_an_obj_file(tmp_path: Path) -> None:
+    refused(tmp_path, b"so it is\nv 1 2 3\n" * 100, "is not a scene file")
+    refused(tmp_path, b"# only\n# comments\n" * 100, "is not a scene file")
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (
+            ["point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply", "input.ply"],
+            "Give the scene in it: {}/point_cloud/iteration_30000/point_cloud.ply",
+        ),
+        (
+            ["ply/point_cloud_6999.ply", "ply/point_cloud_29999.ply", "ckpts/ckpt_29999_rank0.pt"],
+            "Give the scene in it: {}/ply/point_cloud_29999.ply",
+        ),
+        (["splat.ply"], "Give the scene in it: {}/splat.ply"),
+        (["meta.json", "sh0.webp"], "Give the scene in it: {}/meta.json"),
+        (
+            ["config.yml", "nerfstudio_models/step-000029999.ckpt"],
+            "`ns-export gaussian-splat --load-config {}/config.yml --output-dir exports`",
+        ),
+        (
+            ["ckpts/ckpt_6999_rank0.pt", "ckpts/ckpt_29999_rank0.pt", "ckpts/ckpt_29999_rank1.pt"],
+            "`sgsst convert {}/ckpts/ckpt_29999_rank0.pt scene.ply`",
+        ),
+        ([], "is a folder. Give the file of a scene"),
+    ],
+)
+def test_folder_error_names_the_scene_in_it(tmp_path: Path, files: list[str], message: str) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(SceneError, match=re.escape(message.format(tmp_path))):
+        read_scene(tmp_path)
