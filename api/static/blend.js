@@ -2,7 +2,7 @@
 /** Control of a blend of the original with one or two results; the viewer shows it exactly. */
 import { artifactPath, ask } from "./api.js";
 import { announce, h, newId, put } from "./dom.js";
-import { resultFormats } from "./scene_formats.js";
+import { resultFormats } from "./tables.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./viewer/viewer.js").Part} Part */

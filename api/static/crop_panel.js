@@ -2,8 +2,7 @@
 /** Panel to crop a scene to a box in the 3D view: what lies outside keeps its colors. */
 import { announce, h, icon } from "./dom.js";
 import { button } from "./fields.js";
-import { outline } from "./shapes.js";
-import { shapeAround, ShapeTool } from "./shape_tool.js";
+import { outline, shapeAround, ShapeTool } from "./shapes.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./shapes.js").Shape} Shape */

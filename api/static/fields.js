@@ -1,6 +1,7 @@
 // @ts-check
-/** Small controls of panels. */
-import { h, newId } from "./dom.js";
+/** Small controls of panels, and the button that deletes a job after a confirmation. */
+import { h, icon, newId, put } from "./dom.js";
+import { words } from "./words.js";
 
 /** @param {string} name @param {() => void} onclick @param {string} [kind] */
 export const button = (name, onclick, kind = "quiet") => h(`button.${kind}.small`, { type: "button", onclick }, name);
@@ -27,4 +28,33 @@ export function range(name, properties) {
 export function check(name, checked = false) {
   const input = h("input", { type: "checkbox", checked });
   return { input, element: h("label.check", input, h("span", name)) };
+}
+
+const say = words.job;
+
+/**
+ * Create a button that asks for confirmation.
+ *
+ * @param {string} name
+ * @param {() => Promise<void>} act
+ * @param {(error: unknown) => void} failed
+ * @param {string} [label]
+ */
+export function deleteButton(name, act, failed, label) {
+  const holder = h("span.sure");
+  const first = h("button.quiet.danger", { type: "button", onclick: () => ask_(), "aria-label": label ?? name }, label ? icon("bin") : name);
+  const ask_ = () => {
+    const yes = h("button.danger", { type: "button", onclick: () => act().catch(failed) }, say.remove);
+    holder.classList.add("asking");
+    put(holder, h("span", say.removeSure), yes, h("button.quiet", { type: "button", onclick: leave }, say.keep));
+    yes.focus();
+  };
+  const leave = () => {
+    holder.classList.remove("asking");
+    put(holder, first);
+    first.focus();
+  };
+  holder.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Escape" && holder.classList.contains("asking") && leave());
+  put(holder, first);
+  return holder;
 }

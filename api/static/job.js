@@ -2,20 +2,15 @@
 /** View of one job: progress, loss and plan while it runs, and the result in 3D afterwards. */
 import { artifactPath, ask, get, Problem } from "./api.js";
 import { LossChart } from "./chart.js";
-import { deleteButton } from "./delete_button.js";
+import { deleteButton } from "./fields.js";
 import { announce, h, put } from "./dom.js";
-import { startFrom } from "./draft.js";
-import { installed } from "./installed.js";
-import { downloadCard, factsCard, filesCard } from "./job_cards.js";
-import { JobName } from "./job_name.js";
-import { JobProgress, outcomeOf } from "./job_progress.js";
+import { startFrom } from "./stored.js";
+import { actionsOf, installed, statusTitles, UNFINISHED, WORKING } from "./tables.js";
+import { downloadCard, factsCard, filesCard, JobName, JobProgress, outcomeOf, ShareCard, VideoCard } from "./job_cards.js";
 import { JobStage } from "./job_stage.js";
 import { nameOf } from "./names.js";
 import { planOf } from "./plan.js";
-import { ShareCard } from "./share_card.js";
 import { LIVE, PREVIEW } from "./result_stage.js";
-import { actionsOf, titles, UNFINISHED, WORKING } from "./statuses.js";
-import { VideoCard } from "./video_card.js";
 import { time, words } from "./words.js";
 
 const say = words.job;
@@ -31,7 +26,7 @@ const CONTINUABLE = ["within", "on-request"];
 const reopen = () => void dispatchEvent(new HashChangeEvent("hashchange"));
 
 /** @param {string} status */
-export const badge = (status) => h(`span.badge.${status}${WORKING.has(status) ? ".working" : ""}`, titles[status] ?? status);
+export const badge = (status) => h(`span.badge.${status}${WORKING.has(status) ? ".working" : ""}`, statusTitles[status] ?? status);
 
 export class JobView {
   /** @param {string} id @param {import("./stage.js").Stage} [before] stage of the form that has created the job */
@@ -186,7 +181,7 @@ export class JobView {
   /** @param {{status: string}} told */
   async onStatus({ status }) {
     await this.refresh().catch(() => {});
-    announce(titles[status] ?? status);
+    announce(statusTitles[status] ?? status);
     if (!UNFINISHED.has(this.job.status)) {
       this.source?.close();
       this.setConnected(true);

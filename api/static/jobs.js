@@ -1,12 +1,12 @@
 // @ts-check
-/** View of all jobs: their images, names and states. */
-import { artifactPath, ask, get } from "./api.js";
+/** View of all jobs, and the one that compares runs of one scene: side by side, and two of them by the wipe. */
+import { artifactPath, ask, get, Problem } from "./api.js";
 import { announce, h, put } from "./dom.js";
-import { deleteButton } from "./delete_button.js";
+import { deleteButton } from "./fields.js";
 import { badge } from "./job.js";
-import { nameOf, stylesOf } from "./names.js";
-import { sceneOf } from "./result_stage.js";
-import { stepFraction, titles, UNFINISHED } from "./statuses.js";
+import { labels, nameOf, stylesOf } from "./names.js";
+import { ResultStage, sceneOf } from "./result_stage.js";
+import { statusTitles, stepFraction, UNFINISHED } from "./tables.js";
 import { percent, time, words } from "./words.js";
 
 const say = words.jobs;
@@ -28,7 +28,7 @@ export class JobsView {
     this.cards = new Map();
     this.name = h("input", { type: "search", "aria-label": say.filter, placeholder: say.filter, oninput: () => this.show() });
     this.status = h("select", { "aria-label": say.status, onchange: () => this.show() }, h("option", { value: "" }, say.any),
-      Object.entries(titles).map(([value, text]) => h("option", { value }, text)));
+      Object.entries(statusTitles).map(([value, text]) => h("option", { value }, text)));
     this.compare = h("button.quiet", { type: "button", disabled: true, title: say.chooseTwo, onclick: () => this.compareChosen() }, say.compare);
     this.problem = h("p.wrong.block", { hidden: true, role: "alert" });
     this.list = h("ul.grid");
@@ -134,4 +134,66 @@ export class JobsView {
     this.leaving.abort();
     clearTimeout(this.timer);
   }
+}
+
+export class CompareView {
+  /** @param {string[]} ids */
+  constructor(ids) {
+    this.ids = ids;
+    this.title = words.compare.title;
+    this.leaving = new AbortController();
+    this.heading = h("h1");
+    this.sheet = h("ul.grid.contact", { "aria-label": words.compare.sheet });
+    this.holder = h("div");
+    this.element = h("div.comparison", h("p.quiet.pending", words.page.loading));
+    this.load();
+  }
+
+  async load() {
+    try {
+      const jobs = await Promise.all(this.ids.map((id) => get(`v1/jobs/${id}`, this.leaving.signal)));
+      this.show(jobs);
+      if (jobs.some((job) => UNFINISHED.has(job.status))) this.timer = setTimeout(() => (document.hidden ? this.later() : this.load()), OFTEN);
+      else this.showStage(jobs.filter((job) => job.status === "succeeded"));
+    } catch (error) {
+      if (this.leaving.signal.aborted) return;
+      put(this.element, h("div.empty", h("h1", error instanceof Problem && error.status === 404 ? words.job.gone : words.page.error), h("p", error instanceof Error && !(error instanceof Problem && error.status === 404) ? error.message : words.compare.notThere), h("a.button.quiet", { href: "#/jobs" }, words.page.jobs)));
+    }
+  }
+
+  later() {
+    document.addEventListener("visibilitychange", () => this.load(), { once: true, signal: this.leaving.signal });
+  }
+
+  /** @param {any[]} jobs */
+  show(jobs) {
+    const names = labels(jobs);
+    this.heading.textContent = names.length === 2 ? words.compare.heading(names[0], names[1]) : words.compare.several(names.length);
+    if (this.heading.parentElement === null) put(this.element, h("header.head", this.heading), this.sheet, this.holder);
+    const focused = [...this.sheet.querySelectorAll("a")].indexOf(/** @type {any} */ (document.activeElement));
+    put(this.sheet, jobs.map((job, i) => tile(job, names[i])));
+    if (focused >= 0) this.sheet.querySelectorAll("a")[focused]?.focus();
+  }
+
+  /** @param {any[]} jobs finished runs */
+  showStage(jobs) {
+    if (!jobs.length) throw new Error(words.compare.notThere);
+    this.stage = new ResultStage(jobs, { signal: this.leaving.signal });
+    this.stage.stage.title = labels(jobs).join(" ");
+    put(this.holder, this.stage.element);
+  }
+
+  end() {
+    this.leaving.abort();
+    clearTimeout(this.timer);
+    this.stage?.end();
+  }
+}
+
+/** Return the image of a job with its label and status. @param {any} job @param {string} name */
+function tile(job, name) {
+  const painted = stepFraction(job);
+  const image = job.preview ? h("img", { src: artifactPath(job.id, job.preview), alt: words.job.sheetOf(name), decoding: "async" }) : h("span.blank", { "aria-hidden": "true" });
+  return h("li.tile", h("a", { href: `#/jobs/${job.id}` }, h("div.thumbnail", image), h("strong", { title: name }, name)),
+    h("div.row", badge(job.status), painted === undefined ? null : h("small", percent(painted))));
 }

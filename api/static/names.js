@@ -1,6 +1,6 @@
 // @ts-check
 /** Names of jobs, and labels that tell jobs apart. */
-import { sceneSuffix } from "./scene_formats.js";
+import { sceneSuffix } from "./tables.js";
 import { time, words } from "./words.js";
 
 /** @param {string} name @returns {string} name of an image without its suffix */

@@ -2,8 +2,7 @@
 /** Options of a new job: presets with their estimated times, and groups of options that can be searched. */
 import { ask, get } from "./api.js";
 import { h, newId, put } from "./dom.js";
-import { optionControl } from "./options.js";
-import { addPictures } from "./strength.js";
+import { addPictures, optionControl } from "./options.js";
 import { seconds, words } from "./words.js";
 
 /** @typedef {import("./options.js").Control} Control */

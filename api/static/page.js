@@ -1,12 +1,14 @@
 // @ts-check
-/** The page: its frame, the view for each address, and the session. */
-import { ask, get, whenKeyIsNeeded } from "./api.js";
-import { CompareView } from "./compare.js";
-import { announce, h, icon, put } from "./dom.js";
-import { forgetDraft, keptDraft } from "./draft.js";
+/**
+ * The page: its frame, the view for each address, and the session.
+ *
+ * The page never stores an API key: the service answers with a cookie that scripts cannot read.
+ */
+import { ask, get, Problem, whenKeyIsNeeded } from "./api.js";
+import { CompareView, JobsView } from "./jobs.js";
+import { announce, h, icon, newId, put } from "./dom.js";
 import { JobView } from "./job.js";
-import { JobsView } from "./jobs.js";
-import { SignInView } from "./signin.js";
+import { forgetDraft, keptDraft } from "./stored.js";
 import { SubmitView } from "./submit.js";
 import { words } from "./words.js";
 
@@ -91,3 +93,32 @@ addEventListener("hashchange", () => {
   announce(view?.title ?? "");
 });
 begin();
+
+class SignInView {
+  /** @param {() => void} done @param {string} why why a key is asked for */
+  constructor(done, why) {
+    this.title = words.signIn.title;
+    const id = newId();
+    this.input = h("input", { type: "password", id, autocomplete: "current-password", required: true, spellcheck: false, "aria-describedby": `${id}e` });
+    this.wrong = h("p.wrong", { id: `${id}e`, hidden: true, role: "alert" });
+    const form = h("form", { noValidate: true, onsubmit: (/** @type {Event} */ event) => (event.preventDefault(), this.send(done)) },
+      h("div.option", h("label", { htmlFor: id }, words.signIn.key), this.input, this.wrong), h("button.primary", { type: "submit" }, words.signIn.go));
+    this.element = h("div.empty.signin", h("h1", words.signIn.heading), h("p", why), h("p", words.signIn.where), form);
+  }
+
+  /** @param {() => void} done */
+  async send(done) {
+    this.wrong.hidden = true;
+    try {
+      await ask("POST", "v1/session", { json: { key: this.input.value.trim() } });
+      this.input.value = "";
+      done();
+    } catch (error) {
+      this.wrong.hidden = false;
+      this.wrong.textContent = error instanceof Problem && error.status === 401 ? words.signIn.wrong : error instanceof Error ? error.message : String(error);
+      this.input.focus();
+    }
+  }
+
+  end() {}
+}

@@ -1,9 +1,10 @@
 // @ts-check
-/** Paintings of a new job: the gallery, and whether several are blended or make a job each. */
+/** Paintings of a new job: a gallery of earlier and bundled ones, whether several are blended, and the example. */
+import { get } from "./api.js";
 import { h, put } from "./dom.js";
-import { Gallery } from "./gallery.js";
 import { defaultName } from "./names.js";
 import { showWrong } from "./options.js";
+import { storedInputs } from "./stored.js";
 import { choice } from "./views_part.js";
 import { words } from "./words.js";
 
@@ -82,9 +83,86 @@ export class PaintingsPart {
     return { weights: Object.fromEntries(Object.entries(this.weights).map(([name, input]) => [name, input.value])), apart: this.apart.input.checked };
   }
 
-  /** @param {import("./draft.js").Draft} draft */
+  /** @param {import("./stored.js").Draft} draft */
   restore({ weights, apart }) {
     this.weights = Object.fromEntries(Object.entries(weights).map(([name, value]) => [name, { value }]));
     this.apart.input.checked = apart;
+  }
+}
+
+/** @typedef {import("./stored.js").Chosen} Chosen */
+
+/** Number of paintings of earlier jobs. */
+const MOST_USED = 6;
+
+export class Gallery {
+  /**
+   * @param {(painting: Chosen) => void} choose
+   * @param {AbortSignal} signal
+   * @param {HTMLElement} example offer of an example scene
+   */
+  constructor(choose, signal, example) {
+    this.choose = choose;
+    this.signal = signal;
+    this.used = h("div", { hidden: true });
+    const bundled = Object.entries(words.gallery.paintings).map(([name, title]) => this.painting(address(name), title, () => painting(name)));
+    this.element = h("details.fold.gallery", { ontoggle: () => this.loadUsed() }, h("summary", words.gallery.title), example, this.used, h("p.help", words.gallery.bundled), h("div.paintings", bundled));
+  }
+
+  /** @param {string} url @param {string} title @param {() => Chosen | Promise<Chosen>} take */
+  painting(url, title, take) {
+    return h("button.painting", { type: "button", title, "aria-label": words.gallery.use(title), onclick: async () => this.choose(await take()) },
+      h("img", { src: url, alt: "", loading: "lazy", decoding: "async" }));
+  }
+
+  /** Show the paintings of the last jobs. Jobs that have expired have none. */
+  async loadUsed() {
+    if (!this.element.open || this.loaded) return;
+    this.loaded = true;
+    const { jobs } = await get("v1/jobs?limit=60", this.signal).catch(() => ({ jobs: [] })), found = new Map();
+    for (const job of jobs) {
+      if (job.status !== "expired") for (const painting of storedInputs(job).style) if (!found.has(painting.sha256)) found.set(painting.sha256, painting);
+    }
+    const shown = [...found.values()].slice(0, MOST_USED);
+    this.used.hidden = !shown.length;
+    put(this.used, h("p.help", words.gallery.used), h("div.paintings", shown.map((painting) => this.painting(painting.url, painting.name, () => painting))));
+  }
+}
+
+/** @param {string} name */
+const address = (name) => new URL(`./paintings/${name}.jpg`, import.meta.url).href;
+
+/** Return a file of the page as if it were chosen from this device. @param {string} url @param {string} name */
+export async function fetched(url, name) {
+  const answer = await fetch(url);
+  if (!answer.ok) throw new Error(words.api.status(answer.status));
+  const blob = await answer.blob();
+  return new File([blob], name, { type: blob.type, lastModified: 0 }); // the same upload every time
+}
+
+/** Return a painting of the page. @param {string} name */
+export const painting = (name) => fetched(address(name), `${name}.jpg`);
+
+/** Name of the example's scene. */
+export const EXAMPLE = "motorcycle.sog";
+
+export class ExamplePart {
+  /** @param {() => void} start called when a user wants the example */
+  constructor(start) {
+    this.buttons = [start, start].map((onclick) => h("button.quiet", { type: "button", onclick }, words.example.start));
+    /** The same offer for two places. @type {HTMLElement[]} */
+    this.offers = this.buttons.map((button) => h("div.example", button, h("small", words.example.credit)));
+  }
+
+  /** Return the files of the example by role. */
+  async files() {
+    for (const button of this.buttons) button.textContent = words.example.preparing;
+    try {
+      const parts = [EXAMPLE, "cameras.json"].map((name) => fetched(new URL(`./example/${name}`, import.meta.url).href, name));
+      const [scene, cameras, style] = await Promise.all([...parts, painting("starry_night")]);
+      return { scene: [scene], style: [style], cameras: [cameras] };
+    } finally {
+      for (const button of this.buttons) button.textContent = words.example.start;
+    }
   }
 }

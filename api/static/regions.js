@@ -2,9 +2,8 @@
 /** Regions of a scene, each with its own style or frozen. */
 import { h, icon, newId, put } from "./dom.js";
 import { paintingsOf } from "./names.js";
-import { showWrong } from "./options.js";
+import { showWrong, strengthName } from "./options.js";
 import { contentOf } from "./stored.js";
-import { strengthName } from "./strength.js";
 import { words } from "./words.js";
 
 const say = words.submit, hand = words.select;

@@ -2,7 +2,7 @@
 /** Tools to select Gaussians in the 3D view: brush, lasso, box, sphere and similar colors. */
 import { h, put } from "./dom.js";
 import { button, check, radios, range } from "./fields.js";
-import { shapeAround, ShapeTool } from "./shape_tool.js";
+import { shapeAround, ShapeTool } from "./shapes.js";
 import { Selection } from "./viewer/selection.js";
 import { words } from "./words.js";
 

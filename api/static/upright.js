@@ -1,6 +1,7 @@
 // @ts-check
-/** Buttons of the form's 3D view that turn a scene which lies on its side: they choose the job's up direction. */
+/** The up direction of a scene: buttons that turn one which lies on its side, and a question with an image for each answer. */
 import { h, icon } from "./dom.js";
+import { button } from "./fields.js";
 import { cross, dot, times } from "./viewer/vectors.js";
 import { words } from "./words.js";
 
@@ -43,4 +44,51 @@ export function uprightButtons(stage, choose) {
     },
   }, icon(name));
   return h("div.upright", button("turn", (up, ahead) => [cross(up, ahead), times(ahead, -1)]), button("tip", (up, ahead) => [ahead, up]));
+}
+
+/** @typedef {import("./stage.js").Stage} Stage */
+
+
+/**
+ * Create the question.
+ *
+ * @param {Stage} stage
+ * @param {string[]} candidates values of the option `up`, the likeliest first
+ * @param {(up: string) => void} choose receives the value that the user has chosen
+ */
+export function upQuestion(stage, candidates, choose) {
+  const others = Object.keys(UPS).filter((up) => !candidates.includes(up));
+  const shown = !!stage.viewer?.sides?.left.scene.middle;
+  const answers = candidates.map((up) => ({ up, image: h("img", { alt: "", hidden: !shown }) }));
+  const neither = button(say.neither, () => element.replaceWith(upQuestion(stage, others, choose)));
+  const element = h("section.card.up-question", { "aria-label": say.which }, h("h2", say.which), h("p.help", say.unsure),
+    h("div.answers", answers.map(({ up, image }) => h("button", { type: "button", onclick: () => choose(up) }, image, h("span", say.isUp(up))))),
+    others.length > candidates.length ? h("div.row", neither) : null);
+  addImages(stage, answers, () => element.isConnected);
+  return element;
+}
+
+/**
+ * Draw the scene upright for each answer; without a 3D view, the answers stay without images.
+ *
+ * @param {Stage} stage
+ * @param {{up: string, image: HTMLImageElement}[]} answers
+ * @param {() => boolean} asking whether the question is still shown
+ */
+async function addImages(stage, answers, asking) {
+  const { viewer } = stage;
+  if (!viewer?.sides?.left.scene.middle) return;
+  const frame = () => new Promise(requestAnimationFrame);
+  await frame(); // the question is shown by then
+  viewer.lines = new Float32Array(0);
+  for (const { up, image } of answers) {
+    viewer.frame(UPS[up]);
+    viewer.draw();
+    while (asking() && viewer.canvas.dataset.state !== "settled") await frame();
+    if (!asking()) break;
+    image.src = URL.createObjectURL(await viewer.picturePng());
+    image.onload = () => URL.revokeObjectURL(image.src);
+  }
+  stage.home();
+  stage.drawFrames();
 }

@@ -3,7 +3,7 @@
 import { readCameras, ringCameras } from "./cameras.js";
 import { h, put } from "./dom.js";
 import { contentOf } from "./stored.js";
-import { directionOf, UPS, uprightButtons } from "./upright.js";
+import { directionOf, uprightButtons, UPS } from "./upright.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./slots.js").Slot} Slot */

@@ -1,6 +1,6 @@
 // @ts-check
 /** All texts of the page that do not come from the service. */
-import { titles } from "./scene_formats.js";
+import { sceneTitles } from "./tables.js";
 
 const number = new Intl.NumberFormat("en");
 const one = new Intl.NumberFormat("en", { maximumFractionDigits: 1 });
@@ -46,7 +46,7 @@ export const words = {
     status: (/** @type {number} */ status) => `The service returned status ${status}.`,
   },
   scene: {
-    notScene: `Not a scene file. Use ${titles}.`,
+    notScene: `Not a scene file. Use ${sceneTitles}.`,
     notShown: (/** @type {string} */ title) => `${title} can't be previewed. You can still upload it; the result will be shown.`,
     notPly: "Not a PLY file.",
     notGaussians: "This PLY contains no 3D Gaussians that can be previewed.",
@@ -94,10 +94,10 @@ export const words = {
   },
   submit: {
     title: "New job", heading: "Paint a scene", lead: "Repaint a 3D Gaussian scene in the style of a painting. Nothing is uploaded until you press a button below.",
-    name: "Name", scene: "Scene", sceneHint: titles, style: "Style", styleHint: "One painting, or several to blend",
+    name: "Name", scene: "Scene", sceneHint: sceneTitles, style: "Style", styleHint: "One painting, or several to blend",
     cameras: "Cameras", camerasHint: "cameras.json, transforms.json, or the files of a COLMAP model", photos: "Photos", photosHint: "Optional: the original photos",
     choose: "Choose", change: "Change", remove: (/** @type {string} */ name) => `Remove ${name}`, removeAll: "Remove all", moreFiles: (/** @type {number} */ n) => `and ${number.format(n)} more`,
-    unused: (/** @type {string[]} */ names) => `Not used: ${names.slice(0, 5).join(", ")}${names.length > 5 ? ` and ${number.format(names.length - 5)} more` : ""}. Add one scene (${titles}), images and camera files (JSON, BIN or TXT).`,
+    unused: (/** @type {string[]} */ names) => `Not used: ${names.slice(0, 5).join(", ")}${names.length > 5 ? ` and ${number.format(names.length - 5)} more` : ""}. Add one scene (${sceneTitles}), images and camera files (JSON, BIN or TXT).`,
     drop: "Drop your scene here", dropTouch: "Tap to choose a scene", dropMore: "You can add cameras and a painting too.", dropNow: "Drop to add files",
     files: "Files", views: "Views", fromFiles: "Use my cameras", around: "Orbit the object", foreign: "Are these the scene's cameras?", anyway: "Start anyway", howMany: "Number of views", preset: "Preset", essentials: "Essentials", lookOptions: "Look", expertOptions: "Expert", expertHint: "Settings of the method. The preset's values suit most scenes.", weights: "Blend",
     nFiles: (/** @type {number} */ n) => several(n, "file"), more: "More options", find: "Find an option", regions: "Regions", addRegion: "Add a region", noOptions: "No matching option.", optionsAway: "Couldn't load the options; the preset's defaults apply.",

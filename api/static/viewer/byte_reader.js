@@ -1,5 +1,5 @@
 // @ts-check
-/** Reader that takes bytes from a stream on demand. */
+/** Reading of bytes from a stream on demand, of half-precision floats (rounded to nearest, clamped), and of ZIP archives below 4 GB. */
 import { words } from "../words.js";
 
 /** Error of a file that cannot be shown; its message is shown to the user. */
@@ -98,4 +98,70 @@ export class ByteReader {
   end() {
     this.reader.cancel().catch(() => {});
   }
+}
+
+const BASE = new Uint16Array(512), SHIFT = new Uint8Array(512), HIDDEN = new Uint32Array(512), ROUND = new Uint32Array(512);
+
+for (let key = 0; key < 512; key++) {
+  const sign = key & 256 ? 0x8000 : 0, exponent = (key & 255) - 127;
+  BASE[key] = sign;
+  SHIFT[key] = 31;
+  if (exponent > 15) BASE[key] = sign | 0x7bff;
+  else if (exponent >= -14) {
+    BASE[key] = sign | ((exponent + 15) << 10);
+    SHIFT[key] = 13;
+    ROUND[key] = 0x1000;
+  } else if (exponent >= -25) { // a subnormal half counts in units of 2^-24
+    SHIFT[key] = -exponent - 1;
+    HIDDEN[key] = 0x800000;
+    ROUND[key] = 1 << (-exponent - 2);
+  }
+}
+
+/** @param {number} bits bits of a float32 @returns {number} bits of a half */
+export function halfOf(bits) {
+  const key = bits >>> 23;
+  const half = BASE[key] + ((((bits & 0x7fffff) | HIDDEN[key]) + ROUND[key]) >>> SHIFT[key]);
+  return (half & 0x7fff) === 0x7c00 ? half - 1 : half;
+}
+
+/** @param {number} half bits of a half */
+export function fromHalf(half) {
+  const sign = half & 0x8000 ? -1 : 1, exponent = (half >> 10) & 31, fraction = half & 1023;
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024));
+}
+
+/** @typedef {Map<string, () => Promise<Uint8Array<ArrayBuffer>>>} Files functions that unpack a file, by its name */
+
+const END = 0x06054b50, END_BYTES = 22, MAX_COMMENT = 65535, ENTRY = 0x02014b50, ENTRY_BYTES = 46;
+const STORED = 0, DEFLATED = 8;
+
+/**
+ * Return the files of an archive.
+ *
+ * @param {Uint8Array<ArrayBuffer>} data
+ * @returns {Promise<Files>}
+ * @throws {CutError} if the archive ends too early
+ */
+export async function unzipped(data) {
+  const view = new DataView(data.buffer, data.byteOffset, data.length), { length } = data;
+  let end = length - END_BYTES;
+  while (end >= 0 && end >= length - END_BYTES - MAX_COMMENT && view.getUint32(end, true) !== END) end--;
+  if (end < 0 || view.getUint32(end, true) !== END) throw new CutError(words.scene.cut);
+  /** @type {Files} */
+  const files = new Map();
+  let at = view.getUint32(end + 16, true);
+  for (let left = view.getUint16(end + 10, true); left > 0 && at + ENTRY_BYTES <= end && view.getUint32(at, true) === ENTRY; left--) {
+    const method = view.getUint16(at + 10, true), bytes = view.getUint32(at + 20, true), local = view.getUint32(at + 42, true);
+    const [name, extra, comment] = [28, 30, 32].map((place) => view.getUint16(at + place, true));
+    files.set(new TextDecoder().decode(data.subarray(at + ENTRY_BYTES, at + ENTRY_BYTES + name)), async () => {
+      const begin = local + 30 + view.getUint16(local + 26, true) + view.getUint16(local + 28, true), packed = data.subarray(begin, begin + bytes);
+      if (method === STORED) return packed;
+      if (method !== DEFLATED) throw new SceneError(words.scene.unreadable);
+      return new Uint8Array(await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate-raw"))).arrayBuffer());
+    });
+    at += ENTRY_BYTES + name + extra + comment;
+  }
+  return files;
 }

@@ -5,10 +5,9 @@
  * Nodes may move, rotate and evenly scale the Gaussians. Files with distorting nodes or sparse values are not shown.
  */
 import { SceneError } from "./byte_reader.js";
-import { rotatedHarmonics } from "./harmonics.js";
-import { HARMONICS, OPACITY, ROTATION, SCALES, COLOR, unpacked } from "./packed.js";
+import { cross, dot, rotatedHarmonics, times, unit } from "./vectors.js";
+import { COLOR, HARMONICS, OPACITY, ROTATION, SCALES, unpacked } from "./packing.js";
 import { extrasRendering } from "./render_tag.js";
-import { cross, dot, times, unit } from "./vectors.js";
 import { words } from "../words.js";
 
 /** @typedef {import("./vectors.js").Vector} Vector */

@@ -4,11 +4,9 @@
  */
 import { ByteReader, SceneError } from "./byte_reader.js";
 import { glb } from "./glb.js";
-import { isKsplat, ksplat } from "./ksplat.js";
-import { compressedPly } from "./compressed_ply.js";
-import { isSplat, splat } from "./splat.js";
+import { isKsplat, isSplat, ksplat, splat } from "./splat.js";
+import { checkLength, compressedPly, plainPly, readHeader } from "./ply.js";
 import { spz, spz4 } from "./spz.js";
-import { checkLength, plainPly, readHeader } from "./ply.js";
 import { sog } from "./sog.js";
 import { words } from "../words.js";
 

@@ -6,7 +6,7 @@
  * compensated for that. Alpha is clamped between 1/255 and 0.99, and slopes are clamped at 1.3 times half the field of
  * view. The determinant is a sum of squares (Cauchy-Binet), so that thin Gaussians cause no cancellation.
  */
-import { EXPRESSIONS } from "./harmonics.js";
+import { EXPRESSIONS } from "./vectors.js";
 import { harmonicTexels, SCALE_LOW, SCALE_RANGE } from "./packing.js";
 
 /** @param {number} degree */

@@ -6,10 +6,9 @@
  * Pixel i of each image belongs to Gaussian i. Images are decoded by the browser and read back from a texture, because
  * a canvas would round the colors of transparent pixels.
  */
-import { SceneError } from "./byte_reader.js";
-import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, setRotation, unpacked } from "./packed.js";
+import { SceneError, unzipped } from "./byte_reader.js";
+import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, setRotation, unpacked } from "./packing.js";
 import { extrasRendering } from "./render_tag.js";
-import { unzipped } from "./zip.js";
 import { words } from "../words.js";
 
 /** @typedef {import("./byte_reader.js").ByteReader} ByteReader */
@@ -48,7 +47,7 @@ export async function sog(reader) {
 /**
  * Return the parts of the finest level of a streamed SOG, and its environment.
  *
- * @param {import("./zip.js").Files} files
+ * @param {import("./byte_reader.js").Files} files
  * @param {string} name path of its index
  */
 async function finestParts(files, name) {
@@ -67,7 +66,7 @@ async function finestParts(files, name) {
   return parts;
 }
 
-/** @param {import("./zip.js").Files} files @param {string} name @returns {Promise<any>} */
+/** @param {import("./byte_reader.js").Files} files @param {string} name @returns {Promise<any>} */
 async function json(files, name) {
   const load = files.get(name);
   if (!load) throw new SceneError(words.scene.unreadable);
@@ -87,7 +86,7 @@ function joined(parts) {
   }, parts[0].rendering);
 }
 
-/** @param {import("./zip.js").Files} files @returns {Promise<Part>} */
+/** @param {import("./byte_reader.js").Files} files @returns {Promise<Part>} */
 async function sogPart(files) {
   const meta = await json(files, META);
   const { version = 1, means, scales, quats, sh0, shN } = meta, table = version === 2 ? codebook : steps;
@@ -162,7 +161,7 @@ let context = null;
 /**
  * Decode a lossless WebP image.
  *
- * @param {import("./zip.js").Files} files
+ * @param {import("./byte_reader.js").Files} files
  * @param {string} name
  * @param {number} least minimum number of pixels
  * @param {number} most maximum number of pixels

@@ -1,8 +1,7 @@
 // @ts-check
 /** Reader of Niantic's SPZ (versions 1 to 4). Its layout is that of github.com/nianticlabs/spz. */
-import { SceneError } from "./byte_reader.js";
-import { fromHalf } from "./half.js";
-import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, setRotation, unpacked } from "./packed.js";
+import { fromHalf, SceneError } from "./byte_reader.js";
+import { COLOR, HARMONICS, LOGITS, OPACITY, ROTATION, SCALES, setRotation, unpacked } from "./packing.js";
 import { ANTIALIASED, CLASSIC } from "./render_tag.js";
 import { decompress } from "../vendor/fzstd/fzstd.js";
 import { words } from "../words.js";

@@ -80,7 +80,7 @@ def test_files_are_cached_by_digest(client: httpx2.Client, files: StaticFiles) -
     for name in files.files:
         path = f"/static/{files.digest}/{name}"
         plain = client.get(path, headers={"Accept-Encoding": "identity"})
-        if name not in ("installed.js", "scene_formats.js", "statuses.js", "strength.js"):  # filled in by the server
+        if name not in ("tables.js", "options.js"):  # filled in by the server
             assert plain.content == Path(FOLDER, name).read_bytes()
         assert "max-age=31536000" in plain.headers["cache-control"]
         assert "immutable" in plain.headers["cache-control"]
@@ -90,7 +90,7 @@ def test_files_are_cached_by_digest(client: httpx2.Client, files: StaticFiles) -
 
 
 def test_page_knows_the_registered_scene_formats(client: httpx2.Client, files: StaticFiles) -> None:
-    module = client.get(f"/static/{files.digest}/scene_formats.js").text
+    module = client.get(f"/static/{files.digest}/tables.js").text
     match = re.search(r"sceneFormats = .*\((\[.*\])\);", module)
     assert match
     assert [entry["suffix"] for entry in json.loads(match[1])] == [format.suffix for format in FORMATS]
@@ -102,12 +102,12 @@ def test_page_knows_the_registered_scene_formats(client: httpx2.Client, files: S
 
 
 def test_page_knows_what_is_installed(client: httpx2.Client, files: StaticFiles) -> None:
-    assert '{"video": true, "heif": true}' in client.get(f"/static/{files.digest}/installed.js").text
-    assert json.dumps(STRENGTHS) in client.get(f"/static/{files.digest}/strength.js").text
+    assert '{"video": true, "heif": true}' in client.get(f"/static/{files.digest}/tables.js").text
+    assert json.dumps(STRENGTHS) in client.get(f"/static/{files.digest}/options.js").text
 
 
 def test_page_knows_the_states_of_jobs(client: httpx2.Client, files: StaticFiles) -> None:
-    module = client.get(f"/static/{files.digest}/statuses.js").text
+    module = client.get(f"/static/{files.digest}/tables.js").text
     states = re.search(r"states = .*\((\{.*\})\);", module)
     assert states
     assert json.loads(states[1]) == {

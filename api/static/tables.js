@@ -1,5 +1,20 @@
 // @ts-check
-/** Scene formats that the service reads. The server fills in its registry. */
+/** Tables that the server fills in: statuses of jobs and their actions, formats of scenes, and installed extras. */
+
+/** @type {{ titles: Record<string, string>, unfinished: string[], working: string[], stepping: string[], actions: { name: string, title: string, statuses: string[] }[] }} */
+const states = /** @type {any} */ ("{{job_states}}");
+
+/** Text to display for each status. */
+export const statusTitles = states.titles;
+/** Return the fraction of its steps that a job has made; undefined unless it makes steps. @param {any} job */
+export const stepFraction = ({ status, progress }) => (states.stepping.includes(status) && progress?.total ? progress.fraction : undefined);
+export const UNFINISHED = new Set(states.unfinished), WORKING = new Set(states.working);
+
+/**
+ * Return the actions that a status allows: `POST /v1/jobs/{id}/{name}`, with the text of the button.
+ * @param {string} status
+ */
+export const actionsOf = (status) => states.actions.filter((action) => action.statuses.includes(status));
 
 /**
  * @typedef {object} SceneFormat
@@ -19,7 +34,7 @@ export const downloads = /** @type {any} */ ("{{downloads}}");
 export const resultFormats = sceneFormats.filter(({ result }) => result);
 
 /** Titles of all formats, without variants such as compressed PLY: "PLY, SPZ or .splat". */
-export const titles = sceneFormats.filter(({ suffix }) => suffix.lastIndexOf(".") === 0).map(({ title }) => title).join(", ").replace(/, ([^,]*)$/, " or $1");
+export const sceneTitles = sceneFormats.filter(({ suffix }) => suffix.lastIndexOf(".") === 0).map(({ title }) => title).join(", ").replace(/, ([^,]*)$/, " or $1");
 
 /** Value of the attribute `accept` of a file input: the last part of each suffix. */
 export const accepted = [...new Set(sceneFormats.map(({ suffix }) => suffix.slice(suffix.lastIndexOf("."))))].join();
@@ -29,3 +44,6 @@ export function sceneSuffix(name) {
   const fitting = sceneFormats.map(({ suffix }) => suffix).filter((suffix) => name.toLowerCase().endsWith(suffix));
   return fitting.reduce((longest, suffix) => (suffix.length > longest.length ? suffix : longest), "");
 }
+
+/** @type {{video: boolean, heif: boolean}} */
+export const installed = /** @type {any} */ ("{{installed_extras}}");
