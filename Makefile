@@ -33,7 +33,7 @@ else
 	$(PYTEST) -m "not slow"
 endif
 
-# Run the slow tests: kills, chains of requests, whole runs, the wheel.
+# Run the slow tests: kills, whole runs, the wheel.
 test-slow: $(VENV)/installed-dev
 	$(BIN)/sgsst weights fetch vgg16
 	$(PYTEST) -m slow

@@ -35,7 +35,7 @@ from typing import Any
 
 import torch
 
-from api.cli.demo_scene import build_demo
+from api.cli.scene_tools import build_demo
 from benchmarks.common import RESULTS, add_pair, describe_machine, read_views
 from benchmarks.equal_steps import UNSTYLIZED, judged
 from sgsst_core import Stylizer, load_cameras, load_image, load_scene, make_settings

@@ -59,7 +59,7 @@ python - "$WORK" <<'PYTHON'
 import sys
 from pathlib import Path
 
-from api.cli.demo_scene import build_demo
+from api.cli.scene_tools import build_demo
 
 build_demo(Path(sys.argv[1]) / "scene")
 PYTHON

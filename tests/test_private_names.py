@@ -51,8 +51,8 @@ PRINTS = (
     "Ray's driver prints the errors of its processes by another function now. Find what writes them to standard "
     "output, and replace that one in worker/ranks/cluster.py."
 )
-ANSWER = "Find how api/http/connection.py can tell whether an answer is open."
-STATE = "Find what api/http/connection.py can read instead."
+ANSWER = "Find how api/http/server.py can tell whether an answer is open."
+STATE = "Find what api/http/server.py can read instead."
 
 
 @pytest.mark.parametrize(
@@ -114,10 +114,10 @@ def test_names_of_pytorch_exist() -> None:
 def test_overridden_connection_methods_exist(method: str) -> None:
     from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-    from api.http.connection import Connection
+    from api.http.server import Connection
 
     assert method in vars(Connection)
     assert method in vars(HttpToolsProtocol), (
-        f"uvicorn's HTTP protocol has no {method} any more: api/http/connection.py overrides nothing there. Find what "
+        f"uvicorn's HTTP protocol has no {method} any more: api/http/server.py overrides nothing there. Find what "
         "it is called now; tests/api/http/hostile shows whether heads are bounded again."
     )

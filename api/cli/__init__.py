@@ -4,14 +4,3 @@ from __future__ import annotations
 
 #: Exit code after Ctrl-C, as in shells, and what is printed then.
 INTERRUPTED, ABORTED = 130, "Aborted. Output files are complete or were not written."
-
-
-def print_version() -> None:
-    """Print the version of the installed program, or "unknown"."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        installed = version("sgsst-service")
-    except PackageNotFoundError:
-        installed = "unknown"
-    print(f"sgsst {installed}")

@@ -6,13 +6,14 @@ import atexit
 import gc
 import sys
 
-from api.cli import ABORTED, INTERRUPTED, print_version
+from api import installed_version
+from api.cli import ABORTED, INTERRUPTED
 
 
 def run() -> int:
     """Run the command line, and return its exit code. Ctrl-C ends it in one line, also while its imports run."""
     if sys.argv[1:] == ["--version"]:
-        print_version()
+        print(f"sgsst {installed_version()}")
         return 0
     atexit.register(gc.freeze)  # or the end searches all that was imported for garbage, for half a second
     try:

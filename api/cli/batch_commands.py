@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from api.cli.arguments import JobInputs, folder_to_write, local_path, path_to_read
 from api.cli.client_commands import KeyOption, conclude, follow, open_client
 from api.cli.console import FAILURE, JOB_FAILED, Invocation, error_console, print_field, transfer_bar
-from api.cli.options import flags, with_options
+from api.cli.options import JobInputs, flags, folder_to_write, local_path, path_to_read, with_options
 from api.cli.stylize_commands import run_job
-from api.client.inputs import camera_files, different_names
+from api.client.uploads import camera_files, different_names
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_out_of_memory
 from sgsst_core.files.atomic import file_digest, write_json
 from sgsst_core.files.formats import SUFFIXES, scene_path

@@ -15,7 +15,6 @@ from rich.progress import BarColumn, ProgressColumn, TextColumn
 from rich.table import Table
 
 from api.cli import INTERRUPTED
-from api.cli.arguments import JobInputs, JsonOption, cameras_of, file_to_write, path_to_write
 from api.cli.console import (
     EARLY_ENDS,
     JOB_FAILED,
@@ -25,8 +24,16 @@ from api.cli.console import (
     out_console,
     transfer_bar,
 )
-from api.cli.options import with_arguments, with_options
-from api.client.inputs import different_names
+from api.cli.options import (
+    JobInputs,
+    JsonOption,
+    cameras_of,
+    file_to_write,
+    path_to_write,
+    with_arguments,
+    with_options,
+)
+from api.client.uploads import different_names
 from service.inputs import JobParameters
 from service.states import ACTIONS, STEPPING, Transition, WebhookEvent
 from sgsst_core.errors import OutputError, SettingsError
@@ -50,7 +57,7 @@ if TYPE_CHECKING:
     from stamina.instrumentation import RetryDetails
 
     from api.client import Client
-    from api.client.answers import Job
+    from api.client.transport import Job
 
 UrlOption = Annotated[
     str | None, typer.Option("--url", help="URL of the service. [default: SGSST_URL, else http://127.0.0.1:8000]")

@@ -1,16 +1,22 @@
-"""Commands for this machine: `doctor` says what works, `weights list`, `fetch` and `path` install feature networks."""
+"""Commands for this machine: `doctor`, `weights`, and its service: `serve`, `keys` and `fsck`."""
 
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from rich.table import Table
 
-from api.cli.arguments import JsonOption
-from api.cli.console import FAILURE, error_console, out_console, transfer_bar
+from api.cli.console import FAILURE, PlainConsole, error_console, out_console, transfer_bar
+from api.cli.options import JsonOption
+
+if TYPE_CHECKING:
+    from service.settings import ServiceSettings
+    from service.store import Store
 
 #: Exit code if jobs run, but slower than they could.
 WARNING = 3
@@ -84,3 +90,155 @@ def print_path() -> None:
     from sgsst_core.features.network_weights import cache_folder
 
     out_console.print(str(cache_folder()))
+
+
+#: Exit codes of `sgsst fsck` by kind of finding. The exit status is the sum over all kinds that were found.
+_FSCK_CODES = {"missing": 4, "damaged": 8, "orphaned": 16}
+
+keys_app = typer.Typer(help="API keys of the service on this machine.", no_args_is_help=True)
+
+DataOption = Annotated[
+    Path | None, typer.Option(help="Data folder of the service. [default: SGSST_DATA, else ./sgsst-data]")
+]
+
+
+def serve(
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1, this machine only]")
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port to listen on. [default: 8000]")] = None,
+    data: DataOption = None,
+) -> None:
+    """Run the service on this machine: HTTP API and dispatcher. Environment variables SGSST_... configure it."""
+    chosen = {"SGSST_HOST": host, "SGSST_PORT": port}
+    os.environ.update({name: str(value) for name, value in chosen.items() if value is not None})
+    settings = _service_settings(data)
+    from api.cli.supervisor import serve as run
+
+    run(settings, error_console.print)
+
+
+def fsck(
+    mend: Annotated[
+        bool,
+        typer.Option(
+            "--mend",
+            help="Move damaged files to the folder 'quarantine', delete rows whose files are missing, and delete files "
+            "that no row has referred to for an hour (six hours in an object store).",
+        ),
+    ] = False,
+    data: DataOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check all files of the service against its database; the service may be running.
+
+    Exit code: 0 if nothing was found, else the sum of 4 (missing files), 8 (damaged) and 16 (orphaned).
+    """
+    from sqlalchemy.engine import make_url
+
+    from service.scheduling.housekeeping import FileCheck
+    from sgsst_core.errors import SettingsError
+
+    url = make_url(_service_settings(data).database_url)
+    if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():  # which opening would create
+        raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
+    store = _open_store(data)
+    check, findings = FileCheck(_service_settings(data), store), []
+    for finding in check.findings(mend=mend):
+        findings.append(finding)
+        if not as_json:
+            needed = f"  needed by {', '.join(finding.holders)}" if finding.holders else ""
+            done = f"  {finding.mended}" if finding.mended else ""
+            out_console.print(f"{finding.kind:<8}  {finding.what:<10}  {finding.name}{needed}{done}")
+    if as_json:
+        out_console.print(json.dumps([asdict(finding) for finding in findings]))
+    kinds: list[str] = [finding.kind for finding in findings]
+    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in _FSCK_CODES)
+    error_console.print(f"Checked {check.checked} files of the database: {counts}")
+    code = sum(_FSCK_CODES[kind] for kind in set(kinds))
+    store.close()
+    raise typer.Exit(code)
+
+
+@keys_app.command("create")
+def create_key(
+    name: Annotated[str, typer.Argument(help="Name of its owner, for display.", show_default=False)],
+    priority: Annotated[int, typer.Option(help="Priority; jobs with higher values run first.")] = 0,
+    jobs_a_day: Annotated[
+        int | None, typer.Option(min=0, help="Quota of jobs per day. [default: the service's]")
+    ] = None,
+    gpu_seconds_a_day: Annotated[
+        float | None, typer.Option(min=0, help="Quota of GPU seconds per day. [default: the service's]")
+    ] = None,
+    stored_bytes: Annotated[
+        int | None, typer.Option(min=0, help="Quota of stored bytes. [default: the service's]")
+    ] = None,
+    requests_a_second: Annotated[
+        float | None, typer.Option(min=0.001, help="Quota of requests per second. [default: the service's]")
+    ] = None,
+    data: DataOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Create an API key and print it. Only a digest is stored, so the key cannot be shown again."""
+    from service.store.keys import Quotas
+
+    quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
+    row, text = _open_store(data).keys.create(name, priority, quotas)
+    if as_json:
+        out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
+        return
+    error_console.print(f"Key {row.id} of {row.name!r}. Save it now; it cannot be shown again:")
+    out_console.print(text)
+
+
+@keys_app.command("list")
+def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
+    """List API keys, without the keys themselves."""
+    rows = _open_store(data).keys.all()
+    if as_json:
+        shown = [
+            {"id": row.id, "name": row.name, "priority": row.priority, "revoked": bool(row.revoked_at)} for row in rows
+        ]
+        out_console.print(json.dumps(shown))
+        return
+    table = Table("id", "name", "priority", "state")
+    for row in rows:
+        table.add_row(row.id, row.name, str(row.priority), "revoked" if row.revoked_at else "valid")
+    PlainConsole().print(table)
+
+
+@keys_app.command("revoke")
+def revoke_key(
+    key_id: Annotated[
+        str, typer.Argument(metavar="ID", help="ID of the key, as listed by `sgsst keys list`.", show_default=False)
+    ],
+    data: DataOption = None,
+) -> None:
+    """Revoke an API key."""
+    row = _open_store(data).keys.revoke(key_id)
+    error_console.print(f"Revoked key {row.id} of {row.name!r}.")
+
+
+def _service_settings(data: Path | None) -> ServiceSettings:
+    """Return the settings from the environment, to which a data folder is added for other processes."""
+    from sgsst_core.errors import SettingsError
+
+    if os.name != "posix":
+        raise SettingsError(
+            "The service does not run on Windows itself. Run this command in WSL2 (`wsl --install`), or run the "
+            "container image; `sgsst submit` and the page reach both from here."
+        )
+    from service.settings import read_settings
+
+    if data is not None:
+        os.environ["SGSST_DATA"] = str(data.absolute())
+    return read_settings()
+
+
+def _open_store(data: Path | None) -> Store:
+    from service.settings import keep_private
+    from service.store import open_store
+
+    settings = _service_settings(data)
+    keep_private(settings)
+    return open_store(settings)

@@ -15,7 +15,8 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli import ABORTED, INTERRUPTED, print_version
+from api import installed_version
+from api.cli import ABORTED, INTERRUPTED
 from api.cli.console import (
     BAD_INPUT,
     CONFLICT,
@@ -47,11 +48,16 @@ _SUMMARIES: dict[str, dict[str, str]] = {
         "convert": "Convert a scene to another format, which the name of OUT determines.",
         "blend": "Blend scenes that differ only in color: a scene and its results, or several results.",
         "view": "Write a scene as one HTML file, which shows it in 3D in a browser, without a server.",
+        "paint": "Paint one view or several, and the scene follows.",
+        "bench": "Benchmarks for your own scene and machine.",
+        "study": "Blind comparisons of results by eye.",
     },
-    "paint_command": {"paint": "Paint one view or several, and the scene follows."},
     "machine_commands": {
         "doctor": "Examine this machine: GPU, driver, precision, memory, weights, caches, and correct results.",
         "weights": "Weights of the feature network.",
+        "serve": "Run the service on this machine: HTTP API and dispatcher.",
+        "fsck": "Check all files of the service against its database; the service may be running.",
+        "keys": "API keys of the service on this machine.",
     },
     "client_commands": {
         "submit": "Submit a job to a service, with the options of stylize.",
@@ -64,13 +70,6 @@ _SUMMARIES: dict[str, dict[str, str]] = {
         "jobs": "List jobs, newest first.",
         "mcp": "Serve the tools of a language model on standard input and output, by the Model Context Protocol.",
     },
-    "operator_commands": {
-        "serve": "Run the service on this machine: HTTP API and dispatcher.",
-        "fsck": "Check all files of the service against its database; the service may be running.",
-        "keys": "API keys of the service on this machine.",
-    },
-    "bench_commands": {"bench": "Benchmarks for your own scene and machine."},
-    "study_commands": {"study": "Blind comparisons of results by eye."},
 }
 #: Module of each command.
 _MODULES = {name: module for module, names in _SUMMARIES.items() for name in names}
@@ -154,7 +153,7 @@ app = typer.Typer(
 def program(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     """Style transfer for 3D Gaussian Splatting scenes (SGSST)."""
     if version:
-        print_version()
+        print(f"sgsst {installed_version()}")
         raise typer.Exit()
 
 

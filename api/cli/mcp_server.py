@@ -9,7 +9,6 @@ import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,9 +19,10 @@ from mcp.server.mcpserver.exceptions import ToolError
 from mcp_types import CallToolResult, TextContent, ToolAnnotations
 from pydantic import BaseModel, Field
 
+from api import installed_version
 from api.client import AsyncClient
-from api.client.answers import Job
-from api.client.inputs import IMAGE_SUFFIXES, JobFiles, input_files
+from api.client.transport import Job
+from api.client.uploads import IMAGE_SUFFIXES, JobFiles, input_files
 from service.inputs import JobParameters
 from sgsst_core.errors import SgsstError
 from sgsst_core.files import formats
@@ -274,7 +274,7 @@ def _messages() -> Iterator[None]:
 def make_server(client: AsyncClient, root: Path) -> MCPServer[None]:
     """Return the server with its tools, which read and write files below `root`."""
     server: MCPServer[None] = MCPServer(
-        "sgsst", instructions=_INSTRUCTIONS, version=version("sgsst-service"), log_level="WARNING"
+        "sgsst", instructions=_INSTRUCTIONS, version=installed_version(), log_level="WARNING"
     )
     tools = Tools(client, root)
     server.add_tool(tools.estimate, annotations=_READS)

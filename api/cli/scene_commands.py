@@ -1,30 +1,37 @@
-"""Commands that read a scene without stylizing it: `plan`, `check`, `render`, `convert` and `blend`."""
+"""Commands that read scenes: `plan`, `check`, `render`, `convert`, `blend`, `view`, `paint`, `bench` and `study`.
+
+Results are compared by benchmarks on one's own scene and machine (`bench`), and blindly by eye (`study`).
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
-from api.cli.arguments import (
+from api.cli.console import error_console, out_console, print_field, spinner
+from api.cli.options import (
     CamerasOption,
     JobInputs,
     OptionalStyleOption,
     SceneArgument,
+    StyleOption,
     file_to_write,
     folder_to_write,
     path_to_read,
     path_to_write,
     source_of,
+    with_arguments,
+    with_options,
 )
-from api.cli.console import error_console, out_console, print_field, spinner
-from api.cli.options import with_arguments, with_options
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
 from sgsst_core.progress import clock, duration
@@ -32,6 +39,8 @@ from sgsst_core.stylizing.progress_bar import job_bar, live_bar
 from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
+    from api.cli.scene_tools import VariantsRequest
+    from sgsst_core.bench.variants import Curve
     from sgsst_core.files.scene_file import SceneFile
     from worker.derived import VideoRequest
 
@@ -293,3 +302,197 @@ def blend(
     for path, weight in blended:
         print_field("weight", f"{weight:.4g} of {path}")
     print_field("scene", out)
+
+
+@with_options(ViewOptions)
+@with_options(StylizeOptions, "chosen", only=("background",))
+def paint(
+    scene: SceneArgument,
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Painted PLY to write; with --export, the PNG to paint on.",
+            callback=file_to_write,
+            show_default=False,
+            rich_help_panel=ESSENTIALS,
+        ),
+    ],
+    view: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE",
+            help="Painted picture of a view, of the same size as the view; may be repeated. Transparent pixels are "
+            "left alone.",
+            rich_help_panel=ESSENTIALS,
+        ),
+    ] = None,
+    export: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Write the picture of a view to paint on.", rich_help_panel=ESSENTIALS),
+    ] = None,
+    cameras: CamerasOption = None,
+    *,
+    options: ViewOptions,
+    chosen: StylizeOptions,
+) -> None:
+    """Paint one view or several, and the scene follows."""
+    from worker.painting import PaintRequest, export_view, paint_scene, write_painted
+
+    if bool(view) == (export is not None):
+        raise SettingsError("Give --export NAME to write a picture, or --view NAME=FILE with a painted one.")
+    source, background = source_of(scene, cameras, options), chosen.settings().background
+    if export is not None:
+        camera = export_view(source, export, background, out)
+        print_field("picture", f"{out}, {camera.width}x{camera.height}: paint on it, then use --view {export}={out}")
+        return
+    request = PaintRequest(source, _paintings(view or []), background)
+    with live_bar(error_console) as bar:
+        task = bar.add_task("painting", total=None)
+        file, painted = paint_scene(request, lambda done, total: bar.update(task, completed=done, total=total))
+    report = write_painted(out, file, painted)
+    print_field("painted pixels", f"{painted.psnr_before:.1f} dB before, {painted.psnr_after:.1f} dB after")
+    print_field("Gaussians", f"{painted.determined:,} of {len(file.scene):,} are determined; the others follow them")
+    print_field("scene", out)
+    out_console.print(f"report: {report}")
+
+
+def _paintings(views: list[str]) -> dict[str, Path]:
+    paintings: dict[str, Path] = {}
+    for text in views:
+        name, equals, path = text.partition("=")
+        if not (name and equals and path):
+            raise SettingsError(f"--view {text}: must be NAME=FILE, such as --view front=front.png.")
+        if name in paintings:
+            raise SettingsError(f"--view {name} is given twice. Merge the two pictures into one.")
+        paintings[name] = Path(path)
+    return paintings
+
+
+#: Options of a job that apply to all variants.
+_OF_VARIANTS = ("coarsest_side", "background", "backbone", "memory_limit", "seed")
+#: Width in characters of tables that a narrower terminal would truncate.
+_TABLE_WIDTH = 180
+
+bench_app = typer.Typer(help="Benchmarks for your own scene and machine.", no_args_is_help=True)
+
+
+@dataclass(frozen=True)
+class VariantsInputs:
+    """Arguments of a command that compares variants; see `with_arguments`."""
+
+    scene: SceneArgument
+    style: StyleOption
+    cameras: CamerasOption = None
+    seconds: Annotated[float, typer.Option(min=1, max=1e6, help="Seconds of optimization per variant.")] = 300.0
+
+    def request(self, options: ViewOptions, chosen: StylizeOptions, variants: str, out: Path) -> VariantsRequest:
+        """Return the request for these variants, which are separated by commas."""
+        from api.cli.scene_tools import VariantsRequest
+
+        source = source_of(self.scene, self.cameras, options)
+        settings = {**chosen.given_settings(), "near": options.near}
+        names = [name.strip() for name in variants.split(",") if name.strip()]
+        return VariantsRequest(source, self.style, out, names, self.seconds, chosen.backbone, settings)
+
+
+@bench_app.command("error-time")
+@with_options(ViewOptions)
+@with_options(StylizeOptions, "chosen", only=_OF_VARIANTS)
+@with_arguments(VariantsInputs)
+def error_time(
+    inputs: VariantsInputs,
+    out: Annotated[
+        Path, typer.Option(help="Folder for table, plot, JSON and scenes.", callback=folder_to_write)
+    ] = Path("error_time"),
+    variants: Annotated[str, typer.Option(help="Names of variants, separated by commas. [default: all]")] = "",
+    *,
+    options: ViewOptions,
+    chosen: StylizeOptions,
+) -> None:
+    """Run variants of a job for the same time each, and plot the remaining error against time."""
+    from api.cli.scene_tools import error_time_table, point_line, run_error_time
+
+    request = inputs.request(options, chosen, variants, out)
+    curves = run_error_time(request, lambda curve: error_console.print(point_line(curve)))
+    Console(width=_TABLE_WIDTH).print(error_time_table(curves))
+    _print_skipped_variants(curves, out)
+
+
+@bench_app.command()
+@with_options(ViewOptions)
+@with_options(StylizeOptions, "chosen", only=_OF_VARIANTS)
+@with_arguments(VariantsInputs)
+def quality(
+    inputs: VariantsInputs,
+    out: Annotated[
+        Path, typer.Option(help="Folder for JSON, plots, images and scenes.", callback=folder_to_write)
+    ] = Path("quality"),
+    variants: Annotated[
+        str, typer.Option(help="Names of variants, separated by commas.")
+    ] = "standard,one-scale,cold-start",
+    *,
+    options: ViewOptions,
+    chosen: StylizeOptions,
+) -> None:
+    """Run variants of a job for the same time each, and judge results with a network that none of them optimizes."""
+    from api.cli.scene_tools import point_line, quality_table, run_quality
+
+    request = inputs.request(options, chosen, variants, out)
+    quality = run_quality(request, lambda curve: error_console.print(point_line(curve)))
+    Console(width=_TABLE_WIDTH).print(quality_table(quality))
+    _print_skipped_variants(quality.curves, out)
+
+
+def _print_skipped_variants(curves: Sequence[Curve], out: Path) -> None:
+    """Print which variants were skipped, and where the results are."""
+    for curve in curves:
+        if curve.left_out:
+            out_console.print(f"{curve.variant.name} was skipped: {curve.left_out}")
+    print_field("results", out)
+
+
+#: Number of views of a study, unless --views sets it.
+_VIEWS = 12
+
+study_app = typer.Typer(help="Blind comparisons of results by eye.", no_args_is_help=True)
+
+
+@study_app.command("make")
+@with_options(ViewOptions)
+@with_options(StylizeOptions, "chosen", only=("background",))
+def make(
+    variants: Annotated[
+        list[str], typer.Argument(metavar="[NAME=]SCENE...", help="Two to four scenes to compare.", show_default=False)
+    ],
+    style: StyleOption,
+    out: Annotated[Path, typer.Option(help="HTML page to write.", callback=file_to_write)] = Path("study.html"),
+    cameras: CamerasOption = None,
+    *,
+    options: ViewOptions,
+    chosen: StylizeOptions,
+) -> None:
+    """Write a page on which people choose the best of two to four results, without seeing which is which.
+
+    The page is one file, works offline and saves the votes as JSON. Keep the key, which is written beside it.
+    """
+    from api.cli.scene_tools import key_path, make_study, named
+
+    source = source_of(named(variants[0])[1], cameras, options)
+    if options.views is None and options.orbit is None:
+        source = source.model_copy(update={"views": _VIEWS})
+    with spinner("Rendering the views"):
+        make_study(variants, source, style, chosen.settings().background, out)
+    print_field("page", out)
+    print_field("key", key_path(out))
+
+
+@study_app.command("count")
+def count(
+    key: Annotated[Path, typer.Argument(help="Key of the study.", show_default=False)],
+    votes: Annotated[list[Path], typer.Argument(help="Files of votes.", show_default=False)],
+) -> None:
+    """Print each variant's share of the votes, with 95 % Wilson intervals."""
+    from api.cli.scene_tools import share_table
+    from sgsst_core.quality.study import count_votes
+
+    out_console.print(share_table(count_votes(key, votes)))

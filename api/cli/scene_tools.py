@@ -1,4 +1,4 @@
-"""Implementation of the commands `plan`, `check`, `render` and `blend`.
+"""Implementation of the commands `demo`, `plan`, `check`, `render`, `blend`, `bench` and `study`, which need PyTorch.
 
 The functions check all inputs, compute, and write the outputs, but print nothing. `stylize` is implemented by
 `worker.run`, and `convert` by `worker.derived`.
@@ -8,29 +8,85 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from api.cli.arguments import local_path
+import torch
+from rich.table import Column, Table
+from torch import Tensor
+
+from api.cli.options import local_path
+from api.static_files import FOLDER
+from sgsst_core.bench.variants import (
+    Curve,
+    Quality,
+    Variant,
+    as_dict,
+    choose_variants,
+    compare_quality,
+    error_time,
+    write_plot,
+    write_sheet,
+)
+from sgsst_core.bench.variants import write_plot as write_quality_plot
 from sgsst_core.devices import seconds_left
 from sgsst_core.errors import OutputError, SettingsError
-from sgsst_core.files.atomic import ensure_writable_folder, write_json
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
+from sgsst_core.files.atomic import atomic_path, ensure_writable_folder, write_json
 from sgsst_core.files.blending import normalized
 from sgsst_core.files.images import load_image, save_png
+from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
+from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.progress import Decision, warnings_of
 from sgsst_core.quality.findings import Finding, findings_of, render_mode_findings
+from sgsst_core.quality.study import VoteShare, check_names, write_study
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.document import plan_json
+from sgsst_core.report.document import machine, plan_json
 from sgsst_core.report.images import write_views
-from sgsst_core.scene.camera import Camera
-from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
+from sgsst_core.scene.camera import Camera, resized
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from worker.derived import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import ViewOptions, split_weight
 from worker.outputs import check_is_not_input
 from worker.prepare import dry_run
+
+T = TypeVar("T")
+
+# --- demo ----------------------------------------------------------------------------------------------------------
+
+
+class DemoScene(NamedTuple):
+    """Files of the demo: a 3DGS PLY of SH degree 0, its views as an INRIA cameras.json, and a style image."""
+
+    ply: Path
+    cameras: Path
+    style: Path
+
+
+def build_demo(folder: Path) -> DemoScene:
+    """Write the demo's scene, cameras and style image into a folder, and create the folder.
+
+    The scene is the example of the page. It was lifted from the stereo pair Motorcycle of the Middlebury 2014 benchmark
+    (Scharstein et al., "High-resolution stereo datasets with subpixel-accurate ground truth", GCPR 2014): every pixel
+    of the photos became a flat Gaussian. World: meters, the left camera's axes (x right, y down, z forward).
+
+    Raises:
+        OutputError: If the folder cannot be written.
+    """
+    ensure_writable_folder(folder)
+    demo = DemoScene(folder / "motorcycle.ply", folder / "cameras.json", folder / "starry_night.jpg")
+    example = FOLDER / "example"
+    write_scene(demo.ply, read_scene(example / "motorcycle.sog").scene)
+    for source, target in ((example / "cameras.json", demo.cameras), (STARRY_NIGHT, demo.style)):
+        with atomic_path(target) as temporary:
+            temporary.write_bytes(source.read_bytes())
+    return demo
+
 
 # --- plan ----------------------------------------------------------------------------------------------------------
 
@@ -133,8 +189,7 @@ def render_views(
     ensure_writable_folder(out)
     paths = [out / name for name in view_file_names(cameras)]
     for index, (camera, path) in enumerate(zip(cameras, paths, strict=True)):
-        colors = view_colors(scene.sh_dc, rest_colors(scene.sh_rest, scene.means, camera))
-        save_png(path, rasterizer.render(colors, camera))
+        save_png(path, rasterizer.render(scene_colors(scene, camera), camera))
         progress(index + 1, len(cameras))
     return paths
 
@@ -179,3 +234,247 @@ def blend_files(
     parts = [(SceneRequest.of(path, None, options), weight) for path, weight in zip(paths, weights, strict=True)]
     warnings = blend(parts, out)
     return list(zip(paths, fractions, strict=True)), warnings
+
+
+# --- bench -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class VariantsRequest:
+    """Request of `sgsst bench error-time` or `sgsst bench quality`.
+
+    Attributes:
+        out: Folder for table, plot, JSON and scenes.
+        variants: Names of variants; empty for all.
+        seconds: Seconds of optimization per variant.
+        backbone: "auto", "vgg19" or "vgg16".
+        settings: Settings of all variants, on top of the standard preset.
+    """
+
+    source: SceneRequest
+    style: Path
+    out: Path
+    variants: Sequence[str]
+    seconds: float
+    backbone: str
+    settings: dict[str, Any]
+
+    @property
+    def title(self) -> str:
+        """Scene and style, for titles of plots."""
+        return f"{self.source.scene.parent.name or self.source.scene.stem}, {self.style.stem}"
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """Contents of the files that a request names."""
+
+    file: SceneFile
+    cameras: list[Camera]
+    style: Tensor
+    weights: BackboneWeights
+    variants: list[Variant]
+
+    @staticmethod
+    def of(request: VariantsRequest) -> _Inputs:
+        """Check and read the files of a request; the quick checks come first."""
+        check_choice(request.source)
+        variants = choose_variants(request.variants)
+        weights = load_network_weights(request.backbone)
+        style = load_image(request.style)
+        file, capture = read_scene_and_capture(request.source)
+        ensure_writable_folder(request.out)
+        return _Inputs(file, capture.cameras, style, weights, variants)
+
+    def run(self, measure: Callable[..., T], request: VariantsRequest, progress: Any) -> T:
+        """Call `measure` with the arguments of `error_time`, and return its result."""
+        arguments = (self.file.scene, self.cameras, self.style, self.variants, request.seconds)
+        return measure(*arguments, weights=self.weights, progress=progress, **request.settings)
+
+    def as_dict(self, request: VariantsRequest) -> dict[str, Any]:
+        """Return the request as a JSON object."""
+        return {
+            "version": 1,
+            "scene": request.source.scene.parent.name + "/" + request.source.scene.name,
+            "style": request.style.name,
+            "views": len(self.cameras),
+            "sizes": [list(size) for size in sorted({(camera.width, camera.height) for camera in self.cameras})],
+            "budget_seconds": request.seconds,
+            "settings": request.settings,
+            "backbone": self.weights.name,
+            "machine": machine(torch.device("cuda" if torch.cuda.is_available() else "cpu")),
+        }
+
+
+def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
+    """Run the variants, and write `error_time.json`, `error_time.png` and each variant's scene into the folder.
+
+    The JSON file is written after each evaluation, so that an interrupted run leaves what it has measured.
+
+    Args:
+        progress: Callback that receives a curve after each of its evaluations.
+
+    Raises:
+        InvalidInputError: If an input cannot be used; the first one is reported.
+    """
+    inputs = _Inputs.of(request)
+    described = inputs.as_dict(request)
+    measured: dict[str, Curve] = {}
+
+    def write(curves: Sequence[Curve]) -> None:
+        write_json(request.out / "error_time.json", {**described, **as_dict(curves)})
+
+    def evaluated(curve: Curve) -> None:
+        measured[curve.variant.name] = curve
+        write(list(measured.values()))
+        progress(curve)
+
+    curves = inputs.run(error_time, request, evaluated)
+    write(curves)
+    write_plot(request.out / "error_time.png", curves, request.title)
+    for curve in curves:
+        if curve.sh_dc is not None:
+            write_stylized(inputs.file, request.out / f"{curve.variant.name}.ply", curve.sh_dc)
+    return curves
+
+
+def run_quality(request: VariantsRequest, progress: Any) -> Quality:
+    """Run the variants, measure their quality, and write `quality.json`, plots, `quality.jpg` and scenes.
+
+    Arguments and errors are those of `run_error_time`.
+    """
+    inputs = _Inputs.of(request)
+    quality = inputs.run(compare_quality, request, progress)
+    write_json(request.out / "quality.json", {**inputs.as_dict(request), **quality.as_dict()})
+    write_quality_plot(request.out / "quality.png", quality, request.title)
+    write_plot(request.out / "error_time.png", quality.curves, request.title)
+    write_sheet(request.out / "quality.jpg", quality)
+    for outcome in quality.outcomes[1:]:
+        write_stylized(inputs.file, request.out / f"{outcome.name}.ply", outcome.sh_dc)
+    return quality
+
+
+def quality_table(quality: Quality) -> Table:
+    """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
+    figures = ("style", "interior_style", "sliced_features", "color_distance", "content", "features")
+    columns = (*figures, "background_sensitivity", "saturated", "short RMSE", "long RMSE", "remaining loss", "steps")
+    table = Table(
+        Column("", no_wrap=True),
+        *columns,
+        title="distances after the same time, lower is better; * = on the Pareto front of style and content",
+    )
+    front = quality.front()
+    for outcome in quality.outcomes:
+        one = outcome.judgment
+        table.add_row(
+            outcome.name + (" *" if outcome in front else ""),
+            *(_number(value) for value in (one.style, one.interior_style, one.sliced_features)),
+            f"{one.color_distance:.0f}",
+            *(_number(value) for value in (one.content, one.features, one.background_sensitivity)),
+            f"{one.saturated:.1%}",
+            *(_number(drift.rmse if drift else None) for drift in (outcome.short, outcome.long)),
+            _number(outcome.loss),
+            str(outcome.steps or "-"),
+        )
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def error_time_table(curves: Sequence[Curve]) -> Table:
+    """Return a table of each variant's remaining loss over time, and of its final loss by scale and judgment."""
+    shown = [curve for curve in curves if curve.points]
+    scales = sorted({scale for curve in shown for scale in curve.points[-1].by_scale})
+    moments = [f"{point.seconds:.0f} s" for point in shown[0].points] if shown else []
+    table = Table(
+        Column("variant", no_wrap=True),
+        *moments,
+        *(f"scale {scale}" for scale in scales),
+        "style",
+        "color_distance",
+        "steps",
+        title="remaining loss, relative to the start, and judgment of the end",
+    )
+    for curve in curves:
+        if not curve.points:
+            continue
+        losses = [_number(point.relative) for point in curve.points]
+        end = curve.points[-1]
+        ends = [end.by_scale[scale] for scale in scales]
+        judged = [end.judgment.style, end.judgment.color_distance] if end.judgment else [None, None]
+        table.add_row(curve.variant.name, *losses, *(_number(value) for value in (*ends, *judged)), str(end.step))
+    return table
+
+
+def point_line(curve: Curve) -> str:
+    """Return the last evaluation of a curve as a line for a log."""
+    name, point = curve.variant.name, curve.points[-1]
+    remains = "the initial loss was 0," if point.relative is None else f"{point.relative:.2%} of the loss remains"
+    return f"{name}: {remains} after {point.seconds:.1f} s, {point.step} steps"
+
+
+# --- study -----------------------------------------------------------------------------------------------------------
+
+#: Longer side in pixels of the views on the page, unless the request has another.
+STUDY_SIDE = 960
+
+
+def key_path(page: Path) -> Path:
+    """Return the path of the key of a study, given its page."""
+    return page.with_suffix(".key.json")
+
+
+def make_study(
+    variants: Sequence[str], source: SceneRequest, style: Path, background: tuple[float, float, float], page: Path
+) -> None:
+    """Render all variants at the same views, and write the page of a study and its key.
+
+    Args:
+        variants: Scenes to compare, each as FILE or NAME=FILE.
+        source: Cameras and view options; its scene is replaced by each variant. An orbit is placed around the first.
+        page: HTML file to write; the key goes beside it.
+
+    Raises:
+        InvalidInputError: If an input cannot be used; the first one is reported.
+    """
+    scenes = [named(text) for text in variants]
+    check_names([name for name, _ in scenes])
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise OutputError(f"{page}: not the name of an HTML file. Give one, such as study.html.")
+    sources = [source.model_copy(update={"scene": path}) for _, path in scenes]
+    for each in sources:
+        check_choice(each)
+    image = load_image(style)
+    side = source.resolution or STUDY_SIDE
+    cameras = [resized(camera, min(side, camera.side)) for camera in read_scene_and_capture(sources[0])[1].cameras]
+
+    def render(index: int) -> list[Tensor]:
+        return _render(sources[index], cameras, background)
+
+    page.parent.mkdir(parents=True, exist_ok=True)
+    write_study(page, key_path(page), [name for name, _ in scenes], image, len(cameras), render)
+
+
+def named(text: str) -> tuple[str, Path]:
+    """Return the name and the path of a variant, given as NAME=FILE, or as FILE, which is its own name."""
+    name, equals, path = text.partition("=")
+    return (name, local_path(path)) if equals and not Path(text).exists() else (text, local_path(text))
+
+
+def _render(source: SceneRequest, cameras: Sequence[Camera], background: tuple[float, float, float]) -> list[Tensor]:
+    """Return the image [H, W, 3] of a scene at each camera."""
+    scene = read_scene_and_capture(source)[0].scene
+    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near, memory=0)
+    check_something_seen(scene, cameras, rasterizer)
+    return [rasterizer.render(scene_colors(scene, camera), camera) for camera in cameras]
+
+
+def share_table(shares: Sequence[VoteShare]) -> Table:
+    """Return a table with each variant's fraction of the votes and its 95 % interval."""
+    table = Table("variant", "votes", "share", "95 % interval", title=f"{shares[0].total} votes")
+    for share in shares:
+        interval = f"{share.low:.1%} to {share.high:.1%}"
+        table.add_row(share.variant, str(share.votes), f"{share.votes / share.total:.1%}", interval)
+    return table

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from api.cli.arguments import JobInputs, file_to_write, folder_to_write
 from api.cli.console import (
     EARLY_ENDS,
     FAILURE,
@@ -27,7 +26,7 @@ from api.cli.console import (
     spinner,
 )
 from api.cli.machine_commands import fetch
-from api.cli.options import with_arguments, with_options
+from api.cli.options import JobInputs, file_to_write, folder_to_write, with_arguments, with_options
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.progress import clock
@@ -81,7 +80,7 @@ def demo(
     ),
 ) -> None:
     """Stylize a built-in scene, lifted from a stereo photograph, in a few minutes."""
-    from api.cli.demo_scene import build_demo
+    from api.cli.scene_tools import build_demo
     from sgsst_core.features.network_weights import load_network_weights
 
     try:

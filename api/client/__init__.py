@@ -1,7 +1,6 @@
 """Clients of the REST API: `Client` and `AsyncClient` have the same methods."""
 
-from api.client.answers import Event, Job
-from api.client.async_client import AsyncClient
-from api.client.client import Client
+from api.client.client import AsyncClient, Client
+from api.client.transport import Event, Job
 
 __all__ = ["AsyncClient", "Client", "Event", "Job"]

@@ -1,4 +1,4 @@
-"""Client of the service for programs without an event loop: the methods of `AsyncClient`, run by a portal's thread.
+"""Clients of the service: `AsyncClient`, and `Client` with the same methods for programs without an event loop.
 
 with Client("http://127.0.0.1:8000") as client:
     job = client.submit("scene.ply", "style.jpg", cameras="cameras.json", preset="preview")
@@ -10,17 +10,343 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
+import re
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
+from urllib.parse import quote
 
+import anyio
+import httpx2
 from anyio.from_thread import start_blocking_portal
 
-from api.client.async_client import AsyncClient
+from api.client import uploads
+from api.client.transport import TRIES, Download, Event, Job, Progress, RequestError, Transport, checked, in_thread
+from api.client.uploads import JobFiles
+from service.states import Transition
+from sgsst_core.errors import OutputError
+from sgsst_core.files.atomic import ensure_writable_folder
+from sgsst_core.files.formats import download_of_name
+from sgsst_core.files.formats.ply import PLY
+from worker.options import path_or_url
 
 P = ParamSpec("P")
 T = TypeVar("T")
 _END = object()
+#: Jobs per page of a list.
+_PAGE = 200
+#: Seconds of silence after which a stream is considered dead; the service sends something every 15 s.
+_SILENCE_SECONDS = 60.0
+#: Seconds to wait before reconnecting to a stream. The wait doubles with each further connection without an event.
+FIRST_WAIT = 1.0
+
+
+#: IDs that do not change the path of a request.
+_ID = re.compile(r"\w+", re.ASCII)
+
+
+def no_progress(done: int, total: int) -> None:
+    """Ignore progress."""
+
+
+class AsyncClient:
+    """Client of the service over HTTP.
+
+    Args:
+        url: Address of the service. None uses the environment variable SGSST_URL, or port 8000 of this machine if the
+            variable is not set.
+        key: API key; None uses the environment variable SGSST_KEY.
+
+    Raises:
+        RequestError: If address, key, or a proxy or certificate file that the environment names cannot be used.
+
+    Attributes:
+        url: Address of the service.
+    """
+
+    def __init__(self, url: str | None = None, key: str | None = None) -> None:
+        self._transport = Transport(url, key)
+        self.url = self._transport.url
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *ignored: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._transport.http.aclose()
+
+    async def submit(
+        self,
+        /,
+        scene: str | Path,
+        style: str | Path | Sequence[str | Path],
+        *,
+        cameras: str | Path | None = None,
+        photos: str | Path | None = None,
+        masks: Mapping[str, str | Path] | None = None,
+        webhook: str | None = None,
+        webhook_events: Sequence[str] = (),
+        progress: Progress = no_progress,
+        **parameters: Any,
+    ) -> Job:
+        """Queue a job. Large files are uploaded in parts, and resume after a lost connection.
+
+        Scene, styles and cameras may be URLs that the service fetches, if its operator allows their hosts.
+
+        Args:
+            style: Style image, or several that are mixed with the weights of the parameter `style_weights`.
+            cameras: Camera file or folder, as for `sgsst stylize --cameras`; None for an orbit.
+            photos: Folder of photos for the content term; None for unstylized renders.
+            masks: Mask files, or folders of mask images, by the names that the parameter `regions` gives them
+                (`mask=NAME`, `masks=NAME`).
+            webhook: URL that gets a message when the job has ended; None for none.
+            webhook_events: Messages that it gets instead: of "started", "progress", "completed".
+            progress: Callback that receives the uploaded bytes and the total bytes of all large files.
+            parameters: Fields of `JobParameters`; those that are None are not sent.
+
+        Raises:
+            RequestError: If an input cannot be used; the message says which and why.
+        """
+        files = _files(scene, style, cameras, photos, masks)
+        given = {"webhook": webhook, "webhook_events": ",".join(webhook_events)}
+        sent = {name: value for name, value in given.items() if value}
+        created = await uploads.create_job(self._transport, files, parameters, sent, progress)
+        return Job.of(created)
+
+    async def plan(
+        self,
+        /,
+        scene: str | Path,
+        style: str | Path | Sequence[str | Path],
+        *,
+        cameras: str | Path | None = None,
+        photos: str | Path | None = None,
+        masks: Mapping[str, str | Path] | None = None,
+        progress: Progress = no_progress,
+        planning: Progress = no_progress,
+        **parameters: Any,
+    ) -> dict[str, Any]:
+        """Plan a job without queueing it, and return the plan. The other arguments are the same as for `submit`.
+
+        Args:
+            planning: Callback that receives the number of completed views of the survey, and of all.
+        """
+        files = _files(scene, style, cameras, photos, masks)
+        return await uploads.plan_job(self._transport, files, parameters, progress=progress, planning=planning)
+
+    async def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> str:
+        """Upload a file in parts, and return the upload's id. Any number of jobs may use the upload."""
+        path = Path(path)
+        return await uploads.upload(self._transport, path, name or path.name, progress)
+
+    async def job(self, job_id: str) -> Job:
+        """Return the current state of a job."""
+        return Job.of((await self._transport.call("GET", _job_path(job_id))).json())
+
+    async def jobs(self, *, status: Sequence[str] = (), limit: int | None = None) -> AsyncIterator[Job]:
+        """Yield the jobs of this key, newest first."""
+        left = limit
+        params: dict[str, Any] = {"status": list(status)}
+        while left is None or left > 0:
+            params["limit"] = min(left or _PAGE, _PAGE)
+            page = (await self._transport.call("GET", "/v1/jobs", params=params)).json()
+            for data in page["jobs"]:
+                yield Job.of(data)
+            params["cursor"] = page["next_cursor"]
+            left = None if left is None else left - len(page["jobs"])
+            if params["cursor"] is None:
+                return
+
+    async def watch(self, job_id: str, after: int = 0) -> AsyncIterator[Event]:
+        """Yield the events of a job as they happen, until it has ended. No event is lost when a connection breaks."""
+        failures = 0
+        timeout = httpx2.Timeout(30.0, read=_SILENCE_SECONDS)
+        while True:
+            headers = {"Last-Event-ID": str(after)} if after else {}
+            path = f"{_job_path(job_id)}/events"
+            try:
+                async with self._transport.http.sse(path, headers=headers, timeout=timeout) as source:
+                    self._transport.reached = True
+                    if source.response.status_code != httpx2.codes.OK:  # 204: no events will follow
+                        await source.response.aread()
+                        checked(source.response)
+                        return
+                    async for sent in source:
+                        if sent.data:  # messages without data only keep the connection alive
+                            event = Event.of(sent)
+                            after, failures = event.id, 0
+                            yield event
+            except httpx2.TransportError as error:
+                # stamina cannot do this: each event resets the count of failures
+                failures += 1
+                if failures >= TRIES or self._transport.gives_up(error):
+                    raise self._transport.unreachable(error) from None
+                await anyio.sleep(FIRST_WAIT * 2.0 ** (failures - 1))
+                continue
+            if (await self.job(job_id)).finished:
+                return
+
+    async def wait(self, job_id: str) -> Job:
+        """Wait until a job has ended, and return its final state."""
+        async for _ in self.watch(job_id):
+            pass
+        return await self.job(job_id)
+
+    async def artifacts(self, job_id: str) -> list[dict[str, Any]]:
+        """Return the files that a job has made so far."""
+        artifacts: list[dict[str, Any]] = []
+        cursor: str | None = ""
+        while cursor is not None:
+            query = f"?cursor={quote(cursor, safe='')}" if cursor else ""
+            page = (await self._transport.call("GET", f"{_job_path(job_id)}/artifacts{query}")).json()
+            artifacts += page["artifacts"]
+            cursor = page.get("next_cursor")  # services of earlier versions send all at once
+        return artifacts
+
+    async def download(
+        self,
+        job_id: str,
+        target: str | Path,
+        name: str = "stylized.ply",
+        progress: Progress = no_progress,
+        format: str | None = None,
+    ) -> Path:
+        """Download a file of a job, and check its SHA-256. If part of it was downloaded before, resume from there.
+
+        Args:
+            format: Format of stylized.ply, such as "spz"; None for that of the target's name. The service converts
+                the file on the first request.
+
+        Raises:
+            RequestError: If the file does not exist, or does not exist yet.
+            OutputError: If the target is a folder, its folder cannot be written or created, or stylized.ply cannot be
+                saved with its suffix.
+        """
+        target = Path(target)
+        if format is None and name == "stylized.ply":
+            format = download_of_name(target.name)
+        if target.is_dir():
+            raise OutputError(f"{target}: is a folder. Name the file to write.")
+        await in_thread(ensure_writable_folder, target.parent)
+        query = f"?format={format}" if format and format != PLY.name else ""
+        await self._transport.fetch(Download(f"{_job_path(job_id)}/artifacts/{quote(name)}{query}", target, progress))
+        return target
+
+    async def blend(
+        self, job_id: str, weight: float, others: Mapping[str, float] | None = None, format: str = "ply"
+    ) -> str:
+        """Blend a finished job's scene with its result, and return the name of the blend for `download`.
+
+        Args:
+            job_id: Job whose scene and result are blended, and that stores the blend.
+            weight: Weight of the job's result. The scene has the remaining weight up to 1.
+            others: Weights of results of other jobs of the same scene by job id.
+            format: Format of the blend, such as "spz".
+
+        Raises:
+            RequestError: If a job has no result, or its result has other Gaussians than the scene.
+        """
+        parts = [{"job_id": other, "weight": each} for other, each in (others or {}).items()]
+        body = {"weight": weight, "others": parts, "format": format}
+        name: str = (await self._transport.call("POST", f"{_job_path(job_id)}/blends", json=body)).json()["name"]
+        return name
+
+    async def video(self, /, job_id: str, progress: Progress = no_progress, **options: Any) -> str:
+        """Render a video of a finished job's result, and return its name for `download`. It takes minutes.
+
+        Args:
+            job_id: Job whose result is shown, and whose earlier video is replaced.
+            progress: Callback that receives the number of rendered frames and the number of all frames.
+            options: Options of `POST /v1/jobs/{id}/video`, such as `path="cameras"`, `seconds=8` and `compare=True`.
+
+        Raises:
+            RequestError: If the job has no result, or an option is invalid.
+        """
+        video = await self._transport.work(f"{_job_path(job_id)}/video", "rendering", progress, json=options)
+        name: str = video["name"]
+        return name
+
+    async def rename(self, job_id: str, name: str) -> Job:
+        """Change the display name of a job; an empty name restores the names of scene and style."""
+        return Job.of((await self._transport.call("PATCH", _job_path(job_id), json={"name": name})).json())
+
+    async def act(self, job_id: str, action: str) -> Job:
+        """Request an action on a job by its name in `service.states.ACTIONS`."""
+        return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/{action}")).json())
+
+    async def finish(self, job_id: str) -> Job:
+        """End a running job after its current step, and keep its result so far."""
+        return await self.act(job_id, Transition.FINISH)
+
+    async def cancel(self, job_id: str) -> Job:
+        """Cancel a job."""
+        return await self.act(job_id, Transition.CANCEL)
+
+    async def retry(self, job_id: str) -> Job:
+        """Queue a failed, canceled or stopped job again."""
+        return await self.act(job_id, Transition.RETRY)
+
+    async def share(self, job_id: str, days: float = 7.0, *, poster: bool = False) -> dict[str, Any]:
+        """Create a read-only link to a result; `url` is its address, `embed_url` that for a frame in another page.
+
+        Args:
+            days: Lifetime of the link, from a minute (1 / 1440) to 90.
+            poster: Whether sites where the link is posted can show an image of the result.
+        """
+        body = {"days": days, "poster": poster}
+        response = await self._transport.call("POST", f"{_job_path(job_id)}/shares", json=body)
+        share: dict[str, Any] = response.json()
+        for name in ("url", "embed_url"):
+            if share.get(name):
+                share[name] = f"{self.url}/shared{share[name].rpartition('/shared')[2]}"
+        return share
+
+    async def shares(self, job_id: str) -> list[dict[str, Any]]:
+        """Return the links to a result that have not expired, without their addresses."""
+        shares: list[dict[str, Any]] = (await self._transport.call("GET", f"{_job_path(job_id)}/shares")).json()[
+            "shares"
+        ]
+        return shares
+
+    async def revoke_share(self, job_id: str, share_id: str) -> None:
+        """Revoke a link to a result."""
+        await self._transport.call("DELETE", f"{_job_path(job_id)}/shares/{share_id}")
+
+    async def delete(self, job_id: str) -> None:
+        """Delete a job that has ended, with its results."""
+        await self._transport.call("DELETE", _job_path(job_id))
+
+
+def _job_path(job_id: str) -> str:
+    """Return the path of a job in the API.
+
+    Raises:
+        RequestError: If no job can have this ID.
+    """
+    if not _ID.fullmatch(job_id):
+        raise RequestError(f"There is no job {job_id!r}. `sgsst jobs` lists the IDs of jobs.", 404)
+    return f"/v1/jobs/{job_id}"
+
+
+def _files(
+    scene: str | Path,
+    style: str | Path | Sequence[str | Path],
+    cameras: str | Path | None,
+    photos: str | Path | None,
+    masks: Mapping[str, str | Path] | None,
+) -> JobFiles:
+    styles = [style] if isinstance(style, str | Path) else style
+    return JobFiles(
+        path_or_url(scene),
+        [path_or_url(each) for each in styles],
+        None if cameras is None else path_or_url(cameras),
+        None if photos is None else Path(photos),
+        {name: Path(path) for name, path in (masks or {}).items()},
+    )
 
 
 def _blocking(

@@ -1,1 +1,1 @@
-"""The REST API."""
+"""The REST API. Each module has one subject, with its routes, and the models of all are in `schemas`."""

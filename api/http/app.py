@@ -1,38 +1,53 @@
-"""The API as an ASGI app. The process that serves it never imports Ray or PyTorch."""
+"""The API as an ASGI app, and the middleware around it: access log, proxies, methods that stand for others, deadlines.
+
+The process that serves it never imports Ray or PyTorch.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import secrets
+import time
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+import anyio
 import anyio.to_thread
 from fastapi import FastAPI
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from api.http.context import Context
-from api.http.documentation import complete
-from api.http.event_hub import Hub
-from api.http.fetching import Fetcher
-from api.http.limits import Rates, SignIns
-from api.http.middleware import Deadlines, Methods, Observed, Proxied
+from api import installed_version
+from api.http import jobs, monitoring, sessions, shares, submission, uploads
+from api.http.context import Context, Rates
+from api.http.events import Hub
 from api.http.monitoring import Metrics, Readiness
-from api.http.problems import Problem, add_handlers
-from api.http.receipts import Receipts
-from api.http.routes import artifacts, events, inputs, jobs, operations, session, shares, submission, uploads
-from api.http.routes.submission import JobFromUploads
-from api.http.schemas import ANSWERS
+from api.http.problems import (
+    METHODS,
+    Problem,
+    add_handlers,
+    complete,
+    from_service,
+    logged_path,
+    route_of,
+    routed_methods,
+)
+from api.http.receiving import Fetcher, Receipts
+from api.http.schemas import ANSWERS, path_of, subpath
+from api.http.sessions import SignIns
 from api.http.static import add_static
-from service.deadlines import FileThreads, OwnerLimit
+from api.http.submission import JobFromUploads
+from service import problems
+from service.deadlines import Deadline, FileThreads, OwnerLimit
 from service.files.blobs import open_blobs
 from service.files.objects import Artifacts
 from service.inspection.derived import DerivedFiles
 from service.inspection.inspector import Inspector
 from service.problems import DamagedWeightsError
-from service.settings import ServiceSettings, check_weights
+from service.settings import ServiceSettings, check_weights, is_subpath
 from service.store import open_store
 
 #: Number of threads for requests that read the database.
@@ -102,7 +117,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     app = _App(
         title="sgsst",
-        version=_version(),
+        version=installed_version(),
         description=_DESCRIPTION,
         lifespan=lifespan,
         generate_unique_id_function=lambda route: route.name,
@@ -110,9 +125,12 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         redoc_url=None,
     )
     app.settings = settings
-    modules = (submission, jobs, events, inputs, artifacts, shares, uploads, session, operations)
-    for module in modules:
-        app.include_router(module.router)
+    routers = [
+        *(submission.router, jobs.router, jobs.inputs_router, jobs.artifacts_router, shares.router),
+        *(uploads.router, sessions.router, monitoring.router),
+    ]
+    for router in routers:
+        app.include_router(router)
     add_static(app)
     add_handlers(app)
     app.add_middleware(Deadlines, seconds=settings.answer_seconds)
@@ -121,7 +139,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     def openapi() -> dict[str, Any]:
         if not app.openapi_schema:
-            routes = [*app.routes, *(route for module in modules for route in module.router.routes)]
+            routes = [*app.routes, *(route for router in routers for route in router.routes)]
             complete(plain(), routes, (Problem, JobFromUploads, *ANSWERS))
         return app.openapi_schema or {}
 
@@ -140,8 +158,196 @@ class _App(FastAPI):
         return Observed(Proxied(inner, self.settings), self.state)
 
 
-def _version() -> str:
-    try:
-        return version("sgsst-service")
-    except PackageNotFoundError:
-        return "0"
+#: Path of the uploads, whose protocol lets a header replace the method, for clients that can only send GET and POST.
+_UPLOADS = "/v1/uploads"
+
+_access = logging.getLogger("api.access")
+_log = logging.getLogger(__name__)
+
+
+class Observed:
+    """Middleware that counts and logs requests by route instead of by path, and gives each an id.
+
+    It is the outermost one, so that it sees every response, those to unexpected errors included. A response that breaks
+    off is counted again with status 500.
+    """
+
+    def __init__(self, app: ASGIApp, state: Any) -> None:
+        self._app, self._state = app, state
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request; record its status and the time until its response starts."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started, request_id = time.perf_counter(), secrets.token_hex(8)
+        request: Scope = {**scope, "request_id": request_id}  # other middleware changes the copy, not the server's
+        status = 0
+
+        def note(new_status: int) -> None:
+            nonlocal status
+            status = new_status
+            self._note(scope["method"], request, status, time.perf_counter() - started)
+
+        async def observed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                note(message["status"])
+                message = {**message, "headers": [*message["headers"], (b"x-request-id", request_id.encode())]}
+            await send(message)
+
+        try:
+            await self._app(request, receive, observed)
+        except asyncio.CancelledError:  # the server is stopping, and has waited for this request for long enough
+            if not status:
+                await from_service(problems.STOPPING())(request, receive, observed)
+        except BaseException:
+            if status < 500:
+                note(500)
+            raise
+
+    def _note(self, method: str, request: Scope, status: int, seconds: float) -> None:
+        known = method if method in METHODS else "(other)"
+        self._state.context.metrics.observe(known, route_of(request), status, seconds)
+        extra = {"method": method, "path": logged_path(request), "status": status, "seconds": round(seconds, 4)}
+        _access.info("request", extra={**extra, "request_id": request["request_id"]})
+
+
+class Proxied:
+    """Middleware that takes the client's address, the scheme and the subpath of a request from a trusted proxy.
+
+    The proxy may pass the subpath on or strip it. A subpath in the settings replaces the proxy's.
+    """
+
+    def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
+        self._subpath = settings.root_path
+        self._app = ProxyHeadersMiddleware(app, settings.trusted_proxies)  # type: ignore[arg-type]
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request."""
+        if scope["type"] == "http":
+            root = self._subpath or self._forwarded(scope)
+            subpath.set(root)
+            scope["root_path"] = root
+            if not f"{scope['path']}/".startswith(f"{root}/"):
+                scope["path"] = root + scope["path"]
+        await self._app(scope, receive, send)  # type: ignore[arg-type]
+
+    def _forwarded(self, scope: Scope) -> str:
+        """Return the `X-Forwarded-Prefix` of a trusted proxy; an empty string for none."""
+        client = scope.get("client")
+        if not client or client[0] not in self._app.trusted_hosts:
+            return ""
+        prefix = _header(scope, b"x-forwarded-prefix").rstrip("/")
+        return prefix if is_subpath(prefix) else ""
+
+
+class Methods:
+    """Middleware that chooses the method by which the routes answer a request.
+
+    HEAD is answered wherever GET is: with the same headers, and without the body.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request."""
+        if scope["type"] == "http":
+            if f"{path_of(scope)}/".startswith(f"{_UPLOADS}/"):
+                scope["method"] = _header(scope, b"x-http-method-override") or scope["method"]
+            if scope["method"] == "HEAD" and "GET" in (routed := routed_methods(scope)) and "HEAD" not in routed:
+                scope["method"], send = "GET", _head_of(send)
+        await self._app(scope, receive, send)
+
+
+class Deadlines:
+    """Middleware that answers a request without progress with 503, and ends a response that stalls.
+
+    Every block of a body that arrives, and every block of a response that the client has taken, is progress, so long
+    transfers have no total limit. The deadline is suspended while the service waits for the client, whose time is
+    limited by `api.http.server`.
+
+    Args:
+        seconds: Time without progress.
+    """
+
+    def __init__(self, app: ASGIApp, seconds: float) -> None:
+        self._app, self._seconds = app, seconds
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request within its deadline."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        await _Exchange(self._app, self._seconds, scope, receive, send).run()
+
+
+class _Exchange:
+    """Request and its response."""
+
+    def __init__(self, app: ASGIApp, seconds: float, scope: Scope, receive: Receive, send: Send) -> None:
+        self._app, self._seconds, self._scope = app, seconds, scope
+        self._from_client, self._to_client = receive, send
+        self._complete = self._started = self._over = False
+        self._cancel = anyio.CancelScope()
+        self._expired = asyncio.get_running_loop().create_future()
+
+    async def run(self) -> None:
+        self._deadline = Deadline(self._seconds, lambda: self._expired.set_result(None))
+        serving = asyncio.create_task(self._serve())
+        try:
+            await asyncio.wait((serving, self._expired), return_when=asyncio.FIRST_COMPLETED)
+            if serving.done():
+                await serving
+            else:
+                await self._expire(serving)
+        finally:
+            self._deadline.close()
+            self._cancel.cancel()
+
+    async def _serve(self) -> None:
+        with self._cancel:
+            await self._app(self._scope, self._receive, self._send)
+
+    async def _expire(self, serving: asyncio.Task[None]) -> None:
+        """Give the request up, and answer it if no response has started; otherwise the server closes the connection."""
+        self._over = True
+        serving.add_done_callback(lambda task: task.cancelled() or task.exception())  # it ends without an audience
+        method, path = self._scope["method"], logged_path(self._scope)
+        _log.warning("no progress for %g s, request given up: %s %s", self._seconds, method, path)
+        if not self._started:
+            await from_service(problems.DEADLINE_EXCEEDED(seconds=self._seconds))(
+                self._scope, self._from_client, self._to_client
+            )
+
+    async def _receive(self) -> Message:
+        if self._complete:  # the app waits for the client to leave
+            return await self._from_client()
+        with self._deadline.suspended():
+            message = await self._from_client()
+        self._complete = not message.get("more_body", False)
+        return message
+
+    async def _send(self, message: Message) -> None:
+        if self._over:
+            return
+        self._started = True
+        with self._deadline.suspended():
+            await self._to_client(message)
+
+
+def _head_of(send: Send) -> Send:
+    """Return a function that sends the head of a response, and ends the response there."""
+
+    async def send_head(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            await send(message)
+            await send({"type": "http.response.body"})
+
+    return send_head
+
+
+def _header(scope: Scope, name: bytes) -> str:
+    """Return a header of a request; an empty string if it is missing."""
+    values: list[bytes] = [value for key, value in scope["headers"] if key == name]
+    return values[0].decode("latin-1").strip() if values else ""

@@ -1,4 +1,4 @@
-"""Dependencies of the routes: the components of the service, and the caller of a request.
+"""Dependencies of the routes: the components of the service, the caller of a request, and limits.
 
 Programs send an API key with each request. A browser sends its key once (`POST /v1/session`) and gets a cookie, which
 it then also sends with images, downloads and event streams.
@@ -11,33 +11,37 @@ that changes something must come from a page of this origin, according to the br
 from __future__ import annotations
 
 import asyncio
+import math
 import re
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BeforeValidator
 
-from api.http.documentation import raises
-from api.http.event_hub import Hub
-from api.http.fetching import Fetcher
-from api.http.limits import Rates, SignIns
-from api.http.monitoring import Metrics, Readiness
-from api.http.receipts import Receipts
+from api.http.problems import raises
 from service import problems
-from service.deadlines import FileThreads, OwnerLimit
-from service.files.blobs import Blobs
-from service.files.objects import Artifacts
-from service.inspection.derived import DerivedFiles
-from service.inspection.inspector import Inspector
 from service.scheduling.capacity import Machine
 from service.settings import ServiceSettings, is_loopback
-from service.store import Store
 from service.store.keys import NO_QUOTAS, Quotas
 from service.store.tables import KeyRow
+
+if TYPE_CHECKING:
+    from api.http.events import Hub
+    from api.http.monitoring import Metrics, Readiness
+    from api.http.receiving import Fetcher, Receipts
+    from api.http.sessions import SignIns
+    from service.deadlines import FileThreads, OwnerLimit
+    from service.files.blobs import Blobs
+    from service.files.objects import Artifacts
+    from service.inspection.derived import DerivedFiles
+    from service.inspection.inspector import Inspector
+    from service.store import Store
 
 #: Owner of everything that is created without a key, on services that require none.
 LOCAL_OWNER = "local"
@@ -218,3 +222,81 @@ def _digits(text: object) -> object:
 
 #: A whole number, written in decimal digits only.
 Digits = Annotated[int, BeforeValidator(_digits)]
+
+#: Bytes of all connections together, and maximum and minimum bytes of each.
+_TOTAL, _MOST, _LEAST = 8 << 20, 1 << 17, 1 << 13
+
+
+class RequestMemory:
+    """Memory of one process for the heads and bodies of requests.
+
+    Each connection may hold an equal fraction of the total. It covers the head, the part of the body that the app has
+    not read yet, and the block that is written to disk next. A JSON body must be complete before it can be parsed. It
+    may exceed this fraction as long as all JSON bodies together stay within the total.
+    """
+
+    def __init__(self) -> None:
+        self.connections = 0
+        self._json_bytes = 0
+
+    def share(self, most: int = _MOST) -> int:
+        """Return the bytes that one connection may hold: `most`, less if there are many connections, at least 8 kB."""
+        return max(_LEAST, min(most, _TOTAL // max(1, self.connections)))
+
+    def take(self, size: int, held: int) -> None:
+        """Count bytes of a JSON body.
+
+        Args:
+            size: Number of bytes to add.
+            held: Number of bytes of this body that were counted before.
+
+        Raises:
+            BUSY: If all JSON bodies together exceed the total, and this one exceeds the limit of one connection.
+        """
+        if self._json_bytes + size > _TOTAL and held + size > self.share():
+            raise problems.BUSY("Too many large requests are arriving. Try again later.", retry_after=5)
+        self._json_bytes += size
+
+    def give_back(self, size: int) -> None:
+        """Stop counting bytes of a JSON body."""
+        self._json_bytes -= size
+
+
+#: Memory budget of this process.
+memory = RequestMemory()
+
+#: Capacity of the token bucket, as the number of seconds of requests at the average rate that may arrive at once.
+_BURST_SECONDS = 10.0
+#: Maximum number of remembered owners. A forgotten owner starts again with a full bucket.
+_REMEMBERED = 10_000
+
+
+class Rates:
+    """Token bucket of requests for each owner."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._left: dict[str, tuple[float, float]] = {}
+
+    def take(self, owner: str, rate: float | None) -> None:
+        """Take one token from the owner's bucket.
+
+        Args:
+            owner: Owner of the request's key.
+            rate: Requests per second that the owner may send on average; None for no limit.
+
+        Raises:
+            RATE_LIMITED: If the owner's bucket is empty.
+        """
+        if rate is None:
+            return
+        most = max(1.0, rate * _BURST_SECONDS)
+        now = self._clock()
+        left, seen = self._left.pop(owner, (most, now))
+        left = min(most, left + (now - seen) * rate)
+        allowed = left >= 1
+        self._left[owner] = (left - 1 if allowed else left), now
+        if len(self._left) > _REMEMBERED:
+            del self._left[next(iter(self._left))]  # the owner with the oldest last request
+        if not allowed:
+            raise problems.RATE_LIMITED(limit=rate, retry_after=math.ceil((1 - left) / rate))

@@ -1,14 +1,19 @@
-"""Models of the API's responses."""
+"""Models of the API's requests and responses, and the addresses in them.
+
+Addresses are below the subpath at which a reverse proxy offers the service. The subpath is that of the current request:
+a setting, or what a trusted proxy has sent.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from starlette.types import Scope
 
-from api.http.addresses import address
 from service.files.objects import media_type
 from service.inputs import JobName, JobParameters
 from service.problems import JOB_ID, SHA256, SHARE_ID, SHARE_TOKEN, UPLOAD_ID
@@ -34,6 +39,21 @@ MOST_POINTS = 512
 MAX_WEIGHT = 10
 #: Times in the examples.
 _CREATED, _STARTED, _NOW = "2026-11-21T14:06:02.057842Z", "2026-11-21T14:06:05.536727Z", "2026-11-21T14:09:30.532514Z"
+
+
+#: Subpath of the current request, such as "/sgsst"; empty at the root of a host.
+subpath: ContextVar[str] = ContextVar("subpath", default="")
+
+
+def address(path: str) -> str:
+    """Return the address, as clients see it, of a path of the API."""
+    return subpath.get() + path
+
+
+def path_of(scope: Scope) -> str:
+    """Return the path of a request without the subpath."""
+    path: str = scope["path"]
+    return path.removeprefix(scope.get("root_path", ""))
 
 
 def utc(seconds: object) -> object:

@@ -14,8 +14,8 @@ from fastapi import Depends, Header, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
-from api.http.documentation import Responses, headers, raises
-from api.http.request_memory import memory
+from api.http.context import memory
+from api.http.problems import Responses, headers, raises
 from service import problems
 from service.deadlines import FileThreads
 from service.problems import SHA256

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from fastapi import FastAPI, Request, Response
 
-from api.http.addresses import path_of
+from api.http.schemas import path_of
 from api.http.sending import names_etag
 from api.static_files import FOLDER, read_static
 from service import problems

@@ -1,4 +1,6 @@
-"""Client of the service for programs that cannot install packages: only Python's standard library is needed."""
+"""Client of the service for programs that cannot install packages. Its splats as PLY files need NumPy; all else is
+Python's standard library.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -250,3 +252,34 @@ class BackgroundJob(threading.Thread):
                 self.colors, self._etag = answer.read(), answer.headers["ETag"]
         except (ServiceError, OSError, http.client.HTTPException):
             pass  # there are none yet, or none that are newer; the next call tries again
+
+
+#: Properties of a splat's colors, and all that it must have besides its position.
+COLORS = ("f_dc_0", "f_dc_1", "f_dc_2")
+REQUIRED = (*COLORS, "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+
+
+def write_splat(path: Path, columns: Mapping[str, Any]) -> None:
+    """Write a splat.
+
+    Args:
+        columns: Arrays of N numbers by property: `x`, `y`, `z`, `REQUIRED`, and `f_rest_*` if there are any.
+    """
+    import numpy as np
+
+    rest = sorted((name for name in columns if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
+    names = ("x", "y", "z", *COLORS, *rest, *REQUIRED[3:])
+    rows = np.stack([np.asarray(columns[name], "<f4") for name in names], axis=1)
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    path.write_bytes(header.encode() + rows.tobytes())
+
+
+def read_colors(path: Path) -> Any:
+    """Return `COLORS` of a PLY whose properties are all float, [N, 3] float32."""
+    import numpy as np
+
+    header, _, content = path.read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in header.decode().splitlines() if line.startswith("property float ")]
+    rows = np.frombuffer(content, "<f4").reshape(-1, len(names))
+    return np.ascontiguousarray(rows[:, [names.index(name) for name in COLORS]])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from api.client import Client
-from api.client.answers import RequestError
+from api.client.transport import RequestError
 from service.inspection.derived import MOST_BLENDS
 from service.settings import ServiceSettings
 from service.states import Published

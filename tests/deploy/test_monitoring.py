@@ -12,7 +12,7 @@ import pytest
 import yaml
 from fastapi.routing import APIRoute
 
-from api.http.routes import jobs
+from api.http import jobs
 from tests.api.service import Service
 
 pytestmark = pytest.mark.slow

@@ -15,8 +15,7 @@ import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from .sgsst_rest import BackgroundJob, Service
-from .splat_ply import COLORS, REQUIRED, read_colors, write_splat
+from .sgsst_rest import COLORS, REQUIRED, BackgroundJob, Service, read_colors, write_splat
 
 #: Factor of the first spherical harmonic.
 _SH_C0 = 0.28209479177387814

@@ -1,4 +1,4 @@
-"""End-to-end tests of the `sgsst` command, on files so small that a job takes seconds."""
+"""Tests of the command line with real files: options, plans, results, reports, messages, exit codes and the demo."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ from PIL import Image
 from plyfile import PlyData
 from torch import Tensor
 
+from api.cli import stylize_commands
 from api.cli.main import app, main
-from sgsst_core.features.network_weights import BackboneWeights, cache_folder
+from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.gaussians import TENSORS
+from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.files.formats.samples import files_of, streamed, unpacked
-from tests.sgsst_core.trainer_scenes import write_gsplat, write_nerfstudio
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
 pytestmark = pytest.mark.usefixtures("one_thread", "tiny_installed")
@@ -346,19 +347,6 @@ def test_closed_terminal_saves(files: Files, workers: tuple[str, ...]) -> None:
 
 
 @pytest.mark.slow
-def test_nohup_continues_at_a_closed_terminal(files: Files) -> None:
-    command = [sys.executable, "-m", "api.cli", *files.stylize("--steps-sos", "150", "--no-early-stop")]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(["nohup", *command], stdout=subprocess.PIPE, text=True, env=environment) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("schedule"):
-                process.send_signal(signal.SIGHUP)
-        assert process.wait(timeout=120) == 0
-    assert files.out.exists()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("command", ["plan", "stylize"])
 def test_ctrl_c_during_survey_leaves_no_files(files: Files, command: str) -> None:
     """The progress bar shows when the survey runs; there are enough views for the signal to arrive meanwhile."""
@@ -420,85 +408,27 @@ def test_time_budget_writes_result_and_checkpoint(files: Files, capsys: pytest.C
 # --- bad input -----------------------------------------------------------------------------------------------------
 
 
-def _missing_scene(files: Files) -> list[str]:
-    files.ply.unlink()
-    return []
+#: Header of an ASCII PLY with one vertex, up to further elements.
+_VERTEX = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
 
 
-def _truncated_scene(files: Files) -> list[str]:
-    files.ply.write_bytes(files.ply.read_bytes()[:-1000])
-    return []
-
-
-def _lying_header(files: Files) -> list[str]:
-    data = files.ply.read_bytes()
-    files.ply.write_bytes(data.replace(b"element vertex 616", b"element vertex 999999999999"))
-    return []
-
-
-def _mesh(files: Files) -> list[str]:
-    files.ply.write_text(
-        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 0\n"
-    )
-    return []
-
-
-def _point_cloud(files: Files) -> list[str]:
-    files.ply.write_text(
-        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-        "end_header\n0 0 0\n"
-    )
-    return []
-
-
-def _infinite_values(files: Files) -> list[str]:
+def _with_infinite_values(files: Files) -> None:
     scene = wall()
-    scene.scales[3, 1] = float("inf")
-    scene.scales[4, 1] = float("nan")
+    scene.scales[3, 1], scene.scales[4, 1] = float("inf"), float("nan")
     write_scene(files.ply, scene)
-    return []
 
 
-def _no_gaussians(files: Files) -> list[str]:
+def _without_gaussians(files: Files) -> None:
     head, end, _ = files.ply.read_bytes().partition(b"end_header\n")
     files.ply.write_bytes(head.replace(b"element vertex 616", b"element vertex 0") + end)
-    return []
 
 
-def _blind_cameras(files: Files) -> list[str]:
-    write_files(files.ply.parent, wall(), [blind_camera(), replace(blind_camera(), name="blind_2")])
-    return []
+def _with_one_photo(files: Files) -> None:
+    (files.ply.parent / "photos").mkdir()
+    Image.new("RGB", (64, 48)).save(files.ply.parent / "photos" / "view_1.png")
 
 
-def _unknown_cameras(files: Files) -> list[str]:
-    files.cameras.write_text('{"poses": []}')
-    return []
-
-
-def _no_cameras(files: Files) -> list[str]:
-    files.cameras.unlink()
-    return []
-
-
-def _missing_photos(files: Files) -> list[str]:
-    photos = files.ply.parent / "photos"
-    photos.mkdir()
-    Image.new("RGB", (64, 48)).save(photos / "view_1.png")
-    return ["--images", str(photos)]
-
-
-def _style_is_no_image(files: Files) -> list[str]:
-    files.style.write_text("not an image")
-    return []
-
-
-def _style_is_missing(files: Files) -> list[str]:
-    files.style.unlink()
-    return []
-
-
-def _style_is_a_bomb(files: Files) -> list[str]:
+def _with_a_bomb(files: Files) -> None:
     """Write a PNG of a few hundred bytes whose header declares 90000 x 90000 pixels."""
 
     def chunk(name: bytes, data: bytes) -> bytes:
@@ -507,104 +437,97 @@ def _style_is_a_bomb(files: Files) -> list[str]:
     header = struct.pack(">IIBBBBB", 90000, 90000, 8, 2, 0, 0, 0)
     body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
     files.style.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
-    return []
-
-
-def _strokes_too_large(files: Files) -> list[str]:
-    Image.new("RGB", (5000, 1)).save(files.style)
-    return ["--style-scale", "4"]
-
-
-def _out_is_a_folder(files: Files) -> list[str]:
-    files.out = files.ply.parent
-    return []
-
-
-def _out_lies_in_a_file(files: Files) -> list[str]:
-    files.out = files.cameras / "stylized.ply"
-    return []
-
-
-def _out_is_the_scene(files: Files) -> list[str]:
-    files.out = files.ply.parent / ".." / files.ply.parent.name / files.ply.name
-    return []
-
-
-def _report_is_the_camera_file(files: Files) -> list[str]:
-    files.cameras = files.cameras.rename(files.cameras.with_name("stylized.report.json"))
-    files.out = files.cameras.with_name("stylized.ply")
-    return []
-
-
-def _sheet_is_a_region_style(files: Files) -> list[str]:
-    files.out = files.style.with_name("stylized.ply")
-    sheet = shutil.copy(files.style, files.style.with_name("stylized.before_after.jpg"))
-    return ["--region", "near:sphere=0,0,4,1", "--region-style", f"near={sheet}"]
-
-
-def _out_is_no_ply(files: Files) -> list[str]:
-    files.out = files.style
-    return []
-
-
-def _no_steps(files: Files) -> list[str]:
-    return ["--steps-sos", "0", "--steps-coarse", "0"]
-
-
-def _both_cameras_and_orbit(files: Files) -> list[str]:
-    return ["--orbit", "3"]
-
-
-def _nothing_to_resume(files: Files) -> list[str]:
-    return ["--resume"]
-
-
-def _damaged_checkpoint(files: Files) -> list[str]:
-    files.out = files.ply.parent / "stylized.ply"
-    files.out.with_name("stylized.checkpoint.safetensors").write_bytes(b"damaged")
-    return ["--resume"]
 
 
 @pytest.mark.parametrize(
-    ("spoil", "expected"),
+    ("spoil", "options", "expected"),
     [
-        (_missing_scene, ["scene.ply", "No such file"]),
-        (_truncated_scene, ["scene.ply", "truncated"]),
-        (_lying_header, ["scene.ply", "999999999999"]),
-        (_mesh, ["scene.ply", "mesh", "rot_0", "opacity"]),
-        (_point_cloud, ["scene.ply", "point cloud", "f_dc_0"]),
-        (_infinite_values, ["scene.ply", "2 of 616", "scale_1 (1 NaN, 1 infinite)", "--drop-invalid"]),
-        (_no_gaussians, ["scene.ply", "no Gaussians"]),
-        (_blind_cameras, ["None of the 2 cameras sees a Gaussian"]),
-        (_unknown_cameras, ["cameras.json", "transforms.json"]),
-        (_no_cameras, ["cameras.json", "cannot be read"]),
-        (_missing_photos, ["no photo for 2 of 3 views: view_0, view_2"]),
-        (_style_is_no_image, ["style.png", "not an image"]),
-        (_style_is_missing, ["style.png", "No such file"]),
-        (_style_is_a_bomb, ["style.png", "megapixels"]),
-        (_strokes_too_large, ["--style-scale 4", "16,384", "smaller scale"]),
-        (_out_is_a_folder, ["is a folder"]),
-        (_out_lies_in_a_file, ["cameras.json"]),
-        (_out_is_the_scene, ["is the scene itself"]),
-        (_report_is_the_camera_file, ["report.json (written beside stylized.ply): is the camera file"]),
-        (_sheet_is_a_region_style, ["before_after.jpg (written beside stylized.ply): is the style image"]),
-        (_out_is_no_ply, ["does not end in .ply"]),
-        (_no_steps, ["steps are 0"]),
-        (_both_cameras_and_orbit, ["--cameras", "--orbit"]),
-        (_nothing_to_resume, ["no checkpoint to resume from"]),
-        (_damaged_checkpoint, ["not a readable checkpoint"]),
+        (lambda files: files.ply.unlink(), [], ["scene.ply", "No such file"]),
+        (lambda files: files.ply.write_bytes(files.ply.read_bytes()[:-1000]), [], ["scene.ply", "truncated"]),
+        (
+            lambda files: files.ply.write_bytes(files.ply.read_bytes().replace(b"vertex 616", b"vertex 999999999999")),
+            [],
+            ["scene.ply", "999999999999"],
+        ),
+        (
+            lambda files: files.ply.write_text(
+                f"{_VERTEX}element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 0\n"
+            ),
+            [],
+            ["scene.ply", "mesh", "rot_0", "opacity"],
+        ),
+        (
+            lambda files: files.ply.write_text(f"{_VERTEX}end_header\n0 0 0\n"),
+            [],
+            ["scene.ply", "point cloud", "f_dc_0"],
+        ),
+        (
+            _with_infinite_values,
+            [],
+            ["scene.ply", "2 of 616", "scale_1 (1 NaN, 1 infinite)", "--drop-invalid"],
+        ),
+        (_without_gaussians, [], ["scene.ply", "no Gaussians"]),
+        (
+            lambda files: write_files(
+                files.ply.parent, wall(), [blind_camera(), replace(blind_camera(), name="blind_2")]
+            ),
+            [],
+            ["None of the 2 cameras sees a Gaussian"],
+        ),
+        (lambda files: files.cameras.write_text('{"poses": []}'), [], ["cameras.json", "transforms.json"]),
+        (lambda files: files.cameras.unlink(), [], ["cameras.json", "cannot be read"]),
+        (
+            _with_one_photo,
+            ["--images", "{0.ply.parent}/photos"],
+            ["no photo for 2 of 3 views: view_0, view_2"],
+        ),
+        (lambda files: files.style.write_text("not an image"), [], ["style.png", "not an image"]),
+        (lambda files: files.style.unlink(), [], ["style.png", "No such file"]),
+        (_with_a_bomb, [], ["style.png", "megapixels"]),
+        (
+            lambda files: Image.new("RGB", (5000, 1)).save(files.style),
+            ["--style-scale", "4"],
+            ["--style-scale 4", "16,384", "smaller scale"],
+        ),
+        (None, ["--out", "{0.ply.parent}"], ["is a folder"]),
+        (None, ["--out", "{0.cameras}/stylized.ply"], ["cameras.json"]),
+        (None, ["--out", "{0.ply.parent}/../{0.ply.parent.name}/{0.ply.name}"], ["is the scene itself"]),
+        (
+            lambda files: shutil.copy(files.cameras, files.cameras.with_name("stylized.report.json")),
+            ["--cameras", "{0.ply.parent}/stylized.report.json", "--out", "{0.ply.parent}/stylized.ply"],
+            ["report.json (written beside stylized.ply): is the camera file"],
+        ),
+        (
+            lambda files: shutil.copy(files.style, files.style.with_name("stylized.before_after.jpg")),
+            [
+                *("--out", "{0.ply.parent}/stylized.ply", "--region", "near:sphere=0,0,4,1"),
+                *("--region-style", "near={0.ply.parent}/stylized.before_after.jpg"),
+            ],
+            ["before_after.jpg (written beside stylized.ply): is the style image"],
+        ),
+        (None, ["--out", "{0.style}"], ["does not end in .ply"]),
+        (None, ["--steps-sos", "0", "--steps-coarse", "0"], ["steps are 0"]),
+        (None, ["--orbit", "3"], ["--cameras", "--orbit"]),
+        (None, ["--resume"], ["no checkpoint to resume from"]),
+        (
+            lambda files: files.ply.with_name("stylized.checkpoint.safetensors").write_bytes(b"damaged"),
+            ["--out", "{0.ply.parent}/stylized.ply", "--resume"],
+            ["not a readable checkpoint"],
+        ),
     ],
 )
 def test_bad_input_prints_one_message_and_leaves_no_files(
     files: Files,
     tmp_path: Path,
-    spoil: Callable[[Files], list[str]],
+    spoil: Callable[[Files], object] | None,
+    options: list[str],
     expected: list[str],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    options = spoil(files)
+    if spoil is not None:
+        spoil(files)
     before = _everything(tmp_path)
-    assert main(files.stylize(*options)) == 2
+    assert main(files.stylize(*(option.format(files) for option in options))) == 2
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.count("error: ") == 1
@@ -680,15 +603,6 @@ def test_invalid_options_exit_with_code_2(files: Files, options: list[str], caps
     error = capsys.readouterr().err
     assert options[0].strip("-").replace("-", "_") in error.replace("-", "_")
     assert not files.out.parent.exists()
-
-
-def test_default_backbone_is_named_with_reason(
-    files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copy(cache_folder() / "vgg16.safetensors", tmp_path)
-    monkeypatch.setenv("SGSST_CACHE", str(tmp_path))
-    assert main(files.stylize("--steps-sos", "1", "--backbone", "auto")) == 0
-    assert "VGG16, because VGG19 (the paper's) is not installed" in capsys.readouterr().out
 
 
 # --- render, weights, program --------------------------------------------------------------------------------------
@@ -793,20 +707,6 @@ def test_video_options_that_contradict_each_other_are_refused(
     assert sorted(Path().iterdir()) == before
 
 
-@pytest.mark.slow
-def test_interrupted_video_leaves_nothing(files: Files, tmp_path: Path) -> None:
-    video = tmp_path / "video.mp4"
-    options = ["--video", str(video), "--path", "orbit", "--seconds", "600"]
-    command = [sys.executable, "-m", "api.cli", "render", str(files.ply), *options]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        assert "Rendering 18000 frames" in process.stderr.readline()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 130
-    assert not list(tmp_path.glob("*video*"))
-    assert not list(tmp_path.glob(".sgsst*"))
-
-
 @pytest.mark.parametrize("name", [format.name for format in RESULT_FORMATS])
 def test_convert_writes_what_it_reads(files: Files, capsys: pytest.CaptureFixture[str], name: str) -> None:
     written, back = files.out.with_name(f"scene.{name}"), files.out.with_name("back.ply")
@@ -823,19 +723,6 @@ def test_convert_writes_what_it_reads(files: Files, capsys: pytest.CaptureFixtur
         assert torch.equal(getattr(one.scene, field), getattr(other.scene, field)), field
 
 
-@pytest.mark.parametrize("write", [write_gsplat, write_nerfstudio])
-def test_convert_reads_checkpoints_of_trainers(files: Files, capsys: pytest.CaptureFixture[str], write: Any) -> None:
-    checkpoint = write(files.ply.with_name("checkpoint.pt"), wall(sh_degree=1))
-    arguments = ["convert", str(checkpoint), str(files.out), "--cameras", str(files.cameras)]
-    assert main([*arguments, "--render-mode", "antialiased", "--compare"]) == 0
-    assert "renders identical to checkpoint.pt" in capsys.readouterr().out
-    written = read_scene(files.out).scene
-    assert written.rendering.antialiased
-    for field in TENSORS:
-        assert torch.equal(getattr(written, field), getattr(wall(sh_degree=1), field)), field
-    assert main(["convert", str(files.ply.with_name("checkpoint.pt")), str(files.out.with_name("a.pt"))]) == 2
-
-
 def test_convert_says_what_it_changes(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
     ply = PlyData.read(files.ply, mmap=False)
     ply["vertex"]["opacity"][:3] = np.inf
@@ -844,15 +731,6 @@ def test_convert_says_what_it_changes(files: Files, capsys: pytest.CaptureFixtur
     assert main(["convert", str(files.ply), str(files.out), "--drop-invalid"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "1 invalid ones dropped, 3 infinite opacities read as almost 0 or 1" in said
-
-
-def test_convert_writes_usd(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("pxr", reason="usd-core is not installed")
-    out = files.out.with_name("scene.usdc")
-    assert main(["convert", str(files.ply), str(out), "--compare"]) == 2
-    assert "Omit --compare" in capsys.readouterr().err
-    assert main(["convert", str(files.ply), str(out)]) == 0
-    assert [path.name for path in out.parent.iterdir()] == ["scene.usdc"]
 
 
 def test_streamed_sog_is_stylized_at_all_levels(files: Files, capsys: pytest.CaptureFixture[str]) -> None:
@@ -1075,3 +953,114 @@ def test_every_command_that_writes_is_tested() -> None:
         return names
 
     assert writing(typer.main.get_command(app)) == {command[0] for command in _WRITING}
+
+
+CONTROLS = [
+    "--preserve-colors",
+    "luminance",
+    "--sh-attenuation",
+    "0.25",
+    "--scales",
+    "1,0,0.5",
+    "--coarsest-side",
+    "16",
+]
+
+
+def command(name: str, folder: Path, *options: str) -> list[str]:
+    ply, cameras, style = write_files(folder, wall(sh_degree=1))
+    return [name, str(ply), "--style", str(style), "--cameras", str(cameras), "--backbone", "vgg16", *options]
+
+
+def test_controls_take_effect_and_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "new" / "out.spz"
+    steps = ["--steps-coarse", "1", "--steps-sos", "3"]
+    assert main(command("stylize", tmp_path, "--out", str(out), *steps, *CONTROLS)) == 0
+    shown = capsys.readouterr().out
+    for line in (
+        "only luminance is compared and optimized",
+        "multiplied by 0.75",
+        "scale 0 1, scale 2 0.5; 1 of 3 scales are not computed",
+        "2 of 3 scales",
+        "compressed:           spz, ",
+        "dB PSNR against the PLY",
+    ):
+        assert line in shown
+    before, after = (read_scene(path).scene for path in (tmp_path / "scene.ply", tmp_path / "new" / "out.ply"))
+    assert torch.equal(held(after.sh_rest), 0.75 * held(before.sh_rest))
+    change = after.sh_dc - before.sh_dc
+    assert float(change.abs().max()) > 0.1
+    torch.testing.assert_close(change, change.mean(1, keepdim=True).expand(-1, 3), atol=1e-6, rtol=0)
+    report = json.loads((tmp_path / "new" / "out.report.json").read_text())
+    assert report["settings"]["preserve_colors"] == "luminance"
+    assert report["settings"]["scales"] == [1, 0, 0.5]
+    assert report["settings"]["sh_attenuation"] == 0.25
+    assert report["scene"]["sh_degree"] == 1
+    assert (report["compressed"]["name"], report["compressed"]["bytes"]) == (out.name, out.stat().st_size)
+    loss = report["loss"]["after"]
+    assert sorted(loss["scales"]) == ["0", "2"]
+    assert loss["total"] == pytest.approx((loss["scales"]["0"]["total"] + 0.5 * loss["scales"]["2"]["total"]) / 1.5)
+    packed = read_scene(out).scene
+    assert float(held(packed.sh_rest).abs().max()) < 0.8 * float(held(before.sh_rest).abs().max())
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--scales", "0,0"], "no scale has a weight"),
+        (["--scales", "1,-1"], "greater than or equal to 0"),
+        (["--scales", "nan"], "finite"),
+        (["--scales", "fine"], "is not a list of weights"),
+        (["--scales", "0,1"], "the views have one scale, 0"),
+        (["--sh-attenuation", "1.5"], "less than or equal to 1"),
+        (["--preserve-colors", "hue"], "hue"),
+    ],
+    ids=str,
+)
+def test_contradictory_controls_are_rejected_before_work_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], problem: str
+) -> None:
+    for name in ("stylize", "plan"):
+        out = tmp_path / ("out.ply" if name == "stylize" else "plan.json")
+        assert main(command(name, tmp_path, "--out", str(out), *options)) == 2
+        assert problem in capsys.readouterr().err
+        assert not out.exists()
+
+
+@pytest.mark.slow
+def test_demo_stylizes_its_scene_and_prints_result_paths(
+    vgg16_weights: BackboneWeights,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(stylize_commands, "DEMO_STEPS", 1)
+    monkeypatch.setattr(stylize_commands, "DEMO_RESOLUTION", 180)
+    out = tmp_path / "demo"
+    assert main(["demo", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    names = {"stylized.ply", "stylized.report.json", "stylized.before_after.jpg", "stylized.loss.png"}
+    names |= {"stylized.report.html"}
+    inputs = {"motorcycle.ply", "cameras.json", "starry_night.jpg"}
+    assert {path.name for path in out.iterdir()} == names | inputs | {"stylized.plan.json"}
+    for name in names:
+        assert str(out / name) in shown
+    before, after = read_scene(out / "motorcycle.ply").scene, read_scene(out / "stylized.ply").scene
+    assert torch.equal(before.means, after.means)
+    assert float((before.sh_dc != after.sh_dc).float().mean()) > 0.5
+    report = json.loads((out / "stylized.report.json").read_text())
+    assert report["loss"]["relative"] < 0.9
+    assert report["cameras"]["count"] == 10
+
+    # The printed command is the one that ran.
+    command = next(line for line in shown.splitlines() if line.startswith("command:")).removeprefix("command:")
+    arguments = shlex.split(command)
+    assert arguments[:3] == ["sgsst", "stylize", str(out / "motorcycle.ply")]
+    assert main([*arguments[1:], "--resume"]) == 2
+    assert "this job is finished" in capsys.readouterr().err
+
+
+def test_demo_rejects_unwritable_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert main(["demo", "--out", str(tmp_path / "file")]) == 2
+    assert "file" in capsys.readouterr().err

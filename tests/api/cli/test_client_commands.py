@@ -18,10 +18,7 @@ from PIL import Image
 
 from api.cli.main import main
 from api.client import Client
-from api.client.answers import RequestError
-from service.files.objects import Artifacts
-from service.settings import ServiceSettings
-from service.store import open_store
+from api.client.transport import RequestError
 from tests.api.service import ROOT, Service
 from tests.full_disk import full_disk
 from tests.http_servers import serve
@@ -46,23 +43,6 @@ def submit(files: list[str], capsys: pytest.CaptureFixture[str], *options: str) 
     """Submit a job, and return its id."""
     assert main(["submit", *files, *options]) == 0
     return capsys.readouterr().out.strip()
-
-
-def finish(service: Service, job_id: str, content: bytes, folder: Path, **result: Any) -> None:
-    """Finish a queued job in place of a dispatcher, with this content as its result."""
-    settings = ServiceSettings(data=service.data)
-    store = open_store(settings)
-    path = folder / "result.ply"
-    path.write_bytes(content)
-    try:
-        while (lease := store.leases.take("test")) is not None:
-            file = Artifacts(settings.artifacts_url).put(lease.job_id, lease.epoch, "stylized.ply", path)
-            store.leases.start(lease)
-            store.leases.succeed(lease, [file], {"steps": 1, "loss_before": 2.0, "loss_after": 1.0, **result})
-            if lease.job_id == job_id:
-                return
-    finally:
-        store.close()
 
 
 def test_exit_codes_and_errors_as_json(files: list[str], capsys: pytest.CaptureFixture[str], service: Service) -> None:
@@ -95,7 +75,7 @@ def test_job_that_ended_early_says_how_little_was_done(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:
     job_id = submit(files, capsys)
-    finish(service, job_id, b"result", tmp_path, stopped="within", steps=2, total=60, loss_after=1.94)
+    service.finish(job_id, {"stylized.ply": b"result"}, stopped="within", steps=2, total=60, loss_after=1.94)
     assert main(["status", job_id]) == 0
     shown = capsys.readouterr().out
     assert "2 of 60: its time budget was used up (submit it again with a larger `within`" in shown
@@ -158,7 +138,7 @@ def test_interrupted_batch_waits_for_its_jobs_again(
     assert record["scene_style"]["complete"] is False
     job = httpx2.get(f"{service.url}/v1/jobs/{record['scene_style']['job']}").json()
     assert job["parameters"]["workers"] == 2
-    finish(service, record["scene_style"]["job"], Path(files[0]).read_bytes(), tmp_path)
+    service.finish(record["scene_style"]["job"], {"stylized.ply": Path(files[0]).read_bytes()})
     assert main(arguments) == 0
     assert (out / "scene_style.ply").read_bytes() == Path(files[0]).read_bytes()
     assert Image.open(out / "batch.jpg").width > 100
@@ -177,7 +157,7 @@ def test_download_replaces_no_file_of_another_job(
     ids = []
     for content in (b"first", b"second"):
         ids.append(submit(files, capsys))
-        finish(service, ids[-1], content, tmp_path)
+        service.finish(ids[-1], {"stylized.ply": content})
     monkeypatch.chdir(tmp_path)
     result = tmp_path / "stylized.ply"
     assert main(["download", ids[0]]) == 0
@@ -265,7 +245,7 @@ def test_share_prints_the_link(
     job_id = submit(files, capsys)
     assert main(["share", job_id]) == 4
     assert "only results can be shared" in capsys.readouterr().err
-    finish(service, job_id, b"result", tmp_path)
+    service.finish(job_id, {"stylized.ply": b"result"})
     assert main(["share", job_id, "--poster", "--days", "1"]) == 0
     link = capsys.readouterr().out.strip()
     assert link.startswith(f"{service.url}/shared/shr_")
@@ -278,7 +258,7 @@ def test_download_to_a_full_disk_leaves_nothing(
     files: list[str], capsys: pytest.CaptureFixture[str], service: Service, tmp_path: Path
 ) -> None:
     job_id = submit(files, capsys)
-    finish(service, job_id, bytes(200_000), tmp_path)
+    service.finish(job_id, {"stylized.ply": bytes(200_000)})
     out = tmp_path / "new" / "out.ply"
     with full_disk(100_000):
         assert main(["download", job_id, "--out", str(out)]) == 2
@@ -428,18 +408,3 @@ def test_address_of_another_program_is_reported(capsys: pytest.CaptureFixture[st
                 assert main([*command, "--url", url + path]) == 1
                 assert f"does not answer like the service: {what}. Check the address." in capsys.readouterr().err
         server.shutdown()
-
-
-@pytest.mark.slow
-def test_service_that_restarts_is_waited_for(files: list[str], tmp_path: Path) -> None:
-    """A refused connection ends a command only if the service has not responded before."""
-    from api.client import Client
-
-    service = Service(tmp_path / "data", alone=True)
-    with service, Client(service.url) as client:
-        assert list(client.jobs()) == []
-        service.stop()
-        restarted = Service(tmp_path / "data", alone=True, SGSST_PORT=service.environment["SGSST_PORT"])
-        restarted.start()
-        assert list(client.jobs()) == []
-        restarted.stop()

@@ -28,7 +28,7 @@ from tests.service.files.s3 import environment_of, s3_server
 from tests.stores import new_store
 
 HOUR = 3600.0
-MISSING, DAMAGED, ORPHANED, ROLLED_BACK = 4, 8, 16, 32
+MISSING, DAMAGED, ORPHANED = 4, 8, 16
 
 
 @pytest.fixture(autouse=True)
@@ -139,27 +139,6 @@ def run(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[st
 
 def kinds(findings: dict[str, dict[str, str]]) -> dict[str, str]:
     return {name: finding["kind"] for name, finding in findings.items()}
-
-
-@pytest.mark.slow
-def test_fsck_finds_a_thousand_lost_and_damaged_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("SGSST_DATA", str(tmp_path / "data"))
-    files, order = Files(tmp_path), random.Random(5)
-    names = [files.input(b"input %d" % number * 9) for number in range(700)]
-    lease = files.job(names[0])
-    names += files.results(lease, {f"previews/step_{number}.jpg": b"%d" % number * 9 for number in range(700)})
-    order.shuffle(names)
-    lost, flipped = names[:500], names[500:1000]
-    for name in lost:
-        files.lose(name)
-    for name in flipped:
-        files.flip(name, order)
-    code, findings = run(capsys)
-    assert kinds(findings) == dict.fromkeys(lost, "missing") | dict.fromkeys(flipped, "damaged")
-    assert code == MISSING + DAMAGED
-    files.store.close()
 
 
 def test_mend_repairs_all_findings(

@@ -13,8 +13,7 @@ from annotated_types import Ge, Gt, Le
 from pydantic import ValidationError
 
 from api.cli.main import app, main
-from api.cli.options import flags, help_text
-from api.cli.options_table import reference
+from api.cli.options import flags, help_text, reference
 from service.inputs import JobParameters
 from sgsst_core.errors import SettingsError
 from sgsst_core.settings import Declared, Settings, checked, declared, make_settings, parse_seconds, parse_strength
@@ -131,7 +130,7 @@ def test_non_finite_numbers_are_rejected(value: str, capsys: pytest.CaptureFixtu
 
 def test_options_reference_is_up_to_date() -> None:
     page = (ROOT / "docs" / "options.md").read_text()
-    assert page == reference(), "run: python -m api.cli.options_table > docs/options.md"
+    assert page == reference(), "run: python -m api.cli.options > docs/options.md"
     for option in [*declared(JobParameters).values(), *declared(RunOptions).values()]:
         assert f"| `{flags(option)}" in page
         assert option.help in page

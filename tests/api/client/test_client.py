@@ -22,11 +22,8 @@ import stamina
 import torch
 
 from api.client import AsyncClient, Client, uploads
-from api.client.answers import ApiError, Event, Job, RequestError
-from api.client.inputs import camera_files, image_files
-from api.client.transport import TRIES
-from service.files.objects import Artifacts
-from service.settings import ServiceSettings
+from api.client.transport import TRIES, ApiError, Event, Job, RequestError
+from api.client.uploads import camera_files, image_files
 from service.store import Store
 from sgsst_core.files.atomic import temporary_path
 from tests.api.service import Service
@@ -45,7 +42,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(autouse=True)
 def no_waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Remove the waits between retries; the number of retries stays the same."""
-    monkeypatch.setattr("api.client.async_client.FIRST_WAIT", 0.0)
+    monkeypatch.setattr("api.client.client.FIRST_WAIT", 0.0)
     with stamina.set_testing(True, attempts=TRIES):
         yield
 
@@ -179,7 +176,8 @@ def test_job_from_upload_to_removal(
 
         assert client.cancel(submitted.id).status == "canceled"
         assert client.retry(submitted.id).status == "queued"
-        result = finish(store, service, submitted.id, bytes(range(256)) * 9000, tmp_path)
+        result = bytes(range(256)) * 9000
+        service.finish(submitted.id, {"stylized.ply": result})
         events: list[Event] = list(client.watch(submitted.id))
         statuses = [event.data["status"] for event in events if event.kind == "status"]
         assert statuses == ["queued", "canceled", "queued", "starting", "running", "succeeded"]
@@ -203,19 +201,6 @@ def test_job_from_upload_to_removal(
         assert (caught.value.status, caught.value.problem["code"]) == (404, "not-found")
 
 
-def finish(store: Store, service: Service, job_id: str, content: bytes, folder: Path) -> bytes:
-    """Finish a queued job in place of a dispatcher, with the given content as its result."""
-    while (lease := store.leases.take("test")) is not None and lease.job_id != job_id:
-        store.leases.stop(lease)
-    assert lease is not None
-    source = folder / "result"
-    source.write_bytes(content)
-    file = Artifacts(ServiceSettings(data=service.data).artifacts_url).put(job_id, lease.epoch, "stylized.ply", source)
-    store.leases.start(lease)
-    store.leases.succeed(lease, [file], {"steps": 1})
-    return content
-
-
 @both
 def test_numbers_that_are_not_finite_are_not_sent(connect: Any, files: dict[str, Path]) -> None:
     """The port of a closed socket refuses connections, which is another error."""
@@ -234,7 +219,7 @@ def test_numbers_that_are_not_finite_are_not_sent(connect: Any, files: dict[str,
 def test_jobs_are_listed_page_by_page(
     connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("api.client.async_client._PAGE", 2)
+    monkeypatch.setattr("api.client.client._PAGE", 2)
     with connect(service.url) as client:
         ids = [client.submit(files["scene"], files["style"], orbit=2, seed=number).id for number in range(5)]
         assert [job.id for job in client.jobs()][:5] == ids[::-1]
@@ -370,7 +355,8 @@ def test_download_resumes_after_lost_connection(
 ) -> None:
     with connect(service.url) as client:
         job_id = client.submit(files["scene"], files["style"], orbit=2).id
-    content = finish(store, service, job_id, hashlib.sha256(job_id.encode()).digest() * 100_000, tmp_path)
+    content = hashlib.sha256(job_id.encode()).digest() * 100_000
+    service.finish(job_id, {"stylized.ply": content})
     reported: list[tuple[int, int]] = []
     # A block is written once it is complete: the first connection leaves one, the second none, the third another one.
     with (
@@ -393,7 +379,8 @@ def test_download_through_compressing_proxies(
     """nginx makes ETags weak when it compresses; another proxy compresses although it is asked not to."""
     with connect(service.url) as client:
         job_id = client.submit(files["scene"], files["style"], orbit=2).id
-    content = finish(store, service, job_id, b"content" * 10_000, tmp_path)
+    content = b"content" * 10_000
+    service.finish(job_id, {"stylized.ply": content})
 
     class Compressing(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -426,7 +413,8 @@ def test_partial_file_is_resumed_or_discarded_and_no_other_touched(
 ) -> None:
     with connect(service.url) as client:
         job_id = client.submit(files["scene"], files["style"], orbit=2).id
-        content = finish(store, service, job_id, job_id.encode() * 1000, tmp_path)
+        content = job_id.encode() * 1000
+        service.finish(job_id, {"stylized.ply": content})
         tag = hashlib.sha256(content).hexdigest()
         for number, (left, stamp) in enumerate(
             [
@@ -454,7 +442,7 @@ def test_events_resume_after_lost_connection(
         for _ in range(5):
             client.cancel(job_id)
             client.retry(job_id)
-        finish(store, service, job_id, b"ply", tmp_path)
+        service.finish(job_id, {"stylized.ply": b"ply"})
         whole = list(client.watch(job_id))
     with Relay(int(service.environment["SGSST_PORT"]), [600, 650, 700]) as relay, connect(relay.url) as client:
         assert list(client.watch(job_id)) == whole

@@ -11,7 +11,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from api.http.routes import artifacts as routes
+from api.http import jobs as routes
 from service.files.objects import Artifacts
 from service.problems import LostFileError, NotFoundError
 from service.settings import ServiceSettings

@@ -16,7 +16,7 @@ import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
-from api.http.middleware import Deadlines
+from api.http.app import Deadlines
 from service import problems
 from service.deadlines import FileThreads, suspended
 from service.problems import StoreError
@@ -67,7 +67,7 @@ def hanging_folder(folder: Path) -> Iterator[Hanging]:
         yield {}, hang, heal
 
 
-@pytest.mark.parametrize("kind", [hanging_store, hanging_folder])
+@pytest.mark.parametrize("kind", [pytest.param(hanging_store, marks=pytest.mark.slow), hanging_folder])
 def test_hanging_files_delay_only_requests_that_need_them(
     tmp_path: Path, kind: Callable[..., AbstractContextManager[Hanging]]
 ) -> None:

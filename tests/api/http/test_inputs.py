@@ -15,9 +15,9 @@ import pytest
 from sqlalchemy import event
 
 from api.http.context import Caller
-from api.http.routes.submission import _referred_input
 from api.http.schemas import MOST_POINTS
 from api.http.sending import disposition
+from api.http.submission import _referred_input
 from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store

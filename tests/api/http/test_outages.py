@@ -18,7 +18,7 @@ import httpx2
 import pytest
 
 from api.http.app import create_app
-from api.http.limits import MOST_FAILURES
+from api.http.sessions import MOST_FAILURES
 from service.problems import SHARE_ID, SHARE_TOKEN
 from service.settings import ServiceSettings
 from service.store import Store, open_store
@@ -171,6 +171,7 @@ def test_every_operation_reports_unavailable_database(outage: Outage, files: dic
     assert "Traceback" not in outage.service.said()
 
 
+@pytest.mark.slow
 def test_standby_is_read_and_reported_as_unavailable(outage: Outage) -> None:
     with outage.client() as client, outage.kind("standby"):
         wait_for(lambda: client.get(f"/v1/jobs/{outage.job_id}").status_code == 200, "reads", outage.service.said)
@@ -182,6 +183,7 @@ def test_standby_is_read_and_reported_as_unavailable(outage: Outage) -> None:
     assert "Traceback" not in outage.service.said()
 
 
+@pytest.mark.slow
 def test_sign_ins_during_an_outage_do_not_count_as_failed(outage: Outage) -> None:
     with outage.service.client() as browser:
         with outage.kind("killed"):
@@ -197,6 +199,7 @@ def test_health_checks_answer_while_requests_wait(outage: Outage) -> None:
             check_health(outage.service, 503)
 
 
+@pytest.mark.slow
 def test_stream_resumes_when_database_returns(outage: Outage, files: dict[str, bytes]) -> None:
     with outage.client() as client, outage.client() as other:
         job_id = client.post("/v1/jobs", files=form(files)).json()["id"]
@@ -212,7 +215,8 @@ def test_stream_resumes_when_database_returns(outage: Outage, files: dict[str, b
             assert events[-1]["status"] == "canceled"
 
 
-@pytest.mark.parametrize("kind", ["killed", pytest.param("stopped", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["killed", "stopped"])
 def test_interrupted_upload_can_be_resumed(outage: Outage, kind: str) -> None:
     with outage.client() as client, contextlib.ExitStack() as away:
         place = create_upload(client).headers["location"]

@@ -15,7 +15,7 @@ from PIL import Image
 from starlette.requests import Request
 from starlette.types import Message
 
-from api.http.progress import answer_work
+from api.http.events import answer_work
 from api.http.schemas import PlanView
 from service import problems
 from tests.api.service import PATIENCE, Service, wait_for
@@ -223,7 +223,9 @@ def test_service_that_stops_ends_the_work() -> None:
         working: set[asyncio.Task[Any]] = set()
         asked = Request({"type": "http", "headers": [(b"accept", accept)]}, stay)
         asyncio.get_running_loop().call_later(0, lambda: [task.cancel() for task in working])
-        answer = await answer_work(asked, wait, "planning", "plan", working)
+        checked = asyncio.Event()
+        checked.set()
+        answer = await answer_work(asked, wait, "planning", "plan", working, checked)
         return [part async for part in answer.body_iterator]  # type: ignore[attr-defined]
 
     with raises_problem(problems.STOPPING):

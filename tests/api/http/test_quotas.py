@@ -14,7 +14,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from api.http.limits import Rates
+from api.http.context import Rates
 from service import problems
 from service.problems import ServiceError
 from service.settings import ServiceSettings

@@ -1,31 +1,35 @@
-"""Tests of the real API with Schemathesis: no request causes a 5xx or a response that the OpenAPI document lacks."""
+"""Tests of the OpenAPI document and of the real API against it.
+
+The document is complete and has valid examples of everything; with Schemathesis, no request causes a 5xx or a response
+that it lacks.
+"""
 
 from __future__ import annotations
 
-import base64
-import copy
-from collections import Counter
-from collections.abc import Sequence
+import ast
+from collections.abc import Iterator
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
-import httpx2
 import pytest
 import schemathesis
-from hypothesis import HealthCheck, Phase, settings
-from schemathesis import GenerationMode
+from hypothesis import HealthCheck, settings
+from jsonschema import Draft202012Validator, FormatChecker
+from openapi_spec_validator import validate
 from schemathesis.checks import CHECKS, load_all_checks
 from schemathesis.core.transport import Response
-from schemathesis.generation.stateful.state_machine import StepInput, StepOutput
 from schemathesis.specs.openapi.checks import missing_required_header, negative_data_rejection
 
 from api.http.app import create_app
-from service.files.objects import Artifacts
+from api.http.problems import MEDIA_TYPE
+from service import problems
+from service.problems import ProblemType
 from service.settings import ServiceSettings
 from service.store import Store
+from sgsst_core.files.formats import RESULT_FORMATS
 from tests.api.conftest import Services
 from tests.api.service import Service
-from tests.small_scenes import wall, write_files
 
 DOCUMENT: dict[str, Any] = create_app(ServiceSettings()).openapi()
 schemathesis.serializer.alias("application/offset+octet-stream", "application/octet-stream")
@@ -78,7 +82,7 @@ def key(store: Store) -> str:
 
 
 @schemathesis.openapi.from_dict(DOCUMENT).parametrize()
-@settings(max_examples=8, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+@settings(max_examples=4, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
 def test_every_operation_follows_schema(case: schemathesis.Case, service: Service, key: str) -> None:
     """Requests include the examples, limits of every parameter, unsupported methods and random input."""
     case.call_and_validate(
@@ -86,140 +90,131 @@ def test_every_operation_follows_schema(case: schemathesis.Case, service: Servic
     )
 
 
-# --- chains --------------------------------------------------------------------------------------------------------
-
-#: Settings with which each run generates the same chains of requests.
-BOUNDS = settings(
-    max_examples=40,
-    stateful_step_count=8,
-    derandomize=True,
-    deadline=None,
-    database=None,
-    phases=[Phase.generate],
-    suppress_health_check=list(HealthCheck),
-)
-#: Operations that chains only reach by links, because ids cannot be guessed.
-JOBS = ("get_job", "cancel_job", "delete_job", "watch_job")
-ENDS = ("cancel_job", "retry_job")
-ARTIFACTS = ("list_artifacts", "get_artifact")
-INPUTS = ("get_progress", "list_inputs", "get_input")
-UPLOADS = ("get_upload", "head_upload", "append_upload", "delete_upload")
-#: Parameters that are not only well-formed but valid, so that requests create resources that links refer to.
-RIGHT: dict[str, dict[str, Any]] = {
-    "dry_run": {"type": "boolean", "enum": [False]},
-    "Upload-Length": {"type": "integer", "minimum": 100, "maximum": 200},
-    "Upload-Metadata": {"type": "string", "const": "filename c2NlbmUucGx5"},
-    "Upload-Checksum": {"type": "string", "const": ""},
-}
+PROBLEMS = {name: value for name, value in vars(problems).items() if isinstance(value, ProblemType)}
+SCHEMAS: dict[str, Any] = DOCUMENT["components"]["schemas"]
+OPERATIONS: list[tuple[str, dict[str, Any]]] = [
+    (f"{method.upper()} {path}", operation)
+    for path, methods in DOCUMENT["paths"].items()
+    for method, operation in methods.items()
+]
 
 
-class Uploaded:
-    """Small scene whose files are uploaded once, with methods that finish its jobs in place of a dispatcher."""
-
-    def __init__(self, service: Service, store: Store, key: str, folder: Path) -> None:
-        self._store = store
-        self._artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
-        self._ply, cameras, style = write_files(folder, wall())
-        self._client = service.client(key)
-        self._ids = [_upload(self._client, path) for path in (self._ply, style, cameras)]
-
-    def document(self) -> dict[str, Any]:
-        """Return the OpenAPI document with these files' ids in all jobs: schemas cannot express which ids exist."""
-        changed = copy.deepcopy(DOCUMENT)
-        scene, style, cameras = self._ids
-        seed = {"type": "integer", "minimum": 0, "maximum": 9}
-        changed["components"]["schemas"]["JobFromUploads"]["properties"] = {
-            "scene": {"const": scene},
-            "style": {"const": style},
-            "cameras": {"const": [cameras]},
-            "parameters": {"type": "object", "additionalProperties": False, "properties": {"seed": seed}},
-        }
-        changed["components"]["schemas"]["JobFromUploads"]["required"] = ["scene", "style", "cameras"]
-        del changed["paths"]["/v1/jobs"]["post"]["requestBody"]["content"]["multipart/form-data"]
-        for operations in changed["paths"].values():
-            for operation in operations.values():
-                for parameter in operation.get("parameters", []):
-                    parameter["schema"] = RIGHT.get(parameter["name"], parameter["schema"])
-        return changed
-
-    def finish_jobs(self) -> None:
-        """Finish all queued jobs with results, in place of a dispatcher (`test_service` runs a real one)."""
-        while (lease := self._store.leases.take("test")) is not None:
-            result = self._artifacts.put(lease.job_id, lease.epoch, "stylized.ply", self._ply)
-            self._store.leases.start(lease)
-            self._store.leases.publish(lease, [result])
-            self._store.leases.succeed(lease, [result], {"steps": 1})
-
-    def delete_jobs(self) -> None:
-        """Delete all jobs, so that each sequence of requests starts without jobs."""
-        self.finish_jobs()
-        for job in self._client.get("/v1/jobs", params={"limit": 200}).json()["jobs"]:
-            assert self._client.delete(f"/v1/jobs/{job['id']}").status_code == 204
+def resolved(schema: dict[str, Any]) -> dict[str, Any]:
+    target: dict[str, Any] = SCHEMAS[schema["$ref"].rsplit("/", 1)[1]] if "$ref" in schema else schema
+    return target
 
 
-@pytest.fixture(scope="module")
-def uploaded(service: Service, store: Store, key: str, tmp_path_factory: pytest.TempPathFactory) -> Uploaded:
-    return Uploaded(service, store, key, tmp_path_factory.mktemp("inputs"))
+def examples_of(described: dict[str, Any]) -> list[object]:
+    """Return the examples of a media type, a parameter or a header, or those of its schema."""
+    own = [entry["value"] for entry in described.get("examples", {}).values()]
+    if "example" in described:
+        own.append(described["example"])
+    return own or list(resolved(described["schema"]).get("examples", []))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("path", "behind"),
-    [
-        ("/v1/jobs(?!.*(artifacts|inputs|progress))", JOBS),
-        # Separate chains, because those above rarely cancel and then retry a job, or list and then get its files.
-        ("/v1/jobs($|/{job_id}/(cancel|retry))", ENDS),
-        ("/v1/jobs($|/{job_id}/artifacts)", ARTIFACTS),
-        ("/v1/jobs($|/{job_id}/(inputs|progress))", INPUTS),
-        ("/v1/uploads", UPLOADS),
-    ],
-)
-def test_request_chains_follow_schema(
-    service: Service, key: str, uploaded: Uploaded, path: str, behind: tuple[str, ...]
-) -> None:
-    """Stateful test: ids from responses are used in the requests that the document links to them."""
-    followed: Counter[str] = Counter()
-    loaded = schemathesis.openapi.from_dict(uploaded.document()).include(path_regex=f"^{path}")
-    loaded.config.update(base_url=service.url)
-    loaded.config.generation.update(modes=[GenerationMode.POSITIVE])  # invalid requests are tested above
-
-    class Chains(loaded.as_state_machine()):  # type: ignore[misc]
-        def setup(self) -> None:
-            uploaded.delete_jobs()
-
-        def get_call_kwargs(self, case: schemathesis.Case) -> dict[str, Any]:
-            return {"headers": {"Authorization": f"Bearer {key}"}, "timeout": 60}
-
-        def before_call(self, case: schemathesis.Case) -> None:
-            if name_of(case) in ("list_artifacts", "watch_job"):  # the stream of a waiting job would not end
-                uploaded.finish_jobs()
-
-        def validate_response(self, response: Response, case: schemathesis.Case, **ignored: object) -> None:
-            case.validate_response(response, checks=checks(), recorder=self.recorder)
-
-        def step(self, input: StepInput) -> StepOutput:
-            output = super().step(input)
-            if input.transition is not None and input.is_applied and 200 <= output.response.status_code < 300:
-                followed[name_of(input.case)] += 1
-            return output
-
-    missed: Sequence[str] = behind
-    for chains in (40, 80, 160):  # chains depend on answers too, so try longer runs if some operation was not reached
-        if missed:
-            Chains.run(settings=settings(BOUNDS, max_examples=chains))
-            missed = [name for name in behind if not followed[name]]
-    assert not missed, f"no chain has succeeded with {missed}; others: {dict(followed)}"
+def check(where: str, described: dict[str, Any]) -> None:
+    """Fail if there is no example, or if one violates its schema."""
+    examples = examples_of(described)
+    assert examples, f"{where}: no example"
+    schema = {**described["schema"], "components": DOCUMENT["components"]}
+    validator = Draft202012Validator(schema, format_checker=FormatChecker())
+    for example in examples:
+        wrong = [f"{error.json_path}: {error.message}" for error in validator.iter_errors(example)]
+        assert not wrong, f"{where}: its example is not as its schema says: {wrong}"
 
 
-def name_of(case: schemathesis.Case) -> str:
-    return str(case.operation.definition.raw["operationId"])
+def bodies(operation: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield every media type of the request and of the responses."""
+    for kind, body in operation.get("requestBody", {}).get("content", {}).items():
+        yield f"request {kind}", body
+    for status, answer in operation["responses"].items():
+        for kind, body in answer.get("content", {}).items():
+            yield f"{status} {kind}", body
 
 
-def _upload(client: httpx2.Client, path: Path) -> str:
-    name = base64.b64encode(path.name.encode()).decode()
-    tus = {"Tus-Resumable": "1.0.0"}
-    headers = {**tus, "Upload-Length": str(path.stat().st_size), "Upload-Metadata": f"filename {name}"}
-    upload = client.post("/v1/uploads", headers=headers).json()
-    headers = {**tus, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
-    client.patch(f"/v1/uploads/{upload['id']}", content=path.read_bytes(), headers=headers)
-    return str(upload["id"])
+@pytest.mark.parametrize(("label", "operation"), OPERATIONS, ids=[label for label, _ in OPERATIONS])
+def test_summary_says_what_the_operation_does(label: str, operation: dict[str, Any]) -> None:
+    """Summaries are sentences, not names of functions."""
+    summary = operation["summary"]
+    assert operation["description"].startswith(summary)
+    assert summary.lower() != operation["operationId"].replace("_", " ")
+    assert len(summary.split()) > 2
+    assert len(summary) < 100
+
+
+def test_document_is_valid_openapi() -> None:
+    validate(DOCUMENT)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_every_schema_has_an_example(name: str) -> None:
+    check(name, {"schema": {"$ref": f"#/components/schemas/{name}"}})
+
+
+@pytest.mark.parametrize(("label", "operation"), OPERATIONS, ids=[label for label, _ in OPERATIONS])
+def test_every_operation_has_examples(label: str, operation: dict[str, Any]) -> None:
+    for where, body in bodies(operation):
+        check(f"{label}: {where}", body)
+    for parameter in operation.get("parameters", []):
+        assert parameter.get("description"), f"{label}: {parameter['name']}: no description"
+        check(f"{label}: parameter {parameter['name']}", parameter)
+    for status, answer in operation["responses"].items():
+        assert answer["description"], f"{label}: {status}: no description"
+        for name, header in answer.get("headers", {}).items():
+            check(f"{label}: {status}: header {name}", header)
+
+
+@pytest.mark.parametrize(("label", "operation"), OPERATIONS, ids=[label for label, _ in OPERATIONS])
+def test_every_refusal_has_its_codes(label: str, operation: dict[str, Any]) -> None:
+    """Each error status lists its codes, and each code has an example of that status."""
+    refusals = {int(status): answer for status, answer in operation["responses"].items() if int(status) >= 400}
+    assert {400, 431, 500} <= refusals.keys()
+    assert {401, 403} <= refusals.keys() or "security" not in operation
+    for status, answer in refusals.items():
+        if MEDIA_TYPE not in answer.get("content", {}):
+            assert label.startswith("HEAD") or (label, status) == ("GET /readyz", 503)
+            continue
+        body = answer["content"][MEDIA_TYPE]
+        assert body["schema"] == {"$ref": f"#/components/schemas/Problem{status}"}
+        properties = resolved(body["schema"])["properties"]
+        shown = {code: example["value"] for code, example in body["examples"].items()}
+        assert shown
+        assert properties["status"]["const"] == status
+        assert set(properties["code"]["enum"]) >= shown.keys()
+        assert all(value["code"] == code and value["status"] == status for code, value in shown.items())
+
+
+def test_document_lists_every_error_code() -> None:
+    """Errors of the service that reach a client are documented by at least one operation."""
+    documented = {
+        code
+        for _, operation in OPERATIONS
+        for answer in operation["responses"].values()
+        if MEDIA_TYPE in answer.get("content", {})
+        for code in answer["content"][MEDIA_TYPE]["examples"]
+    }
+    hidden = (problems.LEASE_LOST, problems.METHOD_NOT_ALLOWED)  # of dispatchers, and of no operation
+    assert {problem.code for problem in PROBLEMS.values() if problem not in hidden} <= documented
+
+
+def test_calls_of_problems_name_all_values_of_their_messages() -> None:
+    """A missing value would show only when the error occurs."""
+    called = set()
+    for file in (file for package in ("api", "service") for file in Path(package).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            name = ast.unparse(node.func).partition("problems.")[2] if isinstance(node, ast.Call) else ""
+            if not isinstance(node, ast.Call) or name not in PROBLEMS or any(key.arg is None for key in node.keywords):
+                continue
+            given, problem = {key.arg for key in node.keywords}, PROBLEMS[name]
+            fields = {field for text in problem.headers.values() for _, field, _, _ in Formatter().parse(text)}
+            if not node.args:
+                fields |= {field for _, field, _, _ in Formatter().parse(problem.message)}
+            assert fields - {None} <= given, f"{file}:{node.lineno}"
+            assert node.args or problem.message, f"{file}:{node.lineno}: no message"
+            called.add(name)
+    assert len(called) > 60
+
+
+def test_media_type_of_every_result_format_is_documented() -> None:
+    content = DOCUMENT["paths"]["/v1/jobs/{job_id}/artifacts/{name}"]["get"]["responses"]["200"]["content"]
+    assert {each.media_type for each in RESULT_FORMATS} <= content.keys()

@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from api.http.limits import MOST_FAILURES, WITHIN_SECONDS, SignIns
+from api.http.sessions import MOST_FAILURES, WITHIN_SECONDS, SignIns
 from service import problems
 from service.scheduling.capacity import Machine
 from service.settings import ServiceSettings

@@ -14,8 +14,6 @@ import httpx2
 import pytest
 from sqlalchemy import update
 
-from api.client import Client
-from service.files.objects import Artifacts
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import MOST_SHARES
@@ -53,28 +51,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"scene": ply, "cameras": cameras, "style": style}
 
 
-def finished(client: httpx2.Client, service: Service, store: Store, files: dict[str, Path], folder: Path) -> str:
+def finished(client: httpx2.Client, service: Service, files: dict[str, Path]) -> str:
     """Return a finished job, with results in place of those of a dispatcher."""
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     parameters = {"background": "white", "name": "my wall", "seed": 7}
     answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
     job_id = str(answer.json()["id"])
-    artifacts = Artifacts(ServiceSettings(data=service.data).artifacts_url)
-    while (lease := store.leases.take("test")) is not None:
-        results = []
-        contents = {
-            "stylized.ply": PLY,
-            "colors.f16": COLORS,
-            "report.json": b"{}",
-            "plan.json": b'{"decisions": []}',
-            "previews/thumbnail.jpg": THUMBNAIL,
-        }
-        for name, content in contents.items():
-            path = folder / Path(name).name
-            path.write_bytes(content)
-            results.append(artifacts.put(lease.job_id, lease.epoch, name, path))
-        store.leases.start(lease)
-        store.leases.succeed(lease, results, {"steps": 1})
+    contents = {"stylized.ply": PLY, "colors.f16": COLORS, "report.json": b"{}", "plan.json": b'{"decisions": []}'}
+    service.finish(job_id, {**contents, "previews/thumbnail.jpg": THUMBNAIL})
     return job_id
 
 
@@ -94,7 +78,7 @@ def assert_missing(answer: httpx2.Response, code: str = "not-found") -> None:
 def test_link_shows_the_result_and_nothing_else(
     service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, store, files, tmp_path)
+    job_id = finished(me, service, files)
     view, token = share(me, job_id)
     shown = visitor.get(f"/v1/shared/{token}")
     assert shown.headers["referrer-policy"] == "no-referrer"
@@ -131,7 +115,7 @@ def test_link_shows_the_result_and_nothing_else(
 def test_link_with_poster_names_its_image(
     service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, store, files, tmp_path)
+    job_id = finished(me, service, files)
     assert me.patch(f"/v1/jobs/{job_id}", json={"name": 'my "<wall>"'}).status_code == 200
     view = me.post(f"/v1/jobs/{job_id}/shares", json={"poster": True}).json()
     path, token = view["url"], view["url"].rpartition("/")[2]
@@ -160,7 +144,7 @@ def test_link_with_poster_names_its_image(
 def test_only_permitted_sites_may_frame_a_link(
     service: Service, services: Services, store: Store, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, store, files, tmp_path)
+    job_id = finished(me, service, files)
     hidden, posted = (me.post(f"/v1/jobs/{job_id}/shares", json={"poster": poster}).json() for poster in (False, True))
     assert hidden["embed_url"].startswith("/shared?embed=1#shr_")
     for view in (hidden, posted):
@@ -200,14 +184,14 @@ def test_token_opens_no_other_file(
     tmp_path: Path,
     name: str,
 ) -> None:
-    _, token = share(me, finished(me, service, store, files, tmp_path))
+    _, token = share(me, finished(me, service, files))
     assert visitor.get(f"/v1/shared/{token}/{name}").status_code in (404, 422)
 
 
 def test_token_is_no_key_and_of_one_job(
     service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id, other = (finished(me, service, store, files, tmp_path) for _ in range(2))
+    job_id, other = (finished(me, service, files) for _ in range(2))
     view, token = share(me, job_id)
     for headers in ({"Authorization": f"Bearer {token}"}, {"Cookie": f"sgsst_session={token}"}):
         for method, path in (
@@ -232,7 +216,7 @@ def test_token_is_no_key_and_of_one_job(
 def test_wrong_tokens_open_nothing(
     service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    view, token = share(me, finished(me, service, store, files, tmp_path))
+    view, token = share(me, finished(me, service, files))
     secret = token.partition(".")[2]
     changed = ("A" if secret[0] != "A" else "B") + secret[1:]
     for wrong in (f"{view['id']}.{changed}", view["id"], f"{view['id']}.", f"{token}x", f"x{token}", secret, "x" * 100):
@@ -245,7 +229,7 @@ def test_wrong_tokens_open_nothing(
 def test_link_ends_when_it_expires_or_is_revoked(
     service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, store, files, tmp_path)
+    job_id = finished(me, service, files)
     (first, one), (second, two), (_, three) = (share(me, job_id) for _ in range(3))
     with store.database.writing() as session:
         session.get_one(ShareRow, first["id"]).expires_at = store.database.clock() - 1
@@ -266,7 +250,7 @@ def test_link_ends_with_the_key_of_its_job(
 ) -> None:
     key, text = store.keys.create("leaving")
     with service.client(text) as client:
-        _, token = share(client, finished(client, service, store, files, tmp_path))
+        _, token = share(client, finished(client, service, files))
     assert visitor.get(f"/v1/shared/{token}").status_code == 200
     store.keys.revoke(key.id)
     assert_missing(visitor.get(f"/v1/shared/{token}"))
@@ -275,13 +259,13 @@ def test_link_ends_with_the_key_of_its_job(
 def test_only_results_of_ones_own_can_be_shared(
     service: Service, store: Store, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, store, files, tmp_path)
+    job_id = finished(me, service, files)
     with service.client(store.keys.create("other")[1]) as other:
         for method in ("GET", "POST"):
             assert_missing(other.request(method, f"/v1/jobs/{job_id}/shares", json={}))
         view, _ = share(me, job_id)
         assert_missing(other.delete(f"/v1/jobs/{job_id}/shares/{view['id']}"))
-    own = finished(me, service, store, files, tmp_path)
+    own = finished(me, service, files)
     assert_missing(me.delete(f"/v1/jobs/{own}/shares/{view['id']}"))
     body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
     waiting = me.post("/v1/jobs", files=body).json()["id"]
@@ -307,7 +291,7 @@ def test_only_results_of_ones_own_can_be_shared(
 def test_expired_links_do_not_count_toward_the_limit(
     store: Store, service: Service, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, store, files, tmp_path)
+    job_id = finished(me, service, files)
     for _ in range(MOST_SHARES):
         share(me, job_id)
     now = store.database.clock()
@@ -320,7 +304,7 @@ def test_expired_links_do_not_count_toward_the_limit(
 def test_stored_digest_is_no_token_and_logs_contain_none(
     service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, store, files, tmp_path)
+    job_id = finished(me, service, files)
     view, token = share(me, job_id)
     with store.database.reading() as session:
         row = session.get_one(ShareRow, view["id"])
@@ -342,7 +326,7 @@ def test_requests_of_a_link_are_limited(files: dict[str, Path], tmp_path: Path) 
     with Service(tmp_path / "data", alone=True, **settings) as service, service.client() as visitor:
         store = open_store(ServiceSettings(data=service.data))
         with service.client(store.keys.create("me")[1]) as me:
-            _, token = share(me, finished(me, service, store, files, tmp_path))
+            _, token = share(me, finished(me, service, files))
         store.close()
         for path in (token, "shr_1.x"):
             answers = [visitor.get(f"/v1/shared/{path}") for _ in range(20)]
@@ -351,23 +335,10 @@ def test_requests_of_a_link_are_limited(files: dict[str, Path], tmp_path: Path) 
             assert refused.json()["code"] == "rate-limited"
 
 
-def test_client_shares_results(
-    service: Service, store: Store, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
-) -> None:
-    key = store.keys.create("client")[1]
-    with service.client(key) as raw, Client(service.url, key) as client:
-        job_id = finished(raw, service, store, files, tmp_path)
-        created = client.share(job_id, days=2)
-        assert created["url"].startswith(f"{service.url}/shared#shr_")
-        assert [each["id"] for each in client.shares(job_id)] == [created["id"]]
-        client.revoke_share(job_id, created["id"])
-        assert client.shares(job_id) == []
-
-
 def test_link_whose_files_hang_occupies_no_thread_of_others(
     service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, store, files, tmp_path)
+    job_id = finished(me, service, files)
     _, token = share(me, job_id)
     row = store.jobs.artifact(job_id, "plan.json")
     assert row is not None

@@ -11,7 +11,7 @@ import httpx2
 import pytest
 
 from api.client import Client
-from api.client.answers import RequestError
+from api.client.transport import RequestError
 from tests.api.service import Service, wait_for
 from tests.small_scenes import wall, write_files
 

@@ -6,12 +6,7 @@ import asyncio
 import importlib
 import inspect
 import json
-import os
-import shlex
-import shutil
-import subprocess
 import sys
-import threading
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,13 +23,10 @@ from api.integrations.build import build
 from sgsst_core.files.scene_file import read_scene
 from tests.api.integrations import comfy_stand_in
 from tests.api.service import ROOT, Service, wait_for
-from tests.ports import free_port
 from tests.small_scenes import wall
 
 pytestmark = pytest.mark.slow
 WORKFLOW = ROOT / "api" / "integrations" / "comfyui" / "example_workflows" / "stylize_splat.json"
-#: Command that starts ComfyUI 0.22 or later, such as "venv/bin/python ComfyUI/main.py".
-COMFYUI = os.environ.get("SGSST_COMFYUI")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +38,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
     (folder / "sgsst").rename(folder / "sgsst_comfyui")
     stand_ins = comfy_stand_in.modules()
     sys.path.insert(0, str(folder))
-    yield importlib.import_module("sgsst_comfyui.nodes")
+    yield importlib.import_module("sgsst_comfyui")
     sys.path.remove(str(folder))
     for name in [*stand_ins, *(name for name in sys.modules if name.startswith("sgsst_comfyui"))]:
         del sys.modules[name]
@@ -129,58 +121,3 @@ def test_what_cannot_be_done_is_said(nodes: ModuleType, image: torch.Tensor) -> 
         nodes.Blend.execute(one, comfy_stand_in.splat_of(wall(sh_degree=1)), 0.5)
     with pytest.raises(RuntimeError, match="sgsst serve"):
         nodes.Stylize.execute(one, image, **settings(), service="http://127.0.0.1:9")
-
-
-def prompt(workflow: dict[str, Any]) -> dict[str, Any]:
-    """Return a saved workflow in the form that ComfyUI runs."""
-    sources = {link[0]: [str(link[1]), link[2]] for link in workflow["links"]}
-    nodes = {}
-    for node in workflow["nodes"]:
-        values = iter(node.get("widgets_values", ()))
-        given: dict[str, Any] = {}
-        for each in node["inputs"]:
-            value = next(values, None) if "widget" in each else None
-            given[each["name"]] = sources[each["link"]] if each["link"] is not None else value
-        nodes[str(node["id"])] = {
-            "class_type": node["type"],
-            "inputs": {name: value for name, value in given.items() if value is not None},
-        }
-    return nodes
-
-
-@pytest.mark.skipif(COMFYUI is None, reason="There is no ComfyUI: name the command that starts one in SGSST_COMFYUI")
-def test_workflow_in_comfyui(service: Service, files: tuple[Path, Path, Path], tmp_path: Path) -> None:
-    for name in ("custom_nodes", "input", "output", "models", "user", "temp"):
-        (tmp_path / name).mkdir()
-    with zipfile.ZipFile(build("comfyui", tmp_path)) as archive:
-        archive.extractall(tmp_path / "custom_nodes")
-    shutil.copy(files[0], tmp_path / "input" / "scene.ply")
-    shutil.copy(files[2], tmp_path / "input" / "style.png")
-    nodes = prompt(json.loads(WORKFLOW.read_text()))
-    by_type = {node["class_type"]: node["inputs"] for node in nodes.values()}
-    by_type["Load3DAdvanced"]["viewport_state"] = {"camera_info": {}}  # the page sets it
-    by_type["SgsstStylize"] |= settings()
-    port = free_port()
-    url = f"http://127.0.0.1:{port}"
-    command = [*shlex.split(COMFYUI or ""), "--cpu", "--disable-api-nodes", "--port", str(port)]
-    command += ["--base-directory", str(tmp_path), "--database-url", "sqlite:///:memory:"]
-    environment = {**os.environ, "SGSST_URL": service.url}
-    with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as comfy:
-        said: list[str] = []
-        assert comfy.stdout
-        threading.Thread(target=said.extend, args=(comfy.stdout,), daemon=True).start()
-        try:
-            wait_for(lambda: any("To see the GUI" in line for line in said) or comfy.poll(), "ComfyUI to start")
-            queued = httpx2.post(f"{url}/prompt", json={"prompt": nodes})
-            assert queued.status_code == 200, queued.text
-            number = queued.json()["prompt_id"]
-            finished = wait_for(lambda: httpx2.get(f"{url}/history/{number}").json(), "the workflow to end")[number]
-            assert finished["status"]["status_str"] == "success", finished["status"]
-        finally:
-            comfy.terminate()
-    (result,) = (tmp_path / "output").rglob("*.ply")
-    original, blend = (read_scene(path).scene for path in (files[0], result))
-    assert torch.allclose(original.means, blend.means)
-    assert not torch.allclose(original.sh_dc, blend.sh_dc, atol=0.1)

@@ -102,7 +102,7 @@ def test_panel_paints_compares_and_undoes(
 def test_colors_appear_while_they_are_being_painted(
     plugin: ModuleType, studio: Studio, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    panel = importlib.import_module("sgsst.panel")
+    panel = importlib.import_module("sgsst")
     colors = np.linspace(-1, 1, 3 * studio.splat.num_points).astype(np.float16)
     started = threading.Event()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import httpx2
 import pytest
 from PIL import Image
 
-from tests.api.page.actions import REFUSED, STEPS, Visit, choose, drop, expand, set_options, write_selection
+from tests.api.page.actions import REFUSED, Visit, choose, drop, expand, set_options, write_selection
 from tests.api.page.browser import FLAGS, Watched, chromium
 from tests.api.service import Service, wait_for
 
@@ -245,31 +244,6 @@ def test_estimate_warns_and_can_be_stopped(visit: Visit, files: dict[str, Path])
     cost = page.get_by_role("region", name="Estimate")
     cost.get_by_role("alert").get_by_text("region empty: ignored, because it has no Gaussians").wait_for()
     cost.get_by_text("for the whole job").wait_for()
-    watched.check("net::ERR")
-
-
-@pytest.mark.parametrize("estimated", [False, True], ids=["estimate", "times of other presets"])
-def test_start_ends_estimates(visit: Visit, service: Service, files: dict[str, Path], *, estimated: bool) -> None:
-    watched = visit()
-    page = watched.page
-    choose(watched, files)
-    set_options(watched, **STEPS)
-    held: list[Any] = []
-
-    def hold(route: Any) -> None:
-        held.append(route)
-        if len(held) == 1 and estimated:
-            route.continue_()
-
-    page.route("**/v1/jobs?*", hold)
-    page.get_by_role("button", name="Estimate time").click()
-    wait_for(lambda: page.evaluate("1") and len(held) > estimated, "the request that is held")
-    with page.expect_event("requestfailed", lambda request: request.url.endswith("dry_run=true")):
-        page.get_by_role("button", name="Start", exact=True).click()
-    wait_for(lambda: page.evaluate("1") and held[-1].request.url.endswith("sure_up=true"), "the job's request")
-    held[-1].continue_()
-    page.unroute_all(behavior="ignoreErrors")
-    page.wait_for_url(re.compile("#/jobs/"))
     watched.check("net::ERR")
 
 

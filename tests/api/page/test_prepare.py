@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.scene_file import read_scene
 from tests.api.page.actions import REFUSED, STEPS, Visit, choose, done, set_options, started
 from tests.api.page.browser import Watched
 from tests.api.service import Service
@@ -138,35 +138,6 @@ def test_scene_is_turned_and_cropped(visit: Visit, service: Service, files: dict
     page.get_by_role("button", name="Remove the crop").click()
     assert crop.get_attribute("aria-pressed") == "false"
     assert page.get_by_role("group", name="Region").count() == 0
-    watched.check()
-
-
-def test_four_turns_or_tips_lead_back(visit: Visit, tmp_path: Path) -> None:
-    block = box((-1, -0.4, -0.6), (1, 0.4, 0.6), 900)
-    write_scene(tmp_path / "scene.sog", replace(scene_of(block, 0.08), sh_dc=2 * block))
-    watched = visit(width=1200, height=800)
-    page = watched.page
-    choose(watched, {"scene": tmp_path / "scene.sog"})
-    set_options(watched)
-    up = page.locator("[data-name=up] select")
-    first = []
-    for name in ("Turn the scene by 90°", "Tip the scene by 90°"):
-        up.select_option("-y")  # a SOG is first seen from between two axes
-        ups, images = [], []
-        for _ in range(5):
-            page.get_by_role("button", name=name).click()
-            ups.append(up.input_value())
-            images.append(watched.pixels())
-        assert len(set(ups)) == 4
-        assert ups[4] == ups[0]
-        assert np.abs(images[4] - images[0]).max() <= 1
-        assert np.abs(images[1] - images[0]).mean() > 5
-        first.append(images[0])
-    assert np.abs(first[1] - first[0]).mean() > 5
-    up.select_option("x")
-    chosen = watched.pixels()
-    up.select_option("auto")
-    assert np.abs(watched.pixels() - chosen).mean() > 5, "the choice of the form turns the view too"
     watched.check()
 
 

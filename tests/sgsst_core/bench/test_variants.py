@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from api.cli.bench import error_time_table, point_line
+from api.cli.scene_tools import error_time_table, point_line
 from sgsst_core.bench.variants import (
     TRANSFER,
     UNSTYLIZED,

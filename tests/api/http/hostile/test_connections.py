@@ -14,8 +14,8 @@ from urllib.parse import quote
 import httpx2
 import pytest
 
-from api.http.connection import MAX_HEAD_BYTES, MAX_HEADERS
 from api.http.context import SESSION_COOKIE
+from api.http.server import MAX_HEAD_BYTES, MAX_HEADERS
 from service.settings import ServiceSettings
 from tests.api.http.hostile.conftest import LARGE, api_of
 from tests.api.http.sending import (

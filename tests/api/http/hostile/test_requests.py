@@ -305,6 +305,7 @@ def test_malformed_upload_creation_is_rejected(client: httpx2.Client) -> None:
     )
 
 
+@pytest.mark.slow
 def test_lists_of_many_photos_take_little_memory(client: httpx2.Client, service: Service, store: Store) -> None:
     """Six lists at once of jobs with 2,000 photos each, and lists that are not read; pages have every name once."""
     sha256 = store.jobs.inputs(store.jobs.page(None, limit=1)[0].row.id)[0]["sha256"]

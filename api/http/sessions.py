@@ -3,17 +3,63 @@
 from __future__ import annotations
 
 import asyncio
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request, Response
 
-from api.http.addresses import subpath
 from api.http.context import SESSION_COOKIE, Context, ContextDep, check_origin
-from api.http.documentation import headers, raises
-from api.http.multipart import json_body
-from api.http.schemas import SessionView, SignIn
+from api.http.problems import headers, raises
+from api.http.receiving import json_body
+from api.http.schemas import SessionView, SignIn, subpath
 from service import problems
 from service.problems import ServiceError
+
+#: Maximum number of failed attempts from one address, and the seconds within which they count.
+MOST_FAILURES, WITHIN_SECONDS = 10, 60.0
+#: Maximum number of remembered addresses. Beyond it, the address with the oldest last failure is forgotten.
+_MOST_ADDRESSES = 10_000
+
+
+class SignIns:
+    """Counter of failed sign-ins by address, in the memory of this process.
+
+    Failures are not stored in the database. Keys of 256 bits cannot be guessed anyway, and attackers could fill the
+    database with rows of failed attempts.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
+
+    def attempt(self, address: str) -> None:
+        """Count an attempt as failed until its outcome is known, so that parallel attempts cannot pass the limit.
+
+        Raises:
+            TOO_MANY_TRIES: If the address has failed too often recently.
+        """
+        failures = self._failures.setdefault(address, deque(maxlen=MOST_FAILURES))
+        if len(failures) == MOST_FAILURES:
+            left = failures[0] + WITHIN_SECONDS - self._clock()
+            if left > 0:
+                raise problems.TOO_MANY_TRIES(retry_after=int(left) + 1)
+        failures.append(self._clock())
+        self._failures.move_to_end(address)
+        if len(self._failures) > _MOST_ADDRESSES:
+            self._failures.popitem(last=False)
+
+    def withdraw(self, address: str) -> None:
+        """Forget the newest attempt of an address, whose key could not be looked up."""
+        failures = self._failures.get(address)
+        if failures:
+            failures.pop()
+
+    def succeeded(self, address: str) -> None:
+        """Forget the failures of an address."""
+        self._failures.pop(address, None)
+
 
 router = APIRouter(prefix="/v1/session", tags=["session"])
 
@@ -53,7 +99,7 @@ async def sign_in(
     context.sign_ins.succeeded(address)
     await _end(request, context)
     text = await asyncio.to_thread(context.store.sessions.create, key.id)
-    return _answer(request, text, int(context.store.sessions.seconds))
+    return _cookie_answer(request, text, int(context.store.sessions.seconds))
 
 
 @router.get("", response_model=SessionView)
@@ -78,7 +124,7 @@ async def sign_out(request: Request, context: ContextDep) -> Response:
     """End the session and delete its cookie. Without a session, nothing happens."""
     check_origin(request, required=SESSION_COOKIE in request.cookies)
     await _end(request, context)
-    return _answer(request, "", 0)
+    return _cookie_answer(request, "", 0)
 
 
 async def _end(request: Request, context: Context) -> None:
@@ -88,7 +134,7 @@ async def _end(request: Request, context: Context) -> None:
         await asyncio.to_thread(context.store.sessions.end, cookie)
 
 
-def _answer(request: Request, text: str, seconds: int) -> Response:
+def _cookie_answer(request: Request, text: str, seconds: int) -> Response:
     """Return a response with status 204 that sets the session cookie.
 
     The scheme comes from `Origin`: behind a proxy that terminates TLS, the request itself arrives over plain HTTP.

@@ -14,17 +14,25 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from api.http.addresses import address, subpath
 from api.http.context import Caller, CallerDep, Context, ContextDep, is_id
-from api.http.documentation import headers, links
-from api.http.fetching import file_name, is_url
-from api.http.multipart import MAX_TEXT, Received, check_size, media_type, most_files, parse_json, read_json, receive
-from api.http.progress import DRY_RUN, answer_work
-from api.http.receipts import Receipt
-from api.http.routes.inputs import parse_input
-from api.http.routes.jobs import FOLLOWING_OPERATIONS, find
-from api.http.routes.uploads import IdempotencyHeader, uploaded_name
-from api.http.schemas import JobView, PlanView, job_view
+from api.http.events import DRY_RUN, answer_work
+from api.http.jobs import FOLLOWING_OPERATIONS, find, parse_input
+from api.http.problems import headers, links
+from api.http.receiving import (
+    MAX_TEXT,
+    Receipt,
+    Received,
+    check_size,
+    file_name,
+    is_url,
+    media_type,
+    most_files,
+    parse_json,
+    read_json,
+    receive,
+)
+from api.http.schemas import JobView, PlanView, address, job_view, subpath
+from api.http.uploads import IdempotencyHeader, uploaded_name
 from service import problems
 from service.deadlines import suspended
 from service.inputs import MOST_STYLES, JobParameters, check_roles, default_job_name, staged_name

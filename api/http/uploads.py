@@ -14,11 +14,10 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Request, Response
 
-from api.http.addresses import address
 from api.http.context import CallerDep, Context, ContextDep, Digits, is_id
-from api.http.documentation import headers, links, raises
-from api.http.multipart import body_blocks, check_media_type, media_type
-from api.http.schemas import UploadView, upload_view
+from api.http.problems import headers, links, raises
+from api.http.receiving import body_blocks, check_media_type, media_type
+from api.http.schemas import UploadView, address, upload_view
 from service import problems
 from service.inputs import staged_name
 from service.problems import UPLOAD_ID, ServiceError, StoreError

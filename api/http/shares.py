@@ -12,14 +12,11 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.responses import StreamingResponse
 
-from api.http.addresses import address
 from api.http.context import CallerDep, Context, ContextDep, check_site, is_id
-from api.http.documentation import headers, links, raises
-from api.http.multipart import json_body
-from api.http.routes.artifacts import artifact_file
-from api.http.routes.inputs import INPUT_POLICY, find_input, input_file
-from api.http.routes.jobs import JobId, find
-from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, share_view
+from api.http.jobs import INPUT_POLICY, JobId, artifact_file, find, find_input, input_file
+from api.http.problems import headers, links, raises
+from api.http.receiving import json_body
+from api.http.schemas import NewShare, ShareCreated, SharedView, ShareList, address, share_view
 from api.http.sending import ConditionsDep, SentFile, file_answers, send_file
 from api.http.static import PAGE_HEADERS, shared_page, shared_policy
 from service import problems

@@ -1,4 +1,7 @@
-"""Job events for any number of watchers; one task polls the database for all of them."""
+"""Server-sent events of jobs, and responses to requests that take long: progress events, then the result.
+
+One task polls the database for the events of all watched jobs.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,19 @@ import asyncio
 import json
 import logging
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Coroutine, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
+from fastapi import Request, Response
+from fastapi.responses import JSONResponse, StreamingResponse
+from pydantic import BaseModel
 from pydantic_core import to_jsonable_python
 
-from api.http.schemas import utc
-from service.problems import DatabaseUnavailableError
+from api.http.problems import from_service
+from api.http.schemas import ArtifactView, PlanView, utc
+from service import problems
+from service.problems import DatabaseUnavailableError, ServiceError
 from service.states import ENDED
 from service.store import Store
 from service.store.tables import EventRow
@@ -162,3 +170,136 @@ def _to_item(row: EventRow) -> Item:
         data = {**data, "updated_at": to_jsonable_python(utc(data["updated_at"]))}
     text = f"id: {row.id}\nevent: {row.kind}\ndata: {json.dumps(data)}\n\n"
     return Item(row.id, text.encode(), row.kind == "status" and row.data["status"] in ENDED)
+
+
+_EVENTS = "text/event-stream"
+#: Status in the log if the client has closed the connection, as in nginx. It is never sent.
+_CLOSED = 499
+_PROGRESS = {"stage": "planning", "step": 5, "total": 24, "fraction": 0.208, "eta_s": 31.5}
+
+
+def _work_documentation(model: type[BaseModel], description: str, progress: str, result: str) -> dict[str, Any]:
+    """Return the documentation of such a response, given the names of its events."""
+    event = {
+        "type": "object",
+        "required": ["event", "data"],
+        "properties": {
+            "event": {"type": "string", "enum": [progress, result, "problem"]},
+            "data": {"type": "string", "contentMediaType": "application/json"},
+        },
+    }
+    examples = {progress: {"value": {"event": progress, "data": json.dumps(_PROGRESS)}}}
+    return {"model": model, "description": description, "content": {_EVENTS: {"schema": event, "examples": examples}}}
+
+
+#: Documentation of the responses for the OpenAPI document.
+DRY_RUN = _work_documentation(
+    PlanView,
+    "With `dry_run`: the plan. Nothing was queued. With `Accept: text/event-stream`, events: `planning`, the stage "
+    "(`planning` or `refining`) and its number of completed views (`total` is 0 if it has none); finally "
+    "`plan`, or a `problem` that occurred after the response started.",
+    "planning",
+    "plan",
+)
+VIDEO = _work_documentation(
+    ArtifactView,
+    "The video, which has been rendered. With `Accept: text/event-stream`, events: `rendering`, the number of rendered "
+    "frames; finally `video`, or a `problem` that occurred after the response started.",
+    "rendering",
+    "video",
+)
+
+
+class Work(Protocol):
+    """Function that makes a result and reports its progress."""
+
+    def __call__(self, show: Any) -> Coroutine[Any, Any, BaseModel]:
+        """Return the result; call `show` with the data of each progress event."""
+
+
+async def answer_work(
+    request: Request,
+    work: Work,
+    progress: str,
+    result: str,
+    working: set[asyncio.Task[Any]],
+    checked: asyncio.Event,
+) -> Response:
+    """Return the result as JSON, or a stream of events if the request accepts one.
+
+    JSON is returned when the result is complete; a stream is returned as soon as the inputs are checked. If the client
+    closes the connection, the work is canceled.
+
+    Args:
+        request: Request, whose body has been read.
+        work: Function that makes the result.
+        progress: Name of the progress events.
+        result: Name of the event with the result.
+        working: Tasks of all such work, which are canceled when the service stops.
+        checked: Event after which the stream starts, in which a later error is reported.
+    """
+    reports: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+    # Started here rather than in `_events`, so that the work releases its resources even if no event is read.
+    task = asyncio.create_task(work(reports.put_nowait))
+    task.add_done_callback(lambda _: reports.put_nowait(None))
+    working.add(task)
+    task.add_done_callback(working.discard)
+    streamed = _EVENTS in request.headers.get("accept", "")
+    waits: list[Coroutine[Any, Any, object]] = [_wait_for_disconnect(request), *([checked.wait()] if streamed else [])]
+    canceled: list[asyncio.Task[Any]] = [task, *map(asyncio.create_task, waits)]
+    try:
+        await asyncio.wait(canceled, return_when=asyncio.FIRST_COMPLETED)
+        if streamed and checked.is_set():
+            canceled.remove(task)
+            response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+            return StreamingResponse(_events(task, reports, progress, result), 200, response_headers, _EVENTS)
+        return JSONResponse(_result(task).model_dump(mode="json")) if task.done() else Response(status_code=_CLOSED)
+    finally:
+        for each in canceled:
+            each.cancel()
+
+
+def _result(task: asyncio.Task[BaseModel]) -> BaseModel:
+    """Return the result of work that has ended.
+
+    Raises:
+        STOPPING: If it was canceled because the service stops.
+    """
+    if task.cancelled():
+        raise problems.STOPPING()
+    return task.result()
+
+
+async def _wait_for_disconnect(request: Request) -> None:
+    """Return once the client has closed its connection; the body of the request must have been read."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+async def _events(
+    task: asyncio.Task[BaseModel], reports: asyncio.Queue[dict[str, Any] | None], progress: str, result: str
+) -> AsyncIterator[bytes]:
+    """Yield the events of some work until it is done; ending the iteration cancels the work."""
+    try:
+        while True:
+            try:
+                report = await asyncio.wait_for(reports.get(), HEARTBEAT_SECONDS)
+            except TimeoutError:
+                yield b": still here\n\n"
+                continue
+            if report is None:
+                break
+            yield _encoded(progress, report)
+        try:
+            yield _encoded(result, _result(task).model_dump(mode="json"))
+        except ServiceError as error:
+            yield _encoded("problem", json.loads(bytes(from_service(error).body)))
+        except Exception as error:
+            _log.exception("%s failed unexpectedly", progress, exc_info=error)
+            yield _encoded("problem", json.loads(bytes(from_service(problems.INTERNAL()).body)))
+    finally:
+        task.cancel()
+
+
+def _encoded(kind: str, data: Mapping[str, Any]) -> bytes:
+    return f"event: {kind}\ndata: {json.dumps(data)}\n\n".encode()

@@ -1,0 +1,609 @@
+"""`/v1/jobs`: list, show, rename, watch, finish, cancel, retry and delete jobs; their inputs and artifacts.
+
+`/v1/jobs/{id}/blends` and `/video` make artifacts of results.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from functools import partial
+from pathlib import PurePosixPath
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi.responses import StreamingResponse
+
+from api.http.context import Caller, CallerDep, Context, ContextDep, Digits, is_id
+from api.http.events import VIDEO, answer_work
+from api.http.problems import headers, links
+from api.http.receiving import json_body
+from api.http.schemas import (
+    MOST_POINTS,
+    ArtifactList,
+    ArtifactView,
+    BlendRequest,
+    InputFileView,
+    InputList,
+    JobChange,
+    JobDetail,
+    JobPage,
+    JobView,
+    ProgressHistory,
+    ProgressView,
+    StatusName,
+    artifact_view,
+    example_of,
+    input_view,
+    job_detail,
+    job_view,
+    poll_seconds,
+)
+from api.http.sending import ConditionsDep, IfNoneMatch, SentFile, file_answers, names_etag, send_file, send_list
+from api.static_files import exported_viewer
+from service import problems
+from service.files.blobs import BLOBS
+from service.files.objects import media_type
+from service.inputs import RESULT, JobParameters, default_job_name, stored_parameters
+from service.inspection.derived import PAGE, Blend
+from service.problems import JOB_ID, SHA256, LostFileError
+from service.settings import check_weights
+from service.states import JobStatus
+from service.store.jobs import Jobs
+from service.store.tables import ArtifactRow, BlobRow, JobRow
+from sgsst_core.files.formats import EXTRA_FORMATS, DownloadName, by_name, listed, result_name
+from sgsst_core.files.formats.ply import PLY
+from worker.options import JobVideo
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+JobId = Annotated[str, Path(description="ID of a job.", examples=[JOB_ID])]
+#: Headers of a response that shows a job.
+_SHOWN = headers("ETag", "Cache-Control", maybe=("Retry-After",))
+#: Operations that a client may call next on a job.
+FOLLOWING_OPERATIONS = (
+    "get_job",
+    "change_job",
+    "finish_job",
+    "cancel_job",
+    "retry_job",
+    "delete_job",
+    "watch_job",
+    "get_progress",
+    "list_inputs",
+    "list_artifacts",
+)
+
+
+def _documented(*following: str, **more: str) -> dict[str, Any]:
+    """Return the documentation of a response that shows a job, with the operations that may follow."""
+    return {**more, "headers": _SHOWN, "links": links(*following, job_id="$response.body#/id")}
+
+
+@router.get(
+    "",
+    response_model=JobPage,
+    responses={200: {"links": links(*FOLLOWING_OPERATIONS, job_id="$response.body#/jobs/0/id")}},
+)
+async def list_jobs(
+    context: ContextDep,
+    caller: CallerDep,
+    status: Annotated[
+        list[StatusName] | None,
+        Query(description="Show only jobs with this status; may be repeated.", examples=[["queued", "running"]]),
+    ] = None,
+    cursor: Annotated[
+        str | None, Query(pattern="^job_[0-9a-f]{31}$", description="`next_cursor` of a page.", examples=[JOB_ID])
+    ] = None,
+    limit: Annotated[Digits, Query(ge=1, le=200, description="Jobs on a page.", examples=[20])] = 50,
+) -> Response:
+    """List the jobs of this key, newest first."""
+
+    def read(before: str | None, most: int) -> tuple[list[JobView], str | None]:
+        page = context.store.jobs.page(caller.owner, status=status or (), before=before, limit=most + 1)
+        following = page[most - 1].row.id if len(page) > most else None  # one more shows if more follow
+        return [job_view(job) for job in page[:most]], following
+
+    return await send_list("jobs", read, cursor, limit, context.readers.of(caller.owner), at_once=16)
+
+
+@router.get(
+    "/{job_id}",
+    response_model=JobDetail,
+    responses={
+        200: _documented(*FOLLOWING_OPERATIONS[1:]),
+        304: {"description": "Nothing has changed since the ETag of `If-None-Match`.", "headers": _SHOWN},
+    },
+)
+def get_job(job_id: JobId, context: ContextDep, caller: CallerDep, if_none_match: IfNoneMatch = None) -> Response:
+    """Get a job. `Retry-After` says when to poll again; `If-None-Match` avoids sending an unchanged body."""
+    check_id(job_id)
+    return _job_response(context, caller, job_id, if_none_match)
+
+
+@router.patch(
+    "/{job_id}",
+    response_model=JobDetail,
+    responses={200: _documented(*FOLLOWING_OPERATIONS[1:])},
+)
+async def change_job(
+    job_id: JobId, context: ContextDep, caller: CallerDep, change: Annotated[JobChange, Depends(json_body(JobChange))]
+) -> Response:
+    """Rename a job, whatever its status."""
+    return await asyncio.to_thread(_rename, context, caller, job_id, change.name)
+
+
+def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Response:
+    check_id(job_id)
+    job, _ = context.store.jobs.detail(job_id, caller.owner)
+    regions = JobParameters(**job.row.parameters).region_requests
+    context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs, regions))
+    return _job_response(context, caller, job_id)
+
+
+@router.get("/{job_id}/progress", response_model=ProgressHistory)
+def get_progress(job_id: JobId, context: ContextDep, caller: CallerDep) -> ProgressHistory:
+    """Get the loss history of a job from its first step on, while it runs and after its end."""
+    points = context.store.jobs.loss_history(find(context, caller, job_id), MOST_POINTS)
+    return ProgressHistory.model_validate({"points": points})
+
+
+@router.post(
+    "/{job_id}/finish",
+    response_model=JobDetail,
+    responses={200: _documented("get_job", "cancel_job", "watch_job", "list_artifacts")},
+)
+def finish_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+    """End a running job after its current step and keep its result so far. Until then, its status is `finishing`."""
+    check_id(job_id)
+    context.store.jobs.finish(job_id, caller.owner)
+    return _job_response(context, caller, job_id)
+
+
+@router.post(
+    "/{job_id}/cancel",
+    response_model=JobDetail,
+    responses={200: _documented("get_job", "retry_job", "delete_job", "watch_job")},
+)
+def cancel_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+    """Cancel a job. A waiting job is canceled at once, a running one within seconds (`canceling` until then)."""
+    check_id(job_id)
+    context.store.jobs.cancel(job_id, caller.owner)
+    return _job_response(context, caller, job_id)
+
+
+@router.post(
+    "/{job_id}/retry",
+    status_code=202,
+    response_model=JobDetail,
+    responses={202: _documented("get_job", "cancel_job", "list_artifacts", description="The job is queued again.")},
+)
+def retry_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> Response:
+    """Queue a failed or canceled job again, or one that was stopped early. It resumes from its last checkpoint."""
+    stored_parameters(find(context, caller, job_id).parameters)
+    check_weights()
+    context.store.jobs.retry(job_id, caller.owner, limit=context.settings.max_jobs_per_key, quotas=caller.quotas)
+    return _job_response(context, caller, job_id, status=202)
+
+
+@router.delete("/{job_id}", status_code=204, responses={204: {"description": "The job and its results are deleted."}})
+async def delete_job(job_id: JobId, context: ContextDep, caller: CallerDep) -> None:
+    """Delete a job that has ended, with its results."""
+    check_id(job_id)
+    unused = await asyncio.to_thread(context.store.jobs.delete, job_id, caller.owner)
+    await context.receipts.remove(caller.owner, partial(_remove_files, context, job_id, unused))
+
+
+def _remove_files(context: Context, job_id: str, unused: Sequence[str]) -> None:
+    context.artifacts.objects.remove_below(job_id)
+    context.blobs.remove(unused)
+
+
+def find(context: Context, caller: Caller, job_id: str) -> JobRow:
+    """Return the caller's job with this id.
+
+    Raises:
+        NoJobError: If there is no such job, or it belongs to another caller.
+    """
+    check_id(job_id)
+    return context.store.jobs.get(job_id, caller.owner)
+
+
+def check_id(job_id: str) -> None:
+    """Raise NoJobError if a text cannot be a job's id."""
+    if not is_id(job_id):
+        raise problems.NO_JOB(job_id=job_id[:60])
+
+
+def _job_response(
+    context: Context, caller: Caller, job_id: str, if_none_match: str | None = None, status: int = 200
+) -> Response:
+    job, attempts = context.store.jobs.detail(job_id, caller.owner)
+    body = job_detail(job, attempts).model_dump_json().encode()
+    tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+    response_headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    wait = poll_seconds(job.row)
+    if wait is not None:
+        response_headers["Retry-After"] = str(wait)
+    if names_etag(if_none_match, tag):
+        return Response(status_code=304, headers=response_headers)
+    return Response(body, status, response_headers, media_type="application/json")
+
+
+#: Schema of a single event, because OpenAPI 3.1 cannot describe a stream.
+_EVENT = {
+    "type": "object",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string", "pattern": "^[0-9]+$", "description": "Number for `Last-Event-ID`."},
+        "event": {"type": "string", "enum": ["status", "progress", "artifact"]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+    },
+}
+_EXAMPLES = {
+    "status": {"status": "running", "attempt": 1},
+    "progress": example_of(ProgressView),
+    "artifact": {"name": "previews/000100.jpg", "size": 41239, "sha256": SHA256},
+}
+
+
+@router.get(
+    "/{job_id}/events",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "Events `status`, `progress` and `artifact`, until the job has ended. Each is sent as the "
+            "lines `id: `, `event: ` and `data: `, followed by an empty line.",
+            "headers": headers("Cache-Control", "X-Accel-Buffering"),
+            "content": {
+                "text/event-stream": {
+                    "schema": _EVENT,
+                    "examples": {
+                        kind: {"value": {"id": str(number), "event": kind, "data": json.dumps(data)}}
+                        for number, (kind, data) in enumerate(_EXAMPLES.items(), start=4)
+                    },
+                }
+            },
+        },
+        204: {"description": "The job has ended, and `Last-Event-ID` was its last event: do not reconnect."},
+    },
+)
+async def watch_job(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    last_event_id: Annotated[
+        Digits | None,
+        Header(
+            alias="Last-Event-ID",
+            ge=0,
+            lt=2**62,
+            description="ID of the last received event; later ones follow. After an ID that the job has not had, all "
+            "events follow.",
+            examples=[42],
+        ),
+    ] = None,
+) -> Response:
+    """Watch a job. Resume an interrupted stream with `Last-Event-ID`, which browsers' `EventSource` sends by itself."""
+    await asyncio.to_thread(find, context, caller, job_id)
+    after = await context.hub.resumed(job_id, last_event_id) if last_event_id else 0
+    if after is None:
+        return Response(status_code=204)
+    response_headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(context.hub.watch(job_id, after), 200, response_headers, "text/event-stream")
+
+
+inputs_router = APIRouter(prefix="/v1/jobs", tags=["inputs"])
+
+#: Media types of inputs by file extension. Images can be shown in a page; everything else is sent as bytes.
+_KINDS = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".webp": "image/webp",
+    ".json": "application/json",
+}
+_INPUT = re.compile(r"([a-z]{1,10})(?::([0-9]{1,6}))?", re.ASCII)
+#: Content-Security-Policy of inputs. Users provide these files, so no script in them may run.
+INPUT_POLICY = "sandbox; default-src 'none'"
+
+
+_INPUT_CONTENT: dict[str, Any] = {
+    "application/octet-stream": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
+    "application/json": [{"id": 0, "img_name": "view_0", "width": 64, "height": 48}],
+    "image/jpeg": "\xff\xd8\xff\xe0",
+    "image/png": "\x89PNG\r\n\x1a\n",
+    "image/webp": "RIFF",
+}
+_INPUT_ANSWERS = file_answers(_INPUT_CONTENT, always_policy=True)
+
+
+@inputs_router.get(
+    "/{job_id}/inputs",
+    response_model=InputList,
+    responses={
+        200: {
+            "links": links(
+                "get_input", "head_input", job_id="$request.path.job_id", role="$response.body#/inputs/0/role"
+            )
+        }
+    },
+)
+async def list_inputs(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    cursor: Annotated[Digits, Query(ge=0, lt=2**31, description="`next_cursor` of a page.", examples=[0])] = 0,
+    limit: Annotated[Digits, Query(ge=1, le=1000, description="Files on a page.", examples=[1000])] = 1000,
+) -> Response:
+    """List the files that a job was created from, photos and masks included."""
+    await asyncio.to_thread(find, context, caller, job_id)
+
+    def read(start: str | None, most: int) -> tuple[list[InputFileView], str | None]:
+        position = int(start or 0)
+        page = context.store.jobs.input_page(job_id, position, most + 1)
+        following = str(position + most) if len(page) > most else None
+        return [input_view(job_id, *entry) for entry in page[:most]], following
+
+    return await send_list("inputs", read, str(cursor), limit, context.readers.of(caller.owner))
+
+
+@inputs_router.head(
+    "/{job_id}/inputs/{role}", operation_id="head_input", response_class=Response, responses=_INPUT_ANSWERS
+)
+@inputs_router.get(
+    "/{job_id}/inputs/{role}", operation_id="get_input", response_class=StreamingResponse, responses=_INPUT_ANSWERS
+)
+async def get_input(
+    request: Request,
+    job_id: JobId,
+    role: Annotated[
+        str,
+        Path(
+            description="`scene`, `style`, `cameras`, `photos` or `mask`; of several files the first one, or `style:1` "
+            "and so on, counted from 0 in the order of the list.",
+            examples=["scene"],
+        ),
+    ],
+    context: ContextDep,
+    caller: CallerDep,
+    conditions: ConditionsDep,
+) -> Response:
+    """Download a file that a job was created from, whole or in ranges, until the job expires."""
+    entry, row = await asyncio.to_thread(_find_input, context, caller, job_id, role)
+    kind = _KINDS.get(PurePosixPath(entry["name"]).suffix.lower(), "application/octet-stream")
+    file = input_file(context, caller.owner, row, entry["name"], kind)
+    return await send_file(request, context.threads, file, conditions)
+
+
+def input_file(context: Context, owner: str, row: BlobRow, name: str, kind: str) -> SentFile:
+    """Return a stored input for sending it under a name, with a media type."""
+    path = f"{BLOBS}/{row.location}"
+    check, read = partial(_check_input, context, row), partial(context.blobs.objects.read, path)
+    return SentFile(owner, row.sha256, row.size, name, kind, check, read, policy=INPUT_POLICY)
+
+
+def _check_input(context: Context, row: BlobRow) -> None:
+    """Check that a stored input matches its database row.
+
+    Raises:
+        LostFileError, DamagedFileError: If the file is missing or damaged.
+        NotFoundError: If the file has just been deleted with its job.
+    """
+    try:
+        context.blobs.objects.check_once(f"{BLOBS}/{row.location}", row.sha256)
+    except LostFileError:
+        if not context.store.inputs.blobs([row.sha256]):
+            raise problems.FILE_REMOVED() from None
+        raise
+
+
+def _find_input(context: Context, caller: Caller, job_id: str, role: str) -> tuple[dict[str, Any], BlobRow]:
+    """Return the job's entry for an input file, and the database row of its blob.
+
+    Raises:
+        NO_INPUT: If the job has no such input, or has expired and released its inputs.
+    """
+    job = find(context, caller, job_id)
+    entry = find_input(context.store.jobs, job, role)
+    if entry is not None:
+        row = context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"])
+        if row is not None:
+            return entry, row
+    raise problems.NO_INPUT(job_id=job.id, name=role[:40])
+
+
+def parse_input(name: str) -> tuple[str, int] | None:
+    """Return role and index of an input such as "scene" or "style:1", or None if it is not such a name."""
+    match = _INPUT.fullmatch(name)
+    return (match[1], int(match[2] or 0)) if match else None
+
+
+def find_input(jobs: Jobs, job: JobRow, name: str) -> dict[str, Any] | None:
+    """Return a job's entry for an input such as "scene" or "style:1"; None if it is missing or was released."""
+    place = parse_input(name)
+    return None if place is None or job.status == JobStatus.EXPIRED else jobs.input(job.id, *place)
+
+
+artifacts_router = APIRouter(prefix="/v1/jobs", tags=["artifacts"])
+
+#: Media types that a browser may show inline. The HTML report may run its own script, but is isolated from this site.
+_INLINE = ("image/", "video/", "text/html", "application/json", "text/plain")
+#: Spaces and punctuation, but for those that names of files have.
+_NO_WORD = re.compile(r"[\x00-,/:-@\[-^`{-\xbf\u2000-\u206f\s]+")
+_SANDBOX = (
+    "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
+)
+
+
+@artifacts_router.get(
+    "/{job_id}/artifacts",
+    response_model=ArtifactList,
+    responses={
+        200: {
+            "links": links(
+                "get_artifact", "head_artifact", job_id="$request.path.job_id", name="$response.body#/artifacts/0/name"
+            )
+        }
+    },
+)
+async def list_artifacts(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    cursor: Annotated[
+        str, Query(max_length=200, description="`next_cursor` of a page.", examples=["previews/step_0000100.jpg"])
+    ] = "",
+    limit: Annotated[Digits, Query(ge=1, le=1000, description="Files on a page.", examples=[1000])] = 1000,
+) -> Response:
+    """List the files that a job has made so far, by name. A running job has its plan and previews."""
+    await asyncio.to_thread(find, context, caller, job_id)
+
+    def read(after: str | None, most: int) -> tuple[list[ArtifactView], str | None]:
+        page = context.store.jobs.artifacts(job_id, after or "", most + 1)
+        following = page[most - 1].name if len(page) > most else None
+        return [artifact_view(row) for row in page[:most] if not row.name.startswith(".")], following
+
+    return await send_list("artifacts", read, cursor, limit, context.readers.of(caller.owner))
+
+
+#: Media types of results (`service.files.objects`), and how the content of each starts.
+_CONTENT = {
+    "application/octet-stream": "ply\nformat binary_little_endian 1.0\nelement vertex 616\n",
+    "model/gltf-binary": "glTF\x02\0\0\0",
+    "application/json": {"version": 1, "decisions": []},
+    "text/html": "<!doctype html><html lang=en><title>Report</title></html>",
+    "text/plain": "14:02:11 info    stylizing 616 Gaussians, 3 views\n",
+    "image/jpeg": "\xff\xd8\xff\xe0",
+    "image/png": "\x89PNG\r\n\x1a\n",
+    "video/mp4": "\0\0\0 ftypisom",
+}
+_ANSWERS = file_answers(_CONTENT)
+
+
+@artifacts_router.head(
+    "/{job_id}/artifacts/{name:path}", operation_id="head_artifact", response_class=Response, responses=_ANSWERS
+)
+@artifacts_router.get(
+    "/{job_id}/artifacts/{name:path}", operation_id="get_artifact", response_class=StreamingResponse, responses=_ANSWERS
+)
+async def get_artifact(
+    request: Request,
+    job_id: JobId,
+    name: Annotated[str, Path(description="Name in the list of artifacts.", examples=["stylized.ply"])],
+    context: ContextDep,
+    caller: CallerDep,
+    conditions: ConditionsDep,
+    format_: Annotated[
+        DownloadName | None,
+        Query(
+            alias="format",
+            description="Format of `stylized.ply`. The file is converted at the first request, which takes about ten "
+            "seconds for a million Gaussians, and stored beside the PLY; "
+            f"{listed([f'`{result_name(RESULT, each.name)}.json`' for each in EXTRA_FORMATS])} then has its loss as "
+            "PSNR in the job's views. `html` is a page that shows the result in 3D without a server, beside the scene "
+            "if both have the same Gaussians.",
+            examples=["spz"],
+        ),
+    ] = None,
+) -> Response:
+    """Download a file, whole or in ranges. Resume with `Range` and `If-Range`."""
+    job = await asyncio.to_thread(find, context, caller, job_id)
+    row = await _find_artifact(context, caller, job, name, format_)
+    # the suggested name includes the job's, so that results of jobs differ
+    plain, last = _NO_WORD.sub("_", job.name).strip("._")[:60], PurePosixPath(row.name).name
+    file = artifact_file(context, job.owner, row, f"{plain}-{last}" if plain else last, media_type(row.name))
+    return await send_file(request, context.threads, file, conditions)
+
+
+async def _find_artifact(context: Context, caller: Caller, job: JobRow, name: str, format_: str | None) -> ArtifactRow:
+    """Return the database row of a published file, or of the result in another format."""
+    if format_ is not None and format_ != PLY.name:
+        if name != RESULT:
+            raise problems.INVALID_REQUEST(f"Only {RESULT} has other formats. Omit 'format'.")
+        if format_ == "html":
+            return await context.derived.page(job, exported_viewer(), caller.quotas)
+        return await context.derived.compressed(job, by_name(format_), caller.quotas)
+    row = None if name.startswith(".") else await asyncio.to_thread(context.store.jobs.artifact, job.id, name)
+    if row is None:
+        raise problems.NO_ARTIFACT(job_id=job.id, name=name[:80])
+    return row
+
+
+def artifact_file(context: Context, owner: str, row: ArtifactRow, name: str, kind: str) -> SentFile:
+    """Return a stored result for sending it under a name, with a media type."""
+    check, read = partial(check_artifact, context, row), partial(context.artifacts.objects.read, row.location)
+    policy = _SANDBOX if kind.startswith("text/html") else None
+    inline = kind.startswith(_INLINE) and row.name != PAGE  # the policy would not let the page show anything
+    return SentFile(owner, row.sha256, row.size, name, kind, check, read, policy, inline=inline)
+
+
+def check_artifact(context: Context, row: ArtifactRow) -> None:
+    """Check that a stored result matches its database row.
+
+    Raises:
+        LostFileError, DamagedFileError: If the file is missing or damaged.
+        NotFoundError: If the file has just been replaced by another one, or its job has been deleted.
+    """
+    try:
+        context.artifacts.objects.check_once(row.location, row.sha256)
+    except LostFileError:
+        now = context.store.jobs.artifact(row.job_id, row.name)
+        if now is None or now.location != row.location:
+            raise problems.FILE_REMOVED() from None
+        raise
+
+
+@artifacts_router.post(
+    "/{job_id}/blends",
+    status_code=201,
+    response_model=ArtifactView,
+    responses={
+        201: {
+            "description": "The blend exists. The same request returns the same file.",
+            "headers": headers("Location"),
+            "links": links("get_artifact", "head_artifact", job_id="$request.path.job_id", name="$response.body#/name"),
+        }
+    },
+)
+async def create_blend(
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    body: Annotated[BlendRequest, Depends(json_body(BlendRequest))],
+) -> Response:
+    """Blend a finished job's scene with its result, and store the blend among the job's artifacts."""
+    others = {part.job_id: part.weight for part in body.others}
+    if len({job_id, *others}) != 1 + len(body.others):
+        raise problems.INVALID_REQUEST("others: A job is named twice. Give each job one weight.")
+    for other in others:
+        await asyncio.to_thread(find, context, caller, other)
+    job = await asyncio.to_thread(find, context, caller, job_id)
+    row = await context.derived.blended(job, Blend(body.weight, others, by_name(body.format)), caller.quotas)
+    view = artifact_view(row)
+    return Response(view.model_dump_json(), 201, {"Location": view.url}, media_type="application/json")
+
+
+@artifacts_router.post("/{job_id}/video", response_model=ArtifactView, responses={200: VIDEO})
+async def make_video(
+    request: Request,
+    job_id: JobId,
+    context: ContextDep,
+    caller: CallerDep,
+    options: Annotated[JobVideo, Depends(json_body(JobVideo))],
+) -> Response:
+    """Render a video of the result as `video.mp4`, which replaces an earlier one. It takes minutes.
+
+    The video is completed even if the client closes the connection; repeat the request to wait for it again.
+    """
+    job = await asyncio.to_thread(find, context, caller, job_id)
+
+    async def work(show: Any) -> ArtifactView:
+        return artifact_view(await context.derived.video(job, options, caller.quotas, show))
+
+    checked = asyncio.Event()
+    checked.set()
+    return await answer_work(request, work, "rendering", "video", context.hub.working, checked)
