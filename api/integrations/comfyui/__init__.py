@@ -132,7 +132,7 @@ def _follow(service: Service, job_id: str) -> torch.Tensor:
             model_management.throw_exception_if_processing_interrupted()
             if job["preview"] not in (None, shown):
                 shown = job["preview"]
-                with service.request("GET", f"/v1/jobs/{job_id}/artifacts/{shown}") as answer:
+                with service.inputs("GET", f"/v1/jobs/{job_id}/artifacts/{shown}") as answer:
                     image = Image.open(io.BytesIO(answer.read()))
                 bar.update_absolute(int(_STEPS * fraction(job)), _STEPS, ("JPEG", image.convert("RGB"), None))
             else:
