@@ -1,8 +1,9 @@
 """Change of the Gaussians that painted views do not determine, from the change of those that they do.
 
-Two parts add up. A map of colors says how a color changes anywhere: an affine function for each of some clusters of
-colors, blended smoothly. It carries night, or another hue of all blue things. What the neighbors in place and color
-change beyond this map is local, such as a stroke: it is added, and fades with the distance to them.
+Two parts add up. A map of colors says how a color changes anywhere: an affine function of all colors, and one more for
+each of some clusters of colors, blended smoothly. It carries night, or another hue of all blue things. What the
+neighbors in place and color change beyond this map is local, such as a stroke: it is added, and fades with the distance
+to them.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from torch import Tensor
 
 #: Clusters of colors, and the standard deviation in 0..1 over which their maps blend.
 _CLUSTERS, _SOFTNESS = 16, 0.08
-#: Resistance of a map to anything but a constant change, relative to the confidence of its Gaussians.
-_RIDGE = 0.01
+#: Resistance of a cluster's map to differing from that of all colors, relative to the confidence of its Gaussians, and
+#: to that of so many more.
+_RIDGE, _PRIOR = 0.01, 100.0
 #: Neighbors of a Gaussian; distances in place are in `_PLACE` of the scene's extent, those in color in `_COLOR`.
 _NEIGHBORS, _PLACE, _COLOR = 24, 0.2, 0.1
 #: Distance, in the scene's extent, over which the neighbors' own change fades.
@@ -76,18 +78,22 @@ class Spreading:
     def _mapped(self, change: Tensor) -> Tensor:
         """Return the change [N, 3] float64 by the map of colors that fits the known Gaussians."""
         known, blend = self._known, _memberships(self._colors, self._centers)
-        result = torch.zeros_like(change)
+        everything = torch.ones_like(change[:, :1])
+        middle = (self._colors[known] * self._confidence[known, None]).sum(dim=0) / self._confidence[known].sum()
+        result = self._fitted(change, everything, middle, 1e-6)
+        remaining = change - result
         for cluster, center in enumerate(self._centers):
-            weight = (self._confidence * blend[:, cluster])[known, None]
-            total = float(weight.sum())
-            if total < 1e-6:
-                continue
-            terms = torch.cat([self._colors - center, torch.ones_like(change[:, :1])], dim=1)
-            own = terms[known]
-            resist = torch.diag(torch.tensor([1.0, 1.0, 1.0, 1e-6], dtype=torch.float64)) * _RIDGE * total
-            map = torch.linalg.solve((own * weight).T @ own + resist, (own * weight).T @ change[known])
-            result += blend[:, cluster, None] * (terms @ map)
+            result += self._fitted(remaining, blend[:, cluster, None], center, _RIDGE)
         return result
+
+    def _fitted(self, change: Tensor, membership: Tensor, center: Tensor, ridge: float) -> Tensor:
+        """Return the part [N, 3] of a change that an affine function of color explains, for members of a cluster."""
+        terms = torch.cat([self._colors - center, torch.ones_like(change[:, :1])], dim=1)
+        weight, own = (self._confidence[:, None] * membership)[self._known], terms[self._known]
+        resist = ridge * (float(weight.sum()) + _PRIOR) * torch.eye(4, dtype=torch.float64)
+        resist[3, 3] = ridge * _PRIOR
+        map = torch.linalg.solve((own * weight).T @ own + resist, (own * weight).T @ change[self._known])
+        return membership * (terms @ map)
 
 
 def _memberships(colors: Tensor, centers: Tensor) -> Tensor:
