@@ -20,8 +20,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from benchmarks.inputs import read_views
-from benchmarks.machine import write_result
+from benchmarks.common import read_views, write_result
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.painting.solver import PaintedColors, PaintedView, paint
