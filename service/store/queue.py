@@ -131,29 +131,19 @@ def cause_of(error: Mapping[str, Any] | None) -> Cause:
 
 
 @dataclass(frozen=True)
-class FailureCount:
-    """Count of consecutive failed attempts without progress.
-
-    Attributes:
-        failed_step: Last saved step at the time of the last failure; None for no step.
-    """
-
-    failures: int
-    failed_step: int | None
-
-
-@dataclass(frozen=True)
 class Verdict:
     """Decision about a job.
 
     Attributes:
         transition: STOP, FAIL or REQUEUE.
-        count: New count of failures for the job's record.
+        failures: New number of consecutive failed attempts without progress.
+        failed_step: Last saved step at the time of the last failure; None for no step.
         wait: Delay in seconds before the job may be taken again.
     """
 
     transition: Transition
-    count: FailureCount
+    failures: int
+    failed_step: int | None
     wait: float = 0.0
 
 
@@ -173,9 +163,7 @@ class RetryPolicy:
     def after_attempt(
         self,
         outcome: AttemptOutcome,
-        status: JobStatus,
-        count: FailureCount,
-        saved_step: int | None,
+        job: JobRow,
         causes: Sequence[Cause] = (Cause.JOB,),
         *,
         permanent: bool = False,
@@ -183,29 +171,28 @@ class RetryPolicy:
         """Decide whether a job is retried after an attempt that failed, was lost or was released.
 
         Args:
+            job: Job with the status and the count of failures from before the decision.
             causes: Cause of the attempt's end, then those of earlier attempts back to the last one that made a step.
-            status: Status of the job while the attempt ran.
-            count: Count of failures before this attempt.
-            saved_step: Last saved step of the job; None for no step.
             permanent: Whether another attempt would fail in the same way.
         """
-        if status == JobStatus.CANCELING:
-            return Verdict(Transition.STOP, count)
+        failures, failed_step = job.failures, job.failed_step
+        if job.status == JobStatus.CANCELING:
+            return Verdict(Transition.STOP, failures, failed_step)
         if outcome == AttemptOutcome.RELEASED:
-            return Verdict(Transition.REQUEUE, count)
+            return Verdict(Transition.REQUEUE, failures, failed_step)
         if causes[0] == Cause.JOB:
             # progress resets the count: a long job survives many sporadic failures, but not one at the same step again
-            progress = (saved_step or 0) > (count.failed_step or 0)
-            count = FailureCount(0 if progress else count.failures + 1, saved_step)
-            failed, repeated = permanent or count.failures >= self.max_attempts, count.failures
+            progress = (job.saved_step or 0) > (failed_step or 0)
+            failures, failed_step = 0 if progress else failures + 1, job.saved_step
+            failed, repeated = permanent or failures >= self.max_attempts, failures
         else:
             failed = list(causes[:MAX_LOSSES]) == [Cause.DISPATCHER] * MAX_LOSSES
             repeated = next((number for number, cause in enumerate(causes) if cause == Cause.JOB), len(causes))
         if failed:
-            return Verdict(Transition.FAIL, count)
+            return Verdict(Transition.FAIL, failures, failed_step)
         wait = min(self.retry_seconds * 2.0 ** max(repeated - 1, 0), MAX_RETRY_SECONDS)
         # a lost attempt has already cost the duration of a lease
-        return Verdict(Transition.REQUEUE, count, 0.0 if outcome == AttemptOutcome.LOST else wait)
+        return Verdict(Transition.REQUEUE, failures, failed_step, 0.0 if outcome == AttemptOutcome.LOST else wait)
 
 
 #: Expiry of a lease whose dispatcher is known to be dead.
@@ -484,12 +471,11 @@ class Leases:
     ) -> Verdict:
         """Close an attempt and count it if it failed; return the verdict on the job."""
         _close_attempt(session, job, outcome, error, now)
-        before, status = FailureCount(job.failures, job.failed_step), JobStatus(job.status)
         causes = _causes(session, job) or [cause_of(error)]
         if causes[0] not in (Cause.JOB, Cause.DISPATCHER):
             count(session, "sgsst_outages_total", f'cause="{causes[0]}"')
-        verdict = self._policy.after_attempt(outcome, status, before, job.saved_step, causes, permanent=permanent)
-        job.failures, job.failed_step = verdict.count.failures, verdict.count.failed_step
+        verdict = self._policy.after_attempt(outcome, job, causes, permanent=permanent)
+        job.failures, job.failed_step = verdict.failures, verdict.failed_step
         return verdict
 
     # --- shared ----------------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ from service.store.queue import (
     MAX_LOSSES,
     MAX_RETRY_SECONDS,
     OVERTAKEN_SECONDS,
-    FailureCount,
     RetryPolicy,
     Verdict,
     cause_of,
@@ -80,40 +79,44 @@ def test_waiting_jobs_are_counted_up_to_a_maximum(store: Store, clock: Clock) ->
 
 
 POLICY = RetryPolicy(max_attempts=3, retry_seconds=5.0)
-FRESH = FailureCount(0, None)
+
+
+def job(
+    failures: int = 0, failed_step: int | None = None, saved: int | None = None, status: str = JobStatus.RUNNING
+) -> JobRow:
+    """Return a job with this status and count of failures."""
+    return JobRow(status=status, failures=failures, failed_step=failed_step, saved_step=saved)
 
 
 @pytest.mark.parametrize(
     ("before", "saved", "after"),
     [
-        (FailureCount(0, None), None, FailureCount(1, None)),
-        (FailureCount(1, None), None, FailureCount(2, None)),
-        (FailureCount(1, None), 0, FailureCount(2, 0)),
-        (FailureCount(2, None), 10, FailureCount(0, 10)),
-        (FailureCount(2, 10), 10, FailureCount(3, 10)),
-        (FailureCount(2, 10), 11, FailureCount(0, 11)),
-        (FailureCount(1, 10), 5, FailureCount(2, 5)),
+        ((0, None), None, (1, None)),
+        ((1, None), None, (2, None)),
+        ((1, None), 0, (2, 0)),
+        ((2, None), 10, (0, 10)),
+        ((2, 10), 10, (3, 10)),
+        ((2, 10), 11, (0, 11)),
+        ((1, 10), 5, (2, 5)),
     ],
 )
-def test_failures_count_only_without_progress(before: FailureCount, saved: int | None, after: FailureCount) -> None:
-    assert POLICY.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, before, saved).count == after
+def test_failures_count_only_without_progress(
+    before: tuple[int, int | None], saved: int | None, after: tuple[int, int | None]
+) -> None:
+    verdict = POLICY.after_attempt(AttemptOutcome.FAILED, job(*before, saved))
+    assert (verdict.failures, verdict.failed_step) == after
 
 
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST, AttemptOutcome.RELEASED])
 @pytest.mark.parametrize("permanent", [False, True])
 def test_canceling_job_is_stopped(outcome: AttemptOutcome, permanent: bool) -> None:
-    decision = POLICY.after_attempt(outcome, JobStatus.CANCELING, FailureCount(2, 3), 3, permanent=permanent)
-    assert decision == Verdict(Transition.STOP, FailureCount(2, 3))
+    decision = POLICY.after_attempt(outcome, job(2, 3, 3, JobStatus.CANCELING), permanent=permanent)
+    assert decision == Verdict(Transition.STOP, 2, 3)
 
 
 def test_retry_delay_doubles_up_to_its_maximum() -> None:
     policy = RetryPolicy(max_attempts=100, retry_seconds=5.0)
-    count, waits = FRESH, []
-    for _ in range(9):
-        verdict = policy.after_attempt(AttemptOutcome.FAILED, JobStatus.RUNNING, count, None)
-        assert verdict.transition == Transition.REQUEUE
-        count = verdict.count
-        waits.append(verdict.wait)
+    waits = [policy.after_attempt(AttemptOutcome.FAILED, job(failures)).wait for failures in range(9)]
     assert waits == [5, 10, 20, 40, 80, 160, MAX_RETRY_SECONDS, MAX_RETRY_SECONDS, MAX_RETRY_SECONDS]
 
 
@@ -143,26 +146,24 @@ def test_cause_of_recorded_error(error: dict[str, str] | None, cause: Cause) -> 
 @pytest.mark.parametrize("cause", OTHERS)
 @pytest.mark.parametrize("outcome", [AttemptOutcome.FAILED, AttemptOutcome.LOST])
 def test_only_own_failures_count(cause: Cause, outcome: AttemptOutcome) -> None:
-    count, waits = FailureCount(POLICY.max_attempts - 1, 10), []
+    count, waits = (POLICY.max_attempts - 1, 10), []
     for repeated in range(1, MAX_LOSSES):
-        verdict = POLICY.after_attempt(outcome, JobStatus.RUNNING, count, 10, [cause] * repeated + [Cause.JOB])
-        assert (verdict.transition, verdict.count) == (Transition.REQUEUE, count)
+        verdict = POLICY.after_attempt(outcome, job(*count, 10), [cause] * repeated + [Cause.JOB])
+        assert (verdict.transition, verdict.failures, verdict.failed_step) == (Transition.REQUEUE, *count)
         waits.append(verdict.wait)
     lost = outcome == AttemptOutcome.LOST
     assert waits[:3] == [0.0 if lost else POLICY.retry_seconds * factor for factor in (1, 2, 4)]
     assert waits[-1] == (0.0 if lost else MAX_RETRY_SECONDS)
-    assert POLICY.after_attempt(outcome, JobStatus.CANCELING, count, 10, [cause]).transition == Transition.STOP
+    assert POLICY.after_attempt(outcome, job(*count, 10, JobStatus.CANCELING), [cause]).transition == Transition.STOP
 
 
 @pytest.mark.parametrize("cause", OTHERS)
 def test_job_that_may_end_its_dispatchers_fails_at_last(cause: Cause) -> None:
     """An outage never fails a job, however often it occurs."""
-    verdict = POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.STARTING, FRESH, None, [cause] * MAX_LOSSES)
+    verdict = POLICY.after_attempt(AttemptOutcome.LOST, job(), [cause] * MAX_LOSSES)
     assert verdict.transition == (Transition.FAIL if cause == Cause.DISPATCHER else Transition.REQUEUE)
     mixed = [Cause.DISPATCHER, Cause.DATABASE] * MAX_LOSSES
-    assert POLICY.after_attempt(AttemptOutcome.LOST, JobStatus.STARTING, FRESH, None, mixed).transition == (
-        Transition.REQUEUE
-    )
+    assert POLICY.after_attempt(AttemptOutcome.LOST, job(), mixed).transition == (Transition.REQUEUE)
 
 
 @pytest.mark.parametrize("status", [JobStatus.STARTING, JobStatus.RUNNING, JobStatus.CANCELING])
@@ -170,6 +171,5 @@ def test_job_that_may_end_its_dispatchers_fails_at_last(cause: Cause) -> None:
 @pytest.mark.parametrize("permanent", [False, True])
 def test_every_verdict_is_an_allowed_transition(status: JobStatus, outcome: AttemptOutcome, permanent: bool) -> None:
     for failures in range(POLICY.max_attempts + 1):
-        count = FailureCount(failures, None)
-        verdict = POLICY.after_attempt(outcome, status, count, None, permanent=permanent)
+        verdict = POLICY.after_attempt(outcome, job(failures, status=status), permanent=permanent)
         assert status in TRANSITIONS[verdict.transition]
