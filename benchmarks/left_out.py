@@ -1,9 +1,10 @@
-"""Savings in time and memory from each component that a plan leaves out because the scene does not need it.
+"""Savings from each component that a plan leaves out because the scene does not need it, and from our own mechanisms.
 
 python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 320] [--views 4] [--rounds 3]
 
 CAMERAS is a camera file, or orbit:N. The first configuration leaves out all components that the scene does not need;
-each of the next ones keeps one of them; the last one keeps all. Every configuration runs in a process of its own, so
+each of the next ones keeps one of them, and one keeps all; the others do without one of the mechanisms by which we want
+to gain time or quality. Every configuration runs in a process of its own, so
 that it has its own memory peak, and all of them run once in each round, so that a change of the machine's speed meets
 all alike. Medians over the rounds are stored with their range.
 """
@@ -15,10 +16,11 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,20 +28,39 @@ from torch import Tensor
 from benchmarks.common import read_views, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import Cache, peak_memory
+from sgsst_core.features import layers
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.division import Divider, Division, Size, Tiling
+from sgsst_core.scene import spherical_harmonics
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.planner import plan_job
+from sgsst_core.stylizing.steps import mean_loss
 
 #: Components that can be left out without changing the result.
 EVERYTHING = ("unseen", "uncovered", "activations", "content")
+#: Settings without one of our mechanisms.
+WITHOUT: dict[str, dict[str, Any]] = {
+    "no Winograd": {"precision": "float32"},
+    "no warm start": {"warm_start": False},
+    "no sampling of scales": {"scale_sampling": 1},
+}
+#: Functions that replace compiled ones by PyTorch's operations, with their modules and names.
+REPLACED: dict[str, tuple[Any, str, Callable[..., Any]]] = {
+    "no pooling kernel": (layers, "_is_compiled_for", lambda values: False),
+    "no harmonics kernel": (
+        spherical_harmonics,
+        "_compiled_rest_colors",
+        lambda rest, means, camera, degree: reference_rest_colors(rest, means, camera, degree),
+    ),
+}
 #: Steps of a whole job.
 STEPS = 24
 
@@ -111,7 +132,8 @@ class _Whole(Divider):
 
 
 def _configurations() -> list[tuple[str, Sequence[str]]]:
-    return [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
+    kept = [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
+    return [*kept, *((label, (label,)) for label in (*WITHOUT, *REPLACED))]
 
 
 def _in_a_process(scene: str, added: Sequence[str]) -> dict[str, float]:
@@ -127,19 +149,22 @@ def _measure(arguments: argparse.Namespace) -> dict[str, float]:
     scene = read_scene(Path(ply)).scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)
     added = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
-    settings = make_settings("standard", steps_sos=STEPS, scale_sampling=1, early_stop=False)
+    if arguments.keep in REPLACED:
+        setattr(*REPLACED[arguments.keep])
+    changed = WITHOUT.get(arguments.keep, {})
+    settings = make_settings("standard", **{"steps_sos": STEPS, "early_stop": False, **changed})
     style, started = Style.of(load_image(arguments.style)), time.perf_counter()
     stylizer = with_components(added, scene, views, style, settings)
     while stylizer.step < STEPS:
         stylizer.run_step()
     stylizer.stylized()
-    later = stylizer.history[len(stylizer.job.views.covered) :]
-    return {
-        "step_seconds": median(sum(record.parts.values()) for record in later),
-        "job_seconds": time.perf_counter() - started,
-        "peak_bytes": peak_memory(),
-        "loss": stylizer.history[-1].loss,
-    }
+    figures = {"job_seconds": time.perf_counter() - started, "peak_bytes": peak_memory()}
+    later, weights = stylizer.history[len(stylizer.job.views.covered) :], stylizer.job.loss.weights
+    before, after = (
+        mean_loss(stylizer.evaluate(stylizer.job.views.covered, colors), weights)
+        for colors in (stylizer.job.views.scene.sh_dc, None)
+    )
+    return {"step_seconds": mean(sum(record.parts.values()) for record in later), **figures, "loss": after / before}
 
 
 def _summary(label: str, rounds: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
@@ -159,7 +184,7 @@ def _print(name: str, rows: Mapping[str, Mapping[str, Mapping[str, float]]]) -> 
         texts = [f"{row[key]['median']:.3g} s ({row[key]['more']:+.2g})" for key in ("step_seconds", "job_seconds")]
         texts.append(f"{row['peak_bytes']['median'] / 1e9:.2f} GB ({row['peak_bytes']['more'] / 1e9:+.2f})")
         texts.append(f"loss {row['loss']['more']:+.1e}")
-        print(f"  {label:<14}" + "".join(f"{text:<22}" for text in texts), flush=True)
+        print(f"  {label:<22}" + "".join(f"{text:<22}" for text in texts), flush=True)
 
 
 if __name__ == "__main__":
