@@ -120,7 +120,7 @@ class Stylize(IO.ComfyNode):
         return IO.NodeOutput(result, preview, job_id)
 
 
-def _follow(service: Service, job_id: str) -> torch.Tensor:
+def _follow(connection: Service, job_id: str) -> torch.Tensor:
     """Wait until a job has succeeded, show its progress and newest image, and return the last image.
 
     Raises:
@@ -128,17 +128,17 @@ def _follow(service: Service, job_id: str) -> torch.Tensor:
     """
     bar, shown, image = ProgressBar(_STEPS), None, None
     try:
-        for job in service.watch(job_id):
+        for job in connection.watch(job_id):
             model_management.throw_exception_if_processing_interrupted()
             if job["preview"] not in (None, shown):
                 shown = job["preview"]
-                with service.inputs("GET", f"/v1/jobs/{job_id}/artifacts/{shown}") as answer:
+                with connection.request("GET", f"/v1/jobs/{job_id}/artifacts/{shown}") as answer:
                     image = Image.open(io.BytesIO(answer.read()))
                 bar.update_absolute(int(_STEPS * fraction(job)), _STEPS, ("JPEG", image.convert("RGB"), None))
             else:
                 bar.update_absolute(int(_STEPS * fraction(job)))
     except model_management.InterruptProcessingException:
-        service.cancel(job_id)
+        connection.cancel(job_id)
         raise
     assert image is not None
     return _tensor(image)
