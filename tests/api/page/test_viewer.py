@@ -229,9 +229,11 @@ def with_two_sets(data: bytes) -> bytes:
 
 def test_flag_that_spark_sets_is_ignored(visit: Visit, tmp_path: Path) -> None:
     ply, _, _ = write_files(tmp_path, dust(), cameras(2, 120, 90))
-    write_scene(ply, replace(dust(), rendering=Rendering("antialiased")), by_name("v3.spz"))
-    data = bytearray(gzip.decompress(ply.read_bytes())[:-12])
-    data[14] = 1
+    scene = dust()
+    scene = replace(scene, means=scene.means / 256, rendering=Rendering("antialiased"))
+    write_scene(ply, scene, by_name("v3.spz"))  # with 20 fractional bits; Spark writes 12
+    data = bytearray(gzip.decompress(ply.read_bytes()))
+    data[13] = 12
     ply.write_bytes(gzip.compress(bytes(data)))
     assert_shown_like(visit("/#/jobs"), tmp_path, ply, differs=False)
 
