@@ -193,7 +193,7 @@ def test_job_from_upload_to_removal(
         )
         assert target.read_bytes() == result
         assert reported[-1] == (len(result), len(result))
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.ply", "result"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.ply"]
 
         client.delete(submitted.id)
         with pytest.raises(RequestError, match="no job") as caught:
