@@ -649,12 +649,12 @@ def test_readiness_reports_dispatchers(service: Service, client: httpx2.Client) 
     store.close()
 
 
-def test_metrics_count_attempts_by_outcome(tmp_path: Path) -> None:
+def test_metrics_count_attempts_by_outcome(tmp_path: Path, files: dict[str, bytes]) -> None:
     with Service(tmp_path / "data", alone=True) as service, service.client() as client:
+        for _ in range(3):
+            client.post("/v1/jobs", files=form(files))
         now = time.time()
         store = open_store(ServiceSettings(data=service.data), lambda: now)
-        for _ in range(3):
-            store.jobs.create(NewJob("local", "", 0, {}, []), limit=3)
         held = store.leases.take("lost")
         assert held is not None
         now += 1000
