@@ -41,6 +41,7 @@ from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_col
 from sgsst_core.scene.stored_harmonics import held
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import JobInputs
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import NEIGHBORS, Stylizer, neighbors_change
 
@@ -147,7 +148,7 @@ def measure_first_step(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     """Time a job by part, from a loaded scene to the end of the first step, with network weights installed."""
     settings = make_settings(max_resolution=_RESOLUTION)
     timer, weights, style = Timer(), load_network_weights("auto"), Style.of(texture(512, 512))
-    job = plan_job(scene, cameras, style, settings, weights=weights, timer=timer)
+    job = plan_job(JobInputs(scene, cameras, style, settings, weights=weights), timer=timer)
     with timer("preparing"):
         stylizer = Stylizer(job)
     with timer("first_step"):

@@ -29,7 +29,7 @@ from benchmarks.common import read_views, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import Cache, peak_memory
 from sgsst_core.features import layers
-from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
 from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
@@ -40,7 +40,7 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.steps import mean_loss
 
@@ -98,14 +98,15 @@ def with_components(
     weights: BackboneWeights | None = None,
 ) -> Stylizer:
     """Return the stylizer of a job that computes some of `EVERYTHING` although it does not need to."""
-    job = plan_job(scene, cameras, style, settings, weights=weights)
+    inputs = JobInputs(scene, cameras, style, settings, weights or load_network_weights("auto"))
+    job = plan_job(inputs)
     plan = job.plan
     if "unseen" in added:
         plan = replace(plan, seen=torch.ones_like(plan.seen))
     if "uncovered" in added and plan.weighted:
         whole = [Rectangle(0, 0, camera.height, camera.width) for camera in job.views.cameras]
         plan = replace(plan, survey=replace(plan.survey, regions=whole))
-    job = prepare_job(plan, scene, cameras, style, settings, weights=job.weights)
+    job = prepare_job(plan, inputs)
     if "uncovered" in added:
         job.loss.divider = _Whole(job.loss.tiling)
     if "activations" in added:

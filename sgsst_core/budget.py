@@ -25,16 +25,18 @@ V = TypeVar("V")
 TOTAL_SHARE, FREE_SHARE = 0.4, 0.8
 #: Maximum fraction of a GPU's total memory that a job plans with; a job does not share its GPU.
 GPU_SHARE = 0.7
-#: Fractions of the memory limit by use, which add up to 1: see `memory_for`.
-_FRACTIONS = {"activations": 0.5, "views": 0.25, "rasterizer": 0.25}
+#: Fractions of the memory limit by use. The first three add up to 1; the others are taken from that of views.
+_FRACTIONS = {"activations": 1 / 2, "views": 1 / 4, "rasterizer": 1 / 4, "intersections": 1 / 16, "measuring": 1 / 16}
+MemoryUse = Literal["activations", "views", "rasterizer", "intersections", "measuring"]
 
 
-def memory_for(use: Literal["activations", "views", "rasterizer"], memory: int) -> int:
+def memory_for(use: MemoryUse, memory: int) -> int:
     """Return the portion of a rank's memory limit, in bytes, that is reserved for one use.
 
     Args:
-        use: "activations" for those of one iteration; "views" for view targets and colors, and for the two caches below
-            that a job may need; "rasterizer" for tile intersections and cached blend weights.
+        use: "activations" for those of one iteration; "views" for view targets and colors; "rasterizer" for tile
+            intersections and cached blend weights. If a job needs them, "intersections" of the views whose blend
+            weights are not cached, and "measuring" novel views; the float32 reference takes as much again.
         memory: Memory limit of the rank in bytes.
     """
     return int(memory * _FRACTIONS[use])
@@ -51,23 +53,6 @@ def content_fraction(device: str, *, weighted: bool, has_maps: bool) -> float:
         weighted: Whether statistics are weighted by rendered coverage.
     """
     return 0.5 - 0.25 * has_maps + 0.25 * (device != "cpu" and not weighted)
-
-
-def least_intersection_memory(memory: int) -> int:
-    """Return the memory in bytes reserved for tile intersections if blend weights are cached too, given a rank's limit.
-
-    Views whose blend weights do not fit are rendered from their tile intersections. The memory is taken from the budget
-    for views.
-    """
-    return memory // 16
-
-
-def measuring_memory(memory: int) -> int:
-    """Return the cache size in bytes for novel views, given a rank's memory limit.
-
-    The float32 reference has a cache of the same size. Both are taken from the budget for views.
-    """
-    return memory // 16
 
 
 def default_memory_limit(device: torch.device | None = None) -> int:

@@ -1,4 +1,4 @@
-"""What a job shows to people: its progress, the decisions of its plan, and numbers."""
+"""Texts about a job for people: its progress, the decisions of its plan, and numbers."""
 
 from __future__ import annotations
 

@@ -110,12 +110,8 @@ def window_length(round_length: int) -> int:
 def smoothed(losses: Sequence[float], window: int) -> float:
     """Return the geometric mean of the last `window` losses, or of all losses if there are fewer."""
     last = losses[-window:]
-    return math.exp(sum(map(log_loss, last)) / len(last))
-
-
-def log_loss(loss: float) -> float:
-    """Return the logarithm of a loss; that of the smallest normal numbers for 0."""
-    return math.log(max(loss, 1e-300))
+    # The logarithm of 0 is that of the smallest normal numbers.
+    return math.exp(sum(math.log(max(loss, 1e-300)) for loss in last) / len(last))
 
 
 def ratio(after: float, before: float) -> float | None:

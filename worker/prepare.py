@@ -12,8 +12,7 @@ import json
 import socket
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +33,14 @@ from sgsst_core.planning.plan import LOSS_VIEWS, Plan
 from sgsst_core.planning.survey import ShowPlanning
 from sgsst_core.planning.time_budget import SecondsLeft, TimeChoice
 from sgsst_core.rasterizer import RASTERIZERS
-from sgsst_core.refine import Refinement
 from sgsst_core.report.document import Sources
 from sgsst_core.scene.camera import resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import Settings
 from sgsst_core.stylizing.checkpoint import Checkpoint, load_plan, save_plan, versions
-from sgsst_core.stylizing.job import StylizationJob
+from sgsst_core.stylizing.job import JobInputs, StylizationJob
 from sgsst_core.stylizing.planner import choose_within, plan_job
-from sgsst_core.stylizing.refining import refine, refined
+from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer, render_first_view, transferred_colors
 from worker.inputs import Inputs, fingerprint_of, read_inputs, same_weights, together
 from worker.job import JobSpec, Resume
@@ -129,21 +127,23 @@ def prepare(
     chosen = known.plan.time_choice if known else None
     if not known:
         with timer("planning"):
-            chosen = _choose(inputs, settings, left, weights, collectives)
+            chosen = left and choose_within(_job_inputs(inputs, settings, weights), left, collectives)
     asked, settings = settings, chosen.applied(settings) if chosen else settings
     inputs = inputs.chosen(chosen, settings) if chosen else inputs
     refinement, scene_file = known.plan.refinement if known else None, inputs.scene_file
     if settings.growth > 1:
         with timer("refining"):
-            refinement = refinement if known else _refine(inputs, settings, weights, collectives, show_planning)
+            of_job = _job_inputs(inputs, settings, weights)
+            refinement = refinement if known else refine(of_job, collectives=collectives, show=show_planning)
             scene_file = together(collectives, lambda: inputs.scene_file.refined(refinement))
     plan = _usable_plan(known, collectives)
     if known and not plan and known.plan.device == common_device(collectives):
         asked = asked.model_copy(update={"precision": known.plan.precision})  # a job has one precision
     planned_ranks = known.ranks if known and plan else collectives.size
-    stylization = _planner(inputs, asked, weights, scene_file.scene, refinement, chosen)(
+    of_job = _job_inputs(inputs, asked, weights, chosen).refined(refinement, scene_file.scene)
+    stylization = plan_job(
+        replace(of_job, photos=inputs.photo_loader(settings.background)),
         plan=plan,
-        photos=inputs.photo_loader(settings.background),
         collectives=collectives,
         survey=known.plan.survey if known else None,
         groups=resumed.plan.groups if resumed else None,
@@ -178,14 +178,12 @@ def dry_run(
     """
     settings = request.settings
     weights = weights_for(load_network_weights(request.backbone), settings)
-    of_job, chosen = inputs, _choose(inputs, settings, left, weights, ALONE)
-    applied = chosen.applied(settings) if chosen else settings
-    inputs = inputs.chosen(chosen, applied) if chosen else inputs
-    refinement = _refine(inputs, applied, weights, ALONE, show)
-    scene = refined(inputs.scene_file.scene, refinement)
-    job = _planner(inputs, settings, weights, scene, refinement, chosen)(show=show)
+    whole, chosen = inputs, left and choose_within(_job_inputs(inputs, settings, weights), left)
+    inputs = inputs.chosen(chosen, chosen.applied(settings)) if chosen else inputs
+    of_job = _job_inputs(inputs, settings, weights, chosen)
+    job = plan_job(of_job.refined(refine(of_job, show=show)), show=show)
     if hand_over:
-        fingerprint = fingerprint_of(of_job, settings, weights.sha256, ALONE)
+        fingerprint = fingerprint_of(whole, settings, weights.sha256, ALONE)
         with contextlib.suppress(OSError):  # a job without this file plans again
             save_plan(hand_over, job.plan, fingerprint, _conditions(settings))
     return job
@@ -223,50 +221,13 @@ def _conditions(settings: Settings) -> str:
     return json.dumps([settings.model_dump(mode="json"), versions(), machine])
 
 
-def _choose(
-    inputs: Inputs,
-    settings: Settings,
-    left: SecondsLeft | None,
-    weights: BackboneWeights,
-    collectives: Collectives,
-) -> TimeChoice | None:
-    """Return the choice of the time budget; None without one."""
-    scene = inputs.scene_file.scene
-    return left and choose_within(scene, inputs.cameras, settings, left, weights=weights, collectives=collectives)
-
-
-def _planner(
-    inputs: Inputs,
-    settings: Settings,
-    weights: BackboneWeights,
-    scene: Scene,
-    refinement: Refinement | None,
-    chosen: TimeChoice | None,
-) -> partial[StylizationJob]:
-    """Return `plan_job` for the job of some inputs, given their refined scene and the choice of a time budget."""
-    return partial(
-        plan_job,
-        scene,
-        inputs.cameras,
-        inputs.style,
-        settings,
-        weights=weights,
-        measured=True,
-        orbit=inputs.orbit,
-        about_inputs=inputs.decisions,
-        regions=inputs.regions and inputs.regions.refined(refinement),
-        refinement=refinement,
-        chosen=chosen,
-    )
-
-
-def _refine(
-    inputs: Inputs, settings: Settings, weights: BackboneWeights, collectives: Collectives, show: ShowPlanning | None
-) -> Refinement | None:
-    """Return the refinement of the scene; None if `settings.refine` turns it off."""
-    return refine(
-        inputs.scene_file.scene, inputs.cameras, inputs.style, settings, weights=weights, collectives=collectives,
-        regions=inputs.regions, show=show,
+def _job_inputs(
+    inputs: Inputs, settings: Settings, weights: BackboneWeights, chosen: TimeChoice | None = None
+) -> JobInputs:
+    """Return the inputs of a job, given the choice of its time budget; without photos."""
+    return JobInputs(
+        inputs.scene_file.scene, inputs.cameras, inputs.style, settings, weights, regions=inputs.regions,
+        measured=True, orbit=inputs.orbit, about_inputs=inputs.decisions, chosen=chosen,
     )  # fmt: skip
 
 

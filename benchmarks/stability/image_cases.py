@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.stability.case import LOSS_BOUND, Case, CaseResult, compare_losses, flat, texture, vgg16
-from benchmarks.stability.sos_reference import style_loss_reference
-from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
+from benchmarks.stability.sos_reference import layer_statistics_reference, style_loss_reference
+from sgsst_core.features.statistics import layer_statistics
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import LayerTarget, style_loss

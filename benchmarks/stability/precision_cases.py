@@ -10,16 +10,12 @@ import numpy as np
 import torch
 
 from benchmarks.stability.case import Case, CaseResult, texture, vgg16
-from sgsst_core.features.statistics import (
-    LayerStatistics,
-    layer_statistics,
-    layer_statistics_reference,
-    merge,
-)
+from benchmarks.stability.sos_reference import layer_statistics_reference
+from sgsst_core.features.statistics import LayerStatistics, layer_statistics, merge
 from sgsst_core.features.vgg import FeatureNetwork
-from sgsst_core.loss.gradient_error import Difference
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import LayerTarget, style_loss
+from sgsst_core.quality.measure import Difference
 from sgsst_core.style import Style
 
 #: Relative error bound of a loss that is computed in partition tiles, for any number of tiles.

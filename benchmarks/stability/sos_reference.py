@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sgsst_core.constants import COARSEST_SHORTER_SIDE
 from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.features.statistics import LayerStatistics
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXEL_UNIT, PIXELS, layer_stride
 from sgsst_core.loss.terms import (
     PAPERS_WEIGHTS,
@@ -24,6 +25,17 @@ from sgsst_core.loss.terms import (
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.colors import WEIGHTS as LUMINANCE_WEIGHTS
 from sgsst_core.settings import StyleLossName
+
+
+def layer_statistics_reference(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
+    """Compute the statistics from their definition in float64, unblocked; reference of `layer_statistics`."""
+    flat = features.double().reshape(-1, features.shape[-1])
+    equal = torch.ones(flat.shape[0], dtype=torch.float64)
+    a = equal if position_weights is None else position_weights.double().reshape(-1)
+    count = a.sum()
+    mean = (a[:, None] * flat).sum(0) / count
+    centered = (flat - mean) * a[:, None].sqrt()
+    return LayerStatistics(count, mean, centered.T @ centered)
 
 
 @dataclass(frozen=True)

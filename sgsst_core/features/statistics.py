@@ -239,17 +239,6 @@ class _ShiftedSums:
         return LayerStatistics(count, mean, second - torch.outer(offset, offset) * count)
 
 
-def layer_statistics_reference(features: Tensor, position_weights: Tensor | None = None) -> LayerStatistics:
-    """Compute the statistics from their definition in float64, unblocked; reference of `layer_statistics`."""
-    flat = features.double().reshape(-1, features.shape[-1])
-    equal = torch.ones(flat.shape[0], dtype=torch.float64)
-    a = equal if position_weights is None else position_weights.double().reshape(-1)
-    count = a.sum()
-    mean = (a[:, None] * flat).sum(0) / count
-    centered = (flat - mean) * a[:, None].sqrt()
-    return LayerStatistics(count, mean, centered.T @ centered)
-
-
 # --- on a GPU ---
 
 

@@ -121,11 +121,6 @@ class LossGraphs:
         """Number of captured graphs."""
         return len(self._graphs)
 
-    @property
-    def visited(self) -> int:
-        """Number of keys whose next evaluation is captured or replayed."""
-        return len(self._visited)
-
     def clear(self) -> None:
         """Delete all graphs, for example because the partition is about to change."""
         self._graphs.clear()

@@ -24,10 +24,10 @@ from sgsst_core.loss.terms import (
     POSITION_TERMS,
     TERMS,
     ContentFeatures,
+    ContentTerm,
     LayerTarget,
     LossTerms,
-    Objective,
-    PositionTerm,
+    NearestTerm,
     StatisticsTerms,
     StyleTarget,
     StyleTargets,
@@ -53,7 +53,7 @@ from sgsst_core.parallel.division import (
 )
 from sgsst_core.scales import EVEN, ScaleWeights
 from sgsst_core.scene.colors import downscale, resize_area, style_size
-from sgsst_core.settings import Settings, StyleLossName, make_settings
+from sgsst_core.settings import Settings, StyleLossName
 from sgsst_core.style import Style, chosen_positions
 
 #: Default memory budget for activations in bytes; leaves most of a laptop's memory free.
@@ -79,7 +79,7 @@ class SosResult:
     def terms(self) -> dict[int, LossTerms]:
         """Loss of each scale, split into terms. Synchronizes with the device."""
         rows = zip(self.scales, self.values.tolist(), strict=True)
-        return {scale: LossTerms(**dict(zip(TERMS, row, strict=True))) for scale, row in rows}
+        return {scale: LossTerms(*row) for scale, row in rows}
 
     @property
     def loss(self) -> float:
@@ -109,7 +109,6 @@ class SosLoss:
         *,
         content_weight: float = 1.0,
         style_loss: StyleLossName = "sos",
-        settings: Settings | None = None,
         memory: int = DEFAULT_MEMORY,
         tile_size: int | None = None,
         coarsest: int = COARSEST_SHORTER_SIDE,
@@ -120,7 +119,7 @@ class SosLoss:
     ) -> None:
         self.network = network
         self.content_weight = content_weight
-        self._objective = Objective(network.name, style_loss, content_weight, settings or make_settings())
+        self._style_loss = style_loss
         self.memory = memory
         self.weights = scales
         self.timer = timer or Timer()
@@ -209,7 +208,8 @@ class SosLoss:
         inputs = TermInputs(
             scaled,
             self.network,
-            self._objective,
+            self._style_loss,
+            self.content_weight,
             _styled_regions(style, view),
             self._content(view, scaled.scale, tiles),
             view.coverage,
@@ -318,7 +318,7 @@ class _ScalePass:
     view: ScaledView
     tiles: list[PartitionTile]
     statistics: StatisticsTerms
-    terms: list[PositionTerm]
+    terms: list[ContentTerm | NearestTerm]
     values: Tensor = field(init=False)
 
 
@@ -340,7 +340,6 @@ def make_loss(
         network,
         content_weight=settings.content_weight if content_weight is None else content_weight,
         style_loss=settings.style_loss,
-        settings=settings,
         memory=memory,
         coarsest=settings.coarsest_side,
         style_scale=settings.style_scale,

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import math
 import operator
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import ClassVar, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -36,7 +35,7 @@ from sgsst_core.features.statistics import (
 )
 from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.parallel.division import Division, PositionWeights, ScaledView
-from sgsst_core.settings import Settings, StyleLossName, make_settings
+from sgsst_core.settings import StyleLossName
 
 
 @dataclass(frozen=True)
@@ -164,26 +163,12 @@ class ViewTarget:
 
 
 @dataclass(frozen=True)
-class Objective:
-    """Choice of terms.
-
-    Attributes:
-        network: Feature network, "vgg16" or "vgg19".
-        content_weight: lambda_c; 0 for no content term.
-    """
-
-    network: str
-    style_loss: StyleLossName = "sos"
-    content_weight: float = 1.0
-    settings: Settings = field(default_factory=make_settings)
-
-
-@dataclass(frozen=True)
 class TermInputs:
     """Inputs of the terms of one scale of a view.
 
     Attributes:
         regions: Style targets with the positions of their regions; a single one if the scene has no regions.
+        content_weight: lambda_c; 0 for no content term.
         content: Content features; None without a content term.
         coverage: Position weights of terms that do not depend on the style.
         content_weights: Position weights of the content term, relative to its weight; None for `coverage`.
@@ -191,7 +176,8 @@ class TermInputs:
 
     view: ScaledView
     network: FeatureNetwork
-    objective: Objective
+    style_loss: StyleLossName
+    content_weight: float
     regions: Sequence[StyleTarget]
     content: ContentFeatures | None
     coverage: PositionWeights
@@ -199,94 +185,34 @@ class TermInputs:
     timer: Timer
 
 
-class PositionTerm(ABC):
-    """Term that is a sum over the positions of one scale of a view.
+@dataclass(frozen=True)
+class LossTerms:
+    """Loss of one scale, split into its terms; the fields are the names in `TERMS`, in the same order."""
 
-    Every tile adds the positions that it owns. `POSITION_TERMS` in `terms` lists all such terms.
-
-    Attributes:
-        name: Name in files and reports.
-    """
-
-    name: ClassVar[str]
-    label: ClassVar[str]
-
-    @staticmethod
-    @abstractmethod
-    def layers(objective: Objective) -> tuple[str, ...]:
-        """Return the layers that the term reads; empty if the objective does not have it."""
-
-    @classmethod
-    @abstractmethod
-    def of(cls, inputs: TermInputs) -> Self | None:
-        """Return the term of one scale of a view; None if the loss does not have it."""
-
-    @abstractmethod
-    def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
-        """Return the contribution of the cells that a tile owns, float64 scalar.
-
-        Args:
-            features: Features [h, w, c] of the whole tile by layer.
-        """
-
-    @abstractmethod
-    def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool | None:
-        """Add the derivative of `value` with respect to a layer's features to a gradient in place.
-
-        It is called for every layer that the network reports.
-
-        Returns:
-            Whether the gradient was also passed through the layer's ReLU; None if nothing was added.
-
-        Args:
-            tile: Partition tile; `value` has been called for it.
-            features: [h, w, c], features of the whole tile.
-            gradient: [h, w, c], gradient of the whole tile.
-        """
-
-
-class LossTerms(Mapping[str, float]):
-    """Immutable mapping from every name in `TERMS` to its value: the loss of one scale, split into terms.
-
-    Args:
-        values: Values by name; missing terms are 0.
-
-    Raises:
-        TypeError: If a name is not in `TERMS`.
-    """
-
-    __slots__ = ("_values",)
-
-    def __init__(self, **values: float) -> None:
-        unknown = ", ".join(values.keys() - TERMS.keys())
-        if unknown:
-            raise TypeError(f"the loss has no term {unknown}; it has {', '.join(TERMS)}")
-        self._values = {name: values.get(name, 0.0) for name in TERMS}
+    gram: float = 0.0
+    mean: float = 0.0
+    std: float = 0.0
+    content: float = 0.0
+    nearest: float = 0.0
 
     @property
     def total(self) -> float:
         """Sum of all terms, the loss to minimize."""
         # `sum` rounds differently from Python 3.12 on, so results would depend on the interpreter.
-        return reduce(operator.add, self._values.values())
+        return float(reduce(operator.add, vars(self).values()))
 
     def __getitem__(self, name: str) -> float:
-        return self._values[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
+        return float(vars(self)[name])
 
     def __add__(self, other: LossTerms) -> LossTerms:
-        return LossTerms(**{name: value + other[name] for name, value in self.items()})
+        return LossTerms(*(value + other[name] for name, value in vars(self).items()))
+
+    def __mul__(self, factor: float) -> LossTerms:
+        return LossTerms(*(value * factor for value in vars(self).values()))
 
     def __truediv__(self, count: int) -> LossTerms:
         """Divide every term by a count, which turns a sum into a mean."""
-        return LossTerms(**{name: value / count for name, value in self.items()})
-
-    def __repr__(self) -> str:
-        return f"LossTerms({', '.join(f'{name}={value!r}' for name, value in self.items())})"
+        return LossTerms(*(value / count for value in vars(self).values()))
 
 
 #: Terms of the statistics: name in files and reports, and display name.
@@ -522,9 +448,7 @@ class StatisticsTerms:
             for layer in self._layers:
                 in_view, in_tile = tile.owned_cells(layer, self._view.size)
                 owned, weights = features[layer][in_tile.slices], self._view.weights(layer, in_view, region.positions)
-                nowhere = self._is_nowhere(weights)
-                zero = LayerStatistics.zero(owned.shape[-1], owned.device) if nowhere else None
-                statistics.append(zero or layer_statistics(owned, weights))
+                statistics.append(layer_statistics(owned, weights))
         return statistics
 
     def compare(self, statistics: Sequence[LayerStatistics]) -> dict[str, Tensor]:
@@ -567,16 +491,8 @@ class StatisticsTerms:
         relu, passed = layer != PIXELS and added.shape == gradient.shape, False
         for own, region in self._gradients.get(layer, ()):
             weights = self._view.weights(layer, in_view, region.positions)
-            if not self._is_nowhere(weights):
-                passed = own.add_to(added, owned, weights, relu=relu)
+            passed = own.add_to(added, owned, weights, relu=relu)
         return passed
-
-    def _is_nowhere(self, weights: Tensor | None) -> bool:
-        """Return whether the weights of a region in some cells are known to be all 0.
-
-        Weights on a GPU count as unknown, because reading them would synchronize with the device.
-        """
-        return len(self._regions) > 1 and weights is not None and not weights.is_cuda and not bool(weights.any())
 
 
 def fused_style_loss(
@@ -694,7 +610,7 @@ class ContentDifference:
 
 
 @dataclass(frozen=True)
-class ContentTerm(PositionTerm):
+class ContentTerm:
     """Content term of one scale of a view: lambda_c mean((F_42 - F_42^content)^2), the mean weighted by coverage.
 
     If the content weight differs between regions, the squared difference of position p counts v_p <= 1 times, where
@@ -705,17 +621,11 @@ class ContentTerm(PositionTerm):
     """
 
     name = "content"
-    label = "content"
 
     view: ScaledView
     content: ContentFeatures
     position_weights: PositionWeights
     factor: Tensor
-
-    @staticmethod
-    def layers(objective: Objective) -> tuple[str, ...]:
-        """Return the content layer, if the objective has a content term."""
-        return (CONTENT_LAYER,) if objective.content_weight else ()
 
     @classmethod
     def of(cls, inputs: TermInputs) -> Self | None:
@@ -724,20 +634,30 @@ class ContentTerm(PositionTerm):
             return None
         count = inputs.view.count(CONTENT_LAYER, inputs.coverage)
         network = inputs.network
-        weight = inputs.objective.content_weight * network.feature_unit**2 * network.loss_factor
+        weight = inputs.content_weight * network.feature_unit**2 * network.loss_factor
         factor = content_factor(count, network.channels(CONTENT_LAYER), weight)
         weights = inputs.coverage if inputs.content_weights is None else inputs.content_weights
         return cls(inputs.view, inputs.content, weights, factor)
 
     def value(self, tile: PartitionTile, features: Mapping[str, Tensor]) -> Tensor:
-        """Return the contribution of the cells that a tile owns, float64 scalar."""
+        """Return the contribution of the cells that a tile owns, float64 scalar, given features by layer."""
         owned = self._owned(tile, features[CONTENT_LAYER])
         if _can_be_fused(*owned[:2]):
             return self.factor * fused_content_sum(*owned)
         return self._difference(*owned).loss()
 
     def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool | None:
-        """Add the derivative of `value` with respect to a layer's features to a gradient in place."""
+        """Add the derivative of `value` with respect to a layer's features to a gradient in place.
+
+        It is called for every layer that the network reports, after `value` for the same tile.
+
+        Args:
+            features: [h, w, c], features of the whole tile.
+            gradient: [h, w, c], gradient of the whole tile.
+
+        Returns:
+            Whether the gradient was also passed through the layer's ReLU; None if nothing was added.
+        """
         if layer != CONTENT_LAYER:
             return None
         owned = self._owned(tile, features)
@@ -980,7 +900,7 @@ def search(units: Tensor, style: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @dataclass(frozen=True)
-class NearestTerm(PositionTerm):
+class NearestTerm:
     """Nearest-neighbor feature matching of one scale, after Zhang et al., "ARF: Artistic Radiance Fields" (ECCV 2022).
 
     E_nearest = w_n / n sum_p a_p (1 - max_k u_p . s_k)
@@ -1002,7 +922,6 @@ class NearestTerm(PositionTerm):
     """
 
     name = "nearest"
-    label = "nearest neighbors"
 
     view: ScaledView
     layer: str
@@ -1011,20 +930,16 @@ class NearestTerm(PositionTerm):
     regions: list[tuple[StyleVectors, Tensor, PositionWeights]]
     matches: dict[PartitionTile, list[Matches]] = field(default_factory=dict)
 
-    @staticmethod
-    def layers(objective: Objective) -> tuple[str, ...]:
-        """Return the matched layers."""
-        return nearest_layers(objective.style_loss, objective.network)
-
     @classmethod
     def of(cls, inputs: TermInputs) -> Self | None:
         """Return the term of one scale of a view; None if the loss does not have it."""
-        network, layers = inputs.network, cls.layers(inputs.objective)
+        network = inputs.network
+        layers = nearest_layers(inputs.style_loss, network.name)
         regions = []
         for style in inputs.regions if layers else ():
             if style.vectors is not None:
                 count = inputs.view.count(layers[0], style.positions)
-                weight = style.weight * nearest_weight(inputs.objective.style_loss, network.unit) * network.loss_factor
+                weight = style.weight * nearest_weight(inputs.style_loss, network.unit) * network.loss_factor
                 factor = weight / torch.where(count > 0, count, torch.inf)
                 regions.append((style.vectors, factor, style.positions))
         return cls(inputs.view, layers[0], network.rounding, inputs.timer, regions) if regions else None
@@ -1044,7 +959,7 @@ class NearestTerm(PositionTerm):
         return reduce(operator.add, sums)
 
     def add_gradient(self, tile: PartitionTile, layer: str, features: Tensor, gradient: Tensor) -> bool | None:
-        """Add the derivative of `value` with respect to a layer's features to a gradient in place."""
+        """Add the derivative of `value` to a gradient in place; as `ContentTerm.add_gradient`."""
         added = None
         for (vectors, factor, pyramid), matches in zip(self.regions, self.matches[tile], strict=True):
             if layer in vectors.parts:
@@ -1056,20 +971,14 @@ class NearestTerm(PositionTerm):
         return added
 
 
-#: Terms that are sums over positions.
-POSITION_TERMS: tuple[type[PositionTerm], ...] = (ContentTerm, NearestTerm)
-
-
 #: Terms whose sum is the loss of a scale: name in files and reports, and display name. Summation, display and chart
 #: colors follow this order.
-TERMS = STATISTICS_TERMS | {term.name: term.label for term in POSITION_TERMS}
+TERMS = STATISTICS_TERMS | {ContentTerm.name: "content", NearestTerm.name: "nearest neighbors"}
+#: Terms that are sums over the positions of a view. Every tile adds the positions that it owns.
+POSITION_TERMS = (ContentTerm, NearestTerm)
 
 
-def layers_of(
-    style_loss: StyleLossName, weights: BackboneWeights, *, content: bool, settings: Settings | None = None
-) -> tuple[str, ...]:
-    """Return every layer that a loss reads from a network; settings other than the defaults may add terms."""
-    objective = Objective(weights.name, style_loss, float(content), settings or make_settings())
-    read = [term.layers(objective) for term in POSITION_TERMS]
-    layers = (*statistics_layers(style_loss, weights), *(layer for every in read for layer in every))
-    return tuple(dict.fromkeys(layers))
+def layers_of(style_loss: StyleLossName, weights: BackboneWeights, *, content: bool) -> tuple[str, ...]:
+    """Return every layer that a loss reads from a network."""
+    layers = (*statistics_layers(style_loss, weights), *((CONTENT_LAYER,) if content else ()))
+    return tuple(dict.fromkeys((*layers, *nearest_layers(style_loss, weights.name))))

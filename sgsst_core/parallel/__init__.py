@@ -1,1 +1,1 @@
-"""Communication between ranks, and the division of work among them."""
+"""Communication between ranks, and the division of views into tiles and among ranks."""

@@ -290,7 +290,7 @@ def make_network(
     weights: BackboneWeights, settings: Settings, precision: PlannedPrecision, device: Device
 ) -> FeatureNetwork:
     """Create the feature network with layers up to the deepest one used."""
-    layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0, settings=settings)
+    layers = layers_of(settings.style_loss, weights, content=settings.content_weight > 0)
     use_whole_float32()
     ways = {"tf32": precision == "tf32", "winograd": precision == "winograd"}
     return FeatureNetwork(weights, layers, DTYPES[precision], device, **ways)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from sgsst_core.budget import measuring_memory, memory_for
+from sgsst_core.budget import memory_for
 from sgsst_core.errors import SettingsError
 from sgsst_core.loss.terms import MAX_VECTORS, NEAREST_WEIGHTS, has_statistics
 from sgsst_core.planning.facts import Device, Facts, Machine, NetworkPixels
@@ -316,11 +316,6 @@ def _visits_of_a_size(plan: Plan, facts: Facts, settings: Settings) -> int:
     return _visits(plan, settings) // different
 
 
-def _divides_views(plan: Plan, settings: Settings) -> bool:
-    """Return whether several ranks work on the same view."""
-    return plan.ranks > math.gcd(settings.views_per_step, plan.ranks)
-
-
 def _blend_weights(plan: Plan, facts: Facts, settings: Settings) -> tuple[CachedWeights, Decision]:
     """Choose the format of cached blend weights: float32 or half precision, as fits; none if it saves no time."""
     item, why_not = "blend weights", _why_not_cached(plan, facts, settings)
@@ -359,7 +354,7 @@ def _why_no_graphs(plan: Plan, facts: Facts, settings: Settings) -> str | None:
     visits = _visits_of_a_size(plan, facts, settings)
     if not facts.machine.graphs:
         return "CUDA graphs need an NVIDIA GPU and PyTorch 2.13 or later"
-    if _divides_views(plan, settings):
+    if plan.ranks > math.gcd(settings.views_per_step, plan.ranks):  # several ranks work on the same view
         return "a graph cannot contain communication between workers"
     if visits < _GRAPH_VISITS:
         return f"views of one size are visited only {visits:,} times"
@@ -389,7 +384,7 @@ def _with_memory(plan: Plan, facts: Facts, pixels: NetworkPixels) -> Plan:
     cached = 0 if plan.cached_weights == "none" else (facts.weight_bytes or (0, 0))[plan.cached_weights == "half"]
     used = needed + min(of_views, memory_for("views", memory) + spare // 2)
     used += min(facts.intersection_bytes + cached, memory_for("rasterizer", memory) + spare // 2)
-    used += min(measuring_memory(memory), 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered))
+    used += min(memory_for("measuring", memory), 4 * plan.novel_views * _TARGET_BYTES * areas // len(plan.covered))
     of_scene = facts.gaussians * (_GAUSSIAN_BYTES + 24 * (facts.sh_degree + 1) ** 2)
     process, device = _PROCESS_BYTES + of_scene + (used if plan.device == "cpu" else 0), None
     if plan.device == "cuda":

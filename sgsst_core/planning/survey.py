@@ -374,3 +374,11 @@ def fitted_psnr(photo: Tensor, render: Tensor, weight: Tensor) -> float:
     slope = (covariance / variance.clamp_min(_TINY)).clamp_min(0)  # an inverted photo is none of the scene
     error = float((w * (y - slope * x) ** 2).sum() / (3 * total))
     return -10 * math.log10(error + _TINY)
+
+
+def psnr(error: float) -> float:
+    """Return the PSNR in dB for a mean squared error of values in 0..1.
+
+    Errors below 1e-14, the float32 resolution, count as 1e-14.
+    """
+    return -10 * math.log10(max(error, 1e-14))

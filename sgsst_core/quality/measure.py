@@ -6,6 +6,7 @@ instead of cached. The result is within 1e-6 of the float64 reference (tests/sgs
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
@@ -17,13 +18,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sgsst_core.budget import measuring_memory
+from sgsst_core.budget import memory_for
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.scene_file import losses, read_scene
-from sgsst_core.loss.gradient_error import Difference, psnr
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import has_statistics, layers_of
+from sgsst_core.planning.survey import psnr
 from sgsst_core.quality.judge import LPIPS_NETWORK, Judge, Lpips, load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViews
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
@@ -31,7 +32,7 @@ from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import WHOLE_FLOAT32, StyleLossName
-from sgsst_core.stylizing.job import StyleTargetCache, StylizationJob
+from sgsst_core.stylizing.job import StylizationJob
 from sgsst_core.stylizing.steps import Evaluation, ShowViews, evaluate, show_nothing
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import Views, ViewTargets
@@ -56,7 +57,7 @@ class Measurements:
     @cached_property
     def exact(self) -> Float32Reference:
         """Exact loss and gradient of the job."""
-        return Float32Reference(self._stylizer, measuring_memory(self._stylizer.job.memory))
+        return Float32Reference(self._stylizer, memory_for("measuring", self._stylizer.job.memory))
 
     def evaluate(self, *, unstylized: bool = False) -> Evaluation:
         """Return the exact loss on the evaluation views, for the current colors or the unstylized scene."""
@@ -153,7 +154,7 @@ def make_novel_views(
         source.loss,
         source.style_targets,
         weighted=job.plan.weighted,
-        memory=measuring_memory(job.memory),
+        memory=memory_for("measuring", job.memory),
         **options,
     )
 
@@ -184,6 +185,34 @@ def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
 
 
 @dataclass(frozen=True)
+class Difference:
+    """Difference between two gradients.
+
+    Attributes:
+        relative_error: |actual - exact| / |exact| in the Euclidean norm. If the exact gradient is 0, the error is 0 if
+            the actual gradient is also 0, and 1 otherwise.
+        cosine: Cosine of the angle between the gradients. If one gradient is 0, the cosine is 1 if both are 0, and 0
+            otherwise.
+    """
+
+    relative_error: float
+    cosine: float
+
+    @staticmethod
+    def of(actual: Tensor, exact: Tensor) -> Difference:
+        """Compare two gradients of the same shape in float64. If a value is not finite, the error is infinite."""
+        error, length = (actual - exact).double().norm(), exact.double().norm()
+        product = float((actual.double() * exact.double()).sum())
+        lengths = float(actual.double().norm() * length)
+        if not math.isfinite(lengths):
+            return Difference(math.inf, 0.0)
+        return Difference(
+            float(error / length) if length > 0 else float(error > 0),
+            product / lengths if lengths > 0 else float(not error > 0),
+        )
+
+
+@dataclass(frozen=True)
 class GradientError(Difference):
     """Error of a color gradient relative to the exact one, over all optimized Gaussians.
 
@@ -211,11 +240,11 @@ class ExactLoss:
         settings = stylizer.job.settings
         settings = settings.model_copy(update={"style_loss": style_loss or settings.style_loss})
         with_content, weights = settings.content_weight > 0, stylizer.job.weights
-        layers = layers_of(settings.style_loss, weights, content=with_content, settings=settings)
+        layers = layers_of(settings.style_loss, weights, content=with_content)
         network = FeatureNetwork(weights, layers, torch.float32, stylizer.job.network.device)
         own = stylizer.job.loss
         self.loss = make_loss(network, settings, own.memory, content_weight=own.content_weight)
-        self.style_targets = StyleTargetCache(stylizer.job.styles.to(network.device), self.loss)
+        self.style_targets = stylizer.job.styles.cached_targets(self.loss)
 
 
 class Float32Reference(ExactLoss):

@@ -312,7 +312,7 @@ def _novel_views_json(measured: Sequence[dict[str, Any]]) -> dict[str, Any] | No
 
 
 def _evaluation_json(evaluation: Evaluation, weights: ScaleWeights) -> dict[str, Any]:
-    scales = {str(scale): {**terms, "total": terms.total} for scale, terms in evaluation.items()}
+    scales = {str(scale): {**vars(terms), "total": terms.total} for scale, terms in evaluation.items()}
     return {"total": mean_loss(evaluation, weights), "scales": scales}
 
 

@@ -1,1 +1,1 @@
-"""Optimization: views, steps, phases and checkpoints."""
+"""Optimization: inputs, styles and views of a job, its plan and steps, its colors, and checkpoints."""

@@ -10,10 +10,10 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,15 +22,10 @@ from safetensors.torch import save, save_file
 from torch import Tensor
 
 from sgsst_core.errors import CheckpointError
-from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.loss.feature_scale import EVEN_COLOR_SCALE, EVEN_PIXEL_SCALE, EVEN_SCALE
-from sgsst_core.loss.terms import LossTerms
-from sgsst_core.planning.plan import Plan, Work
-from sgsst_core.planning.survey import Survey
-from sgsst_core.planning.time_budget import TimeChoice
-from sgsst_core.progress import Decision
-from sgsst_core.refine import Refinement
+from sgsst_core.messages import from_json, to_json
+from sgsst_core.planning.plan import Plan
 from sgsst_core.regions import Regions
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -38,10 +33,12 @@ from sgsst_core.scene.rendering import CLASSIC
 from sgsst_core.scene.stored_harmonics import StoredHarmonics
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.steps import StepRecord, StylizerState
+from sgsst_core.stylizing.steps import StylizerState
+
+T = TypeVar("T")
 
 #: Increased whenever the meaning of a stored value changes.
-FORMAT_VERSION = "8"
+FORMAT_VERSION = "9"
 #: Settings that may differ between a checkpoint and the run that resumes from it. They only end the run or select
 #: measurements; the memory limit, which determines the partition, changes only rounding.
 _FREE_SETTINGS = {"within", "fixed", "target_loss", "early_stop", "memory_limit", "measure"}
@@ -187,16 +184,9 @@ def _add_regions(digest: Any, regions: Regions) -> None:
 
 
 def _write(path: Path, checkpoint: Checkpoint, job: str) -> None:
-    tensors, values = _plan_parts(checkpoint.plan)
-    for name, value in vars(checkpoint.state).items():
-        (tensors if isinstance(value, Tensor) else values)[name] = value
-    values["history"] = [
-        {**vars(record), "terms": {scale: dict(terms) for scale, terms in record.terms.items()}}
-        for record in checkpoint.state.history
-    ]
-    values |= {"ranks": checkpoint.ranks, "written_by": checkpoint.written_by}
+    tensors, metadata = _packed(checkpoint, job, checkpoint.run)
     try:
-        save_file(tensors, path, _metadata(tensors, job, checkpoint.run, values))
+        save_file(tensors, path, metadata)
     except SafetensorError as error:  # the operating system's error is contained only in the text
         if "os error" not in str(error).lower():
             raise
@@ -210,8 +200,7 @@ def save_plan(path: Path, plan: Plan, job: str, conditions: str) -> None:
     Args:
         conditions: Text about everything else that the plan depends on, such as the machine.
     """
-    tensors, values = _plan_parts(plan)
-    path.write_bytes(save(tensors, _metadata(tensors, job, conditions, values)))  # `save_file` replaces the file
+    path.write_bytes(save(*_packed(plan, job, conditions)))  # `save_file` replaces the file
 
 
 def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> tuple[Plan, str]:
@@ -223,11 +212,7 @@ def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> 
     Raises:
         CheckpointError: If there is no such file, or it is corrupt or of another job.
     """
-    tensors, metadata, values = _load(path, job)
-    try:
-        plan = _plan(tensors, values["plan"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise _unreadable(path, error) from error
+    plan, conditions = _load(path, job, Plan)
     count, refinement, fits = len(scene), plan.refinement, True
     views = len(plan.time_choice.views) if plan.time_choice else len(cameras)
     if refinement is not None:
@@ -244,13 +229,15 @@ def load_plan(path: Path, job: str, scene: Scene, cameras: Sequence[Camera]) -> 
     )
     if not fits:
         raise CheckpointError(f"{path}: is not a plan of this scene.")
-    return plan, metadata["run"]
+    return plan, conditions
 
 
-def _metadata(tensors: Mapping[str, Tensor], job: str, run: str, values: Mapping[str, Any]) -> dict[str, str]:
-    """Return the metadata of a file of a job, with a digest of all its content."""
-    metadata = {"version": FORMAT_VERSION, "job": job, "run": run, "values": json.dumps(values)}
-    return {**metadata, "digest": _digest(tensors, metadata)}
+def _packed(value: Checkpoint | Plan, job: str, run: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return the tensors of a file of a job, and its metadata with the other values and a digest of all content."""
+    tensors: dict[str, Tensor] = {}
+    values = json.dumps(to_json(value, tensors))
+    metadata = {"version": FORMAT_VERSION, "job": job, "run": run, "values": values}
+    return tensors, {**metadata, "digest": _digest(tensors, metadata)}
 
 
 def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
@@ -262,18 +249,14 @@ def load_checkpoint(path: Path, job: str, run: str | None = None) -> Checkpoint:
     Raises:
         CheckpointError: If the file is missing or corrupt, or belongs to another job or run.
     """
-    tensors, metadata, values = _load(path, job)
-    if run is not None and metadata["run"] != run:
+    checkpoint, written_by = _load(path, job, Checkpoint)
+    if run not in (None, written_by):
         raise CheckpointError(f"{path}: was written by an earlier run. Start again without --resume.")
-    try:
-        plan, state = _plan(tensors, values.pop("plan")), _state(tensors, values)
-        return Checkpoint(state, plan, values["ranks"], metadata["run"], values["written_by"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise _unreadable(path, error) from error
+    return checkpoint
 
 
-def _load(path: Path, job: str) -> tuple[dict[str, Tensor], dict[str, str], dict[str, Any]]:
-    """Return the tensors, the metadata and the other values of a file of a job, after checking its digest."""
+def _load(path: Path, job: str, kind: type[T]) -> tuple[T, str]:
+    """Return the value of a file of a job and what wrote it, after checking its digest."""
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint to resume from. Start again without --resume.")
     try:
@@ -289,13 +272,14 @@ def _load(path: Path, job: str) -> tuple[dict[str, Tensor], dict[str, str], dict
                 f"{path}: belongs to another job (scene, cameras, style, weights or settings differ). "
                 "Give the same ones as before, or start again without --resume."
             )
-        return tensors, metadata, json.loads(metadata["values"])
-    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: Exception) -> CheckpointError:
-    return CheckpointError(f"{path}: is not a readable checkpoint ({error}). Start again without --resume.")
+        value = from_json(json.loads(metadata["values"]), tensors)
+        if not isinstance(value, kind):
+            raise TypeError(f"it holds no {kind.__name__}")
+        return value, metadata["run"]
+    except (SafetensorError, AttributeError, KeyError, TypeError, ValueError, OSError, ImportError) as error:
+        raise CheckpointError(
+            f"{path}: is not a readable checkpoint ({error}). Start again without --resume."
+        ) from error
 
 
 def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
@@ -306,65 +290,3 @@ def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
         digest.update(repr((name, str(tensor.dtype), tuple(tensor.shape))).encode())
         digest.update(tensor.numpy().data)
     return digest.hexdigest()
-
-
-def _state(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> StylizerState:
-    """Return the state of a checkpoint from its tensors and other values."""
-    stored = {**values, **tensors, "generator": tensors["generator"].to(torch.uint8)}
-    stored["history"] = [
-        StepRecord(
-            **{
-                **entry,
-                "terms": {int(scale): LossTerms(**terms) for scale, terms in entry["terms"].items()},
-                "evaluated": tuple(entry["evaluated"]),
-            }
-        )
-        for entry in values["history"]
-    ]
-    return StylizerState(**{field.name: stored[field.name] for field in fields(StylizerState)})
-
-
-def _plan_parts(plan: Plan) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return the tensors of a plan, and its JSON-serializable values under "plan"."""
-    tensors = {
-        "plan.total_weights": plan.survey.total_blend_weights,
-        "plan.optimized": plan.optimized,
-        "plan.seen": plan.seen.clone(),  # may be `optimized`; the format rejects shared tensors
-    }
-    nothing = torch.empty(0)  # placeholder for tensors, which `asdict` would copy
-    refinement = plan.refinement
-    if refinement is not None:
-        tensors["plan.pieces"] = refinement.pieces
-        if refinement.sh_dc is not None:
-            tensors["plan.refined_sh_dc"] = refinement.sh_dc
-        plan = replace(plan, refinement=replace(refinement, pieces=nothing, sh_dc=None))
-    survey = replace(plan.survey, total_blend_weights=nothing)
-    values = asdict(replace(plan, survey=survey, optimized=nothing, seen=nothing))
-    if refinement is not None:
-        del values["refinement"]["pieces"], values["refinement"]["sh_dc"]
-    del values["optimized"], values["seen"], values["survey"]["total_blend_weights"]
-    return tensors, {"plan": values}
-
-
-def _plan(tensors: Mapping[str, Tensor], values: dict[str, Any]) -> Plan:
-    survey = values.pop("survey")
-    regions = [Rectangle(**region) for region in survey.pop("regions")]
-    decisions = tuple(Decision(**decision) for decision in values.pop("decisions"))
-    covered = tuple(values.pop("covered"))
-    work = Work(**values.pop("work"))
-    if chosen := values.pop("time_choice", None):
-        chosen = TimeChoice(**{**chosen, "views": tuple(chosen["views"])})
-    refined, refinement = values.pop("refinement", None), None
-    if refined:
-        refinement = Refinement(tensors["plan.pieces"], sh_dc=tensors.get("plan.refined_sh_dc"), **refined)
-    return Plan(
-        survey=Survey(total_blend_weights=tensors["plan.total_weights"], regions=regions, **survey),
-        optimized=tensors["plan.optimized"],
-        seen=tensors["plan.seen"],
-        covered=covered,
-        decisions=decisions,
-        work=work,
-        refinement=refinement,
-        time_choice=chosen,
-        **values,
-    )

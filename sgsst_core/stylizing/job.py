@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -13,7 +13,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from sgsst_core.budget import Cache, forget_device_peak, least_intersection_memory, measuring_memory, memory_for
+from sgsst_core.budget import Cache, forget_device_peak, memory_for
 from sgsst_core.devices import Timer
 from sgsst_core.errors import DeviceMemoryError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
@@ -22,14 +22,17 @@ from sgsst_core.loss.feature_scale import weights_for
 from sgsst_core.loss.graphs import LossGraphs
 from sgsst_core.loss.sos import SosLoss, SosResult, make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget, combined
+from sgsst_core.orbit import Orbit
 from sgsst_core.parallel.collectives import ALONE, Collectives, Team
 from sgsst_core.parallel.division import Size
 from sgsst_core.planning.facts import PlanningContext, make_network, sharing_memory
 from sgsst_core.planning.plan import Plan, ends_with_transfer
+from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.base import Color
 from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.refine import Refinement
 from sgsst_core.regions import ContentMaps, RegionMaps, Regions
 from sgsst_core.scene.camera import Camera, fit_cameras, spread
 from sgsst_core.scene.colors import ColorSubspace, color_subspace_of, style_size
@@ -41,6 +44,47 @@ from sgsst_core.stylizing.steps import Phase
 from sgsst_core.stylizing.views import PhotoLoader, Views, ViewTargets
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class JobInputs:
+    """Inputs of a job, the same on every rank.
+
+    Attributes:
+        scene: Scene to stylize, after refinement if there was one.
+        cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
+        weights: Weights of the feature network.
+        photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
+            for unstylized renders.
+        regions: Regions of the scene, each with its own style or frozen; None for one style everywhere.
+        rasterizer: Rasterizer that computes blend weights: "cpu", "triton" or "reference". None to choose one.
+        measured: Whether quality is measured and a report is written, as in `sgsst stylize`.
+        orbit: Orbit that produced the cameras, for the plan to report; None for cameras from files.
+        about_inputs: Decisions about cameras and photos that start the plan.
+        refinement: Refinement that produced the scene, for the plan to report; None if it was not refined.
+        chosen: Choice of the time budget, to which `cameras` and `photos` belong (`choose_within`); None without one.
+    """
+
+    scene: Scene
+    cameras: Sequence[Camera]
+    style: Style
+    settings: Settings
+    weights: BackboneWeights
+    photos: PhotoLoader | None = None
+    regions: Regions | None = None
+    rasterizer: str | None = None
+    measured: bool = False
+    orbit: Orbit | None = None
+    about_inputs: Sequence[Decision] = ()
+    refinement: Refinement | None = None
+    chosen: TimeChoice | None = None
+
+    def refined(self, refinement: Refinement | None, scene: Scene | None = None) -> JobInputs:
+        """Return the inputs with their scene refined, unless `scene` is the refined scene."""
+        if refinement is None:
+            return self
+        regions = self.regions and self.regions.refined(refinement)
+        return replace(self, scene=scene or refinement.of(self.scene), regions=regions, refinement=refinement)
 
 
 @dataclass(frozen=True)
@@ -109,6 +153,12 @@ class JobStyles:
             return style.map(lambda image: image.to(device))
 
         return replace(self, own=move(self.own), each=tuple(map(move, self.each)))
+
+    def cached_targets(self, loss: SosLoss) -> Callable[[Camera], StyleTargets]:
+        """Return a function that returns the targets for views of a camera's size, computed at first use."""
+        styles = self.to(loss.network.device)
+        targets = functools.cache(functools.partial(styles.targets, loss))
+        return lambda camera: targets((camera.height, camera.width))
 
     def targets(self, loss: SosLoss, view_size: Size) -> StyleTargets:
         """Compute the targets for views of a size (height, width); see `TargetBuilder.of_style`."""
@@ -233,36 +283,6 @@ def _inside(height: int, width: int, angle: float) -> tuple[int, int]:
     return max(int(down) - 2, 1), max(int(across) - 2, 1)
 
 
-class StyleTargetCache:
-    """Targets of the job's styles by view size, computed when a view first needs them.
-
-    Args:
-        styles: Styles of the job, on the network's device.
-
-    Attributes:
-        seconds: Time in seconds spent on computing targets.
-    """
-
-    def __init__(self, styles: JobStyles, loss: SosLoss) -> None:
-        self.seconds = 0.0
-        self._styles = styles
-        self._loss = loss
-        self._targets: dict[Size, StyleTargets] = {}
-
-    def __call__(self, camera: Camera) -> StyleTargets:
-        """Return the targets for views of the camera's size."""
-        size = (camera.height, camera.width)
-        if size not in self._targets:
-            started = time.perf_counter()
-            self._targets[size] = self._styles.targets(self._loss, size)
-            self.seconds += time.perf_counter() - started
-        return self._targets[size]
-
-    def clear(self) -> None:
-        """Clear the cache."""
-        self._targets.clear()
-
-
 @dataclass(frozen=True)
 class StylizationJob:
     """Context of a stylization, which steps only read; `prepare_job` creates it.
@@ -291,7 +311,7 @@ class StylizationJob:
     team: Team
     memory_limit: int
     memory: int
-    style_targets: StyleTargetCache
+    style_targets: Callable[[Camera], StyleTargets]
     survey_seconds: float = 0.0
 
     @property
@@ -393,35 +413,24 @@ class StylizationJob:
 
 def prepare_job(
     plan: Plan,
-    scene: Scene,
-    cameras: Sequence[Camera],
-    style: Style,
-    settings: Settings,
+    inputs: JobInputs,
     *,
-    weights: BackboneWeights,
-    photos: PhotoLoader | None = None,
     collectives: Collectives = ALONE,
     planning_context: PlanningContext | None = None,
-    regions: Regions | None = None,
 ) -> StylizationJob:
     """Prepare a planned job. Every rank calls this with the same arguments.
 
     Args:
-        plan: Plan for this scene, these cameras and settings, such as that of an earlier run of the same job.
-        scene: Scene to stylize, refined if the plan says so.
-        cameras: Cameras of the views; larger ones are reduced to `settings.max_resolution`.
-        photos: Function that loads the content image of a camera by its index, at the (reduced) size of the view; None
-            for unstylized renders.
+        plan: Plan for these inputs, such as that of an earlier run of the same job.
         planning_context: Planning context of the plan; None to create its objects again.
-        regions: Regions for which the plan was made, each with its own style or frozen; None for one style everywhere.
     """
-    weights = weights_for(weights, settings)
+    scene, settings = inputs.scene, inputs.settings
+    weights = weights_for(inputs.weights, settings)
     attenuated = planning_context.scene if planning_context else scene.attenuated(settings.sh_attenuation)
-    fitted = fit_cameras(cameras, settings)
+    fitted = fit_cameras(inputs.cameras, settings)
     blend_weights = plan.survey.total_blend_weights
-    styles = JobStyles.prepared(
-        style, regions and regions.resolved(blend_weights), settings, scene.sh_dc, blend_weights
-    )
+    regions = inputs.regions and inputs.regions.resolved(blend_weights)
+    styles = JobStyles.prepared(inputs.style, regions, settings, scene.sh_dc, blend_weights)
     forget_device_peak(plan.device)
     network = (
         planning_context.network(plan.precision)
@@ -462,7 +471,7 @@ def prepare_job(
         views,
         loss,
         weighted=plan.weighted,
-        photos=photos,
+        photos=inputs.photos,
         memory=view_memory(plan, memory),
         regions=plan.survey.regions if plan.weighted else None,
         background=settings.background,
@@ -485,7 +494,7 @@ def prepare_job(
         team=team,
         memory_limit=memory_limit,
         memory=memory,
-        style_targets=StyleTargetCache(styles.to(network.device), loss),
+        style_targets=styles.cached_targets(loss),
     )
 
 
@@ -494,12 +503,11 @@ def in_bfloat16(job: StylizationJob, step: int) -> StylizationJob:
     network = make_network(job.weights, job.settings, "bfloat16", job.plan.device)
     job.loss.use(network)
     job.view_targets.forget_division()
-    job.style_targets.clear()
     if job.graphs is not None:
         job.graphs.clear()
     line = Decision("precision", f"features in bfloat16 from step {step} on", "float16 has overflowed")
     plan = replace(job.plan, precision="bfloat16", decisions=(*job.plan.decisions, line))
-    return replace(job, network=network, plan=plan)
+    return replace(job, network=network, plan=plan, style_targets=job.styles.cached_targets(job.loss))
 
 
 def _make_rasterizer(
@@ -521,7 +529,7 @@ def _make_rasterizer(
     return CachedRasterizer(
         rendered,
         max_bytes=budget,
-        min_intersection_bytes=least_intersection_memory(memory),
+        min_intersection_bytes=memory_for("intersections", memory),
         precision="half" if plan.cached_weights == "half" else "float32",
         at_first_use=False,
         uncached=uncached,
@@ -532,9 +540,9 @@ def view_memory(plan: Plan, memory: int) -> int:
     """Return the budget in bytes for data of the views: what other caches leave of it, and half of `Plan.spare`."""
     left = memory_for("views", memory) + plan.spare // 2
     if plan.cached_weights != "none":
-        left -= least_intersection_memory(memory)
+        left -= memory_for("intersections", memory)
     if plan.measured:
-        left -= (2 if plan.is_approximated else 1) * measuring_memory(memory)
+        left -= (2 if plan.is_approximated else 1) * memory_for("measuring", memory)
     return left
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +32,7 @@ from sgsst_core.settings import PresetName, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.planner import NETWORK_PARTS, Rates, estimate
 from sgsst_core.stylizing.progress_bar import JobBar, job_bar
-from sgsst_core.stylizing.steps import RunningRound, mean_loss
+from sgsst_core.stylizing.steps import Evaluation, mean_loss, round_evaluation, round_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import PhotoLoader
 
@@ -88,42 +88,39 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     """
     callbacks = replace(callbacks or Callbacks())
     callbacks.left = callbacks.left or seconds_left(stylizer.job.settings.within)
-    try:
-        last_checkpoint = last_preview = time.perf_counter()
-        pace, ended = _Pace(stylizer), partial(_end_requested, stylizer, callbacks, stylizer.step)
-        report = _Reports(stylizer, callbacks, pace)
-        if callbacks.preview and not stylizer.step:
-            callbacks.preview(stylizer)
-        if stylizer.step:  # a resumed job may have had more steps than were chosen at first
-            _steer(stylizer, callbacks, pace, at_once=True)
-        while stylizer.step < stylizer.job.total_steps:
-            reason = stylizer.job.collectives.broadcast(partial(ended, pace)) or _enough(stylizer)
-            if reason:
-                stylizer.read_step()
-                pace.remember()
-                report(last=True)
-                if callbacks.checkpoint:
-                    _checkpoint(stylizer, callbacks.checkpoint)
-                return reason
-            stylizer.queue_step()
-            _steer(stylizer, callbacks, pace)
-            now = time.perf_counter()
-            last = stylizer.step == stylizer.job.total_steps
-            if last:
-                stylizer.read_step()
-            report(last=last)
-            if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
+    last_checkpoint = last_preview = time.perf_counter()
+    pace, ended = _Pace(stylizer), partial(_end_requested, stylizer, callbacks, stylizer.step)
+    report = _Reports(stylizer, callbacks, pace)
+    if callbacks.preview and not stylizer.step:
+        callbacks.preview(stylizer)
+    if stylizer.step:  # a resumed job may have had more steps than were chosen at first
+        _steer(stylizer, callbacks, pace, at_once=True)
+    while stylizer.step < stylizer.job.total_steps:
+        reason = stylizer.job.collectives.broadcast(partial(ended, pace)) or _enough(stylizer)
+        if reason:
+            stylizer.read_step()
+            pace.remember()
+            report(last=True)
+            if callbacks.checkpoint:
                 _checkpoint(stylizer, callbacks.checkpoint)
-                last_checkpoint = time.perf_counter()
-            if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
-                callbacks.preview(stylizer)
-                last_preview = time.perf_counter()
-            pace.add_beside(time.perf_counter() - now)
-        pace.remember()
-        choice = stylizer.job.plan.time_choice
-        return "within" if choice and stylizer.job.settings.steps_sos < choice.all_steps else "finished"
-    finally:
-        stylizer.job.view_targets.end_prefetch()
+            return reason
+        stylizer.queue_step()
+        _steer(stylizer, callbacks, pace)
+        now = time.perf_counter()
+        last = stylizer.step == stylizer.job.total_steps
+        if last:
+            stylizer.read_step()
+        report(last=last)
+        if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
+            _checkpoint(stylizer, callbacks.checkpoint)
+            last_checkpoint = time.perf_counter()
+        if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
+            callbacks.preview(stylizer)
+            last_preview = time.perf_counter()
+        pace.add_beside(time.perf_counter() - now)
+    pace.remember()
+    choice = stylizer.job.plan.time_choice
+    return "within" if choice and stylizer.job.settings.steps_sos < choice.all_steps else "finished"
 
 
 class _Pace:
@@ -243,24 +240,22 @@ class _Reports:
 
     def __init__(self, stylizer: Stylizer, callbacks: Callbacks, pace: _Pace) -> None:
         self._stylizer, self._callbacks, self._pace = stylizer, callbacks, pace
-        self._running = RunningRound(stylizer.job.round_length, stylizer.job.loss.weights, stylizer.history)
-        self._added = self._reported = len(stylizer.history)
+        self._reported = len(stylizer.history)
         self._at = -math.inf
 
     def __call__(self, *, last: bool) -> None:
         """Report the latest known step, unless it has been reported, or it is not the last and a report is recent."""
         if self._callbacks.progress is None:
             return
-        history, now = self._stylizer.history, time.perf_counter()
-        for record in history[self._added :]:
-            self._running.add(record)
-        self._added = len(history)
-        if self._reported < self._added and (last or now - self._at >= self._callbacks.progress_seconds):
-            self._reported, self._at = self._added, now
+        known, now = len(self._stylizer.history), time.perf_counter()
+        if self._reported < known and (last or now - self._at >= self._callbacks.progress_seconds):
+            self._reported, self._at = known, now
             self._callbacks.progress(self._progress())
 
     def _progress(self) -> Progress:
-        stylizer, record, running = self._stylizer, self._stylizer.history[-1], self._running
+        stylizer, record = self._stylizer, self._stylizer.history[-1]
+        length, weights = stylizer.job.round_length, stylizer.job.loss.weights
+        means = round_evaluation(stylizer.history, length, weights)
         left = self._pace.left()
         return Progress(
             stage=record.stage,
@@ -268,16 +263,16 @@ class _Reports:
             total=stylizer.job.total_steps,
             eta_s=left if self._callbacks.left is None else min(left, max(self._callbacks.left(), 0.0)),
             loss=record.loss,
-            scales=_by_scale({scale: terms.total for scale, terms in record.terms.items()}),
-            mean_loss=running.loss,
-            mean_scales=_by_scale(running.scales()),
+            scales=_by_scale(record.terms),
+            mean_loss=round_loss(stylizer.history, length),
+            mean_scales=_by_scale(means),
             seconds=stylizer.seconds,
         )
 
 
-def _by_scale(losses: Mapping[int, float]) -> list[float | None] | None:
-    """Return losses by scale, full size first and None for skipped scales; None without losses."""
-    return [losses.get(scale) for scale in range(max(losses, default=-1) + 1)] or None
+def _by_scale(evaluation: Evaluation) -> list[float | None]:
+    """Return losses by scale, full size first and None for skipped scales."""
+    return [evaluation[scale].total if scale in evaluation else None for scale in range(max(evaluation) + 1)]
 
 
 def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:

@@ -19,14 +19,12 @@ from torch import Tensor
 
 from sgsst_core.budget import memory_for
 from sgsst_core.constants import SH_C0
-from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.loss.feature_scale import weights_for
-from sgsst_core.loss.gradient_error import psnr
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.planning.facts import PlanningContext, equip
-from sgsst_core.planning.survey import ShowPlanning, progress_of, sees_something
+from sgsst_core.planning.survey import ShowPlanning, progress_of, psnr, sees_something
 from sgsst_core.progress import Progress
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.refine import (
@@ -42,14 +40,12 @@ from sgsst_core.refine import (
     piece_counts,
     split,
 )
-from sgsst_core.regions import Regions
 from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
-from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.color_transfer import with_moments
-from sgsst_core.stylizing.job import prepared_style
+from sgsst_core.stylizing.job import JobInputs, prepared_style
 
 #: Number of evenly spread views whose gradient is computed; each costs an iteration.
 GRADIENT_VIEWS = 24
@@ -63,39 +59,25 @@ _ROUNDS, _TAKEN_BACK = 24, 0.25
 
 
 def refine(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    style: Style,
-    settings: Settings,
-    *,
-    weights: BackboneWeights,
-    rasterizer: str | None = None,
-    collectives: Collectives = ALONE,
-    regions: Regions | None = None,
-    show: ShowPlanning | None = None,
+    inputs: JobInputs, *, collectives: Collectives = ALONE, show: ShowPlanning | None = None
 ) -> Refinement | None:
     """Decide which Gaussians to split, and into how many. All ranks must call this, and get the same result.
 
     Args:
-        rasterizer: Name of the rasterizer, as in `plan_job`.
-        regions: Regions of the scene; frozen Gaussians are not split.
+        inputs: Inputs of a job; frozen Gaussians of its regions are not split.
         show: Callback, called before each view that is surveyed, before each view whose gradient is computed, and
             before images are compared.
 
     Returns:
         The refinement; None if `settings.refine` turns it off.
     """
+    settings = inputs.chosen.applied(inputs.settings) if inputs.chosen else inputs.settings
     if settings.growth <= 1:
         return None
-    fitted = fit_cameras(cameras, settings)
-    planning_context = equip(scene, fitted, settings, weights_for(weights, settings), collectives, rasterizer)
-    frozen = None if regions is None else regions.frozen
-    return _Refining(planning_context, style, collectives, frozen, show).run()
-
-
-def refined(scene: Scene, refinement: Refinement | None) -> Scene:
-    """Return the refined scene, or the scene itself without a refinement."""
-    return scene if refinement is None else refinement.of(scene)
+    fitted, weights = fit_cameras(inputs.cameras, settings), weights_for(inputs.weights, settings)
+    context = equip(inputs.scene, fitted, settings, weights, collectives, inputs.rasterizer)
+    frozen = None if inputs.regions is None else inputs.regions.frozen
+    return _Refining(context, inputs.style, collectives, frozen, show).run()
 
 
 @dataclass(frozen=True)

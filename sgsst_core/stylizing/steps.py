@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import math
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sgsst_core.loss.terms import LossTerms, StyleTargets
-from sgsst_core.scales import EVEN, ScaleWeights, log_loss, ratio, smoothed
+from sgsst_core.scales import EVEN, ScaleWeights, ratio, smoothed
 from sgsst_core.scene.camera import Camera
 from sgsst_core.stylizing.views import ViewTargets
 
@@ -50,11 +49,6 @@ def phase_at(schedule: Sequence[Phase], step: int) -> Phase:
     return schedule[-1]
 
 
-def drawn_round(covered: Sequence[int], generator: torch.Generator) -> list[int]:
-    """Return every view once in random order, for taking views from the end of the list."""
-    return [covered[i] for i in torch.randperm(len(covered), generator=generator).tolist()]
-
-
 class ViewOrder:
     """Random order of the views of a job, in which every view comes once before any comes again.
 
@@ -70,15 +64,9 @@ class ViewOrder:
     def next_view(self) -> int:
         """Remove and return the next view. Rounds are drawn lazily, because checkpoints store the rest of a round."""
         if not self.left:
-            self.left = drawn_round(self._covered, self.generator)
+            drawn = torch.randperm(len(self._covered), generator=self.generator)
+            self.left = [self._covered[index] for index in drawn.tolist()]
         return self.left.pop()
-
-
-def drawn_views(covered: Sequence[int], seed: int) -> Iterator[int]:
-    """Yield the views of all steps of a job from its start, round after round."""
-    generator = torch.Generator().manual_seed(seed)
-    while True:
-        yield from reversed(drawn_round(covered, generator))
 
 
 def drawn_scales(chosen: Sequence[int], period: int, seed: int, view: int, visit: int) -> list[int]:
@@ -209,7 +197,7 @@ def completed(evaluation: Evaluation, scales: Sequence[int], view: int, history:
         last = _last_with({scale, coarsest}, history, view) or _last_with({scale, coarsest}, history)
         if last:
             factor = ratio(evaluation[coarsest].total, last[coarsest].total) or 0.0
-            result[scale] = LossTerms(**{name: value * factor for name, value in last[scale].items()})
+            result[scale] = last[scale] * factor
     return dict(sorted(result.items()))
 
 
@@ -232,45 +220,7 @@ def round_evaluation(history: Sequence[StepRecord], round_length: int, weights: 
     evaluation = mean_evaluation([record.terms for record in _last_round(history, round_length)])
     mean = mean_loss(evaluation, weights)
     factor = round_loss(history, round_length) / mean if mean > 0 else 1.0
-    return {
-        scale: LossTerms(**{name: value * factor for name, value in terms.items()})
-        for scale, terms in evaluation.items()
-    }
-
-
-class RunningRound:
-    """Losses of the last round of views, step by step."""
-
-    def __init__(self, round_length: int, weights: ScaleWeights, history: Sequence[StepRecord] = ()) -> None:
-        self._weights = weights
-        self._stage = ""
-        #: Logarithm of the loss, and total of each scale.
-        self._steps: deque[tuple[float, dict[int, float]]] = deque(maxlen=round_length)
-        for record in history[-round_length:]:
-            self.add(record)
-
-    def add(self, record: StepRecord) -> None:
-        """Add a step, and drop the one that is a round older."""
-        if record.stage != self._stage:
-            self._stage = record.stage
-            self._steps.clear()
-        self._steps.append((log_loss(record.loss), {scale: terms.total for scale, terms in record.terms.items()}))
-
-    @property
-    def loss(self) -> float:
-        """The `round_loss` of the steps."""
-        return math.exp(sum(log for log, _ in self._steps) / len(self._steps))
-
-    def scales(self) -> dict[int, float]:
-        """Return the total of each scale in the `round_evaluation` of the steps."""
-        totals: dict[int, list[float]] = {}
-        for _, step in self._steps:
-            for scale, total in step.items():
-                totals.setdefault(scale, []).append(total)
-        means = {scale: sum(own) / len(own) for scale, own in totals.items()}
-        mean = self._weights.mean(means)
-        factor = self.loss / mean if mean > 0 else 1.0
-        return {scale: factor * total for scale, total in means.items()}
+    return {scale: terms * factor for scale, terms in evaluation.items()}
 
 
 def _last_round(history: Sequence[StepRecord], round_length: int) -> list[StepRecord]:

@@ -37,9 +37,9 @@ from sgsst_core.scene.gaussians import Scene, checked_scene
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style, image_of
-from sgsst_core.stylizing.job import JobStyles, StylizationJob, in_bfloat16, with_second_attempt
+from sgsst_core.stylizing.job import JobInputs, JobStyles, StylizationJob, in_bfloat16, with_second_attempt
 from sgsst_core.stylizing.planner import choose_within, plan_job
-from sgsst_core.stylizing.refining import refine, refined
+from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.steps import (
     BEFORE_STEPS,
     Evaluation,
@@ -50,7 +50,6 @@ from sgsst_core.stylizing.steps import (
     ViewOrder,
     completed,
     drawn_scales,
-    drawn_views,
     evaluate,
     mean_evaluation,
     mean_loss,
@@ -439,34 +438,22 @@ class Stylizer:
             >>> stylizer.job.total_steps
             2
         """
-        style, regions = Style.given(style), regions and regions.with_checked_styles()
-        scene, cameras = checked_scene(scene), checked_cameras(cameras)
-        weights = weights or load_network_weights("auto")
-        left = left or seconds_left(settings.within)
-        chosen = left and choose_within(
-            scene, cameras, settings, left, weights=weights, rasterizer=rasterizer, collectives=collectives
-        )
-        views = chosen.views if chosen else range(len(cameras))
-        cameras = [cameras[index] for index in views]
-        applied = chosen.applied(settings) if chosen else settings
-        refinement = refine(
-            scene, cameras, style, applied, weights=weights, rasterizer=rasterizer, collectives=collectives,
-            regions=regions, show=show,
-        )  # fmt: skip
-        job = plan_job(
-            refined(scene, refinement),
-            cameras,
-            style,
-            settings,
-            photos=photos and (lambda index: image_of(photos(views[index]), f"photo of view {views[index]}")),
-            regions=regions and regions.refined(refinement),
-            refinement=refinement,
-            weights=weights,
+        inputs = JobInputs(
+            checked_scene(scene), checked_cameras(cameras), Style.given(style), settings,
+            weights or load_network_weights("auto"), regions=regions and regions.with_checked_styles(),
             rasterizer=rasterizer,
-            collectives=collectives,
-            show=show,
+        )  # fmt: skip
+        left = left or seconds_left(settings.within)
+        chosen = left and choose_within(inputs, left, collectives)
+        views = chosen.views if chosen else range(len(cameras))
+        inputs = replace(
+            inputs,
+            cameras=[inputs.cameras[index] for index in views],
+            photos=photos and (lambda index: image_of(photos(views[index]), f"photo of view {views[index]}")),
             chosen=chosen,
         )
+        inputs = inputs.refined(refine(inputs, collectives=collectives, show=show))
+        job = plan_job(inputs, collectives=collectives, show=show)
         return cls(job)
 
     @property
@@ -594,13 +581,12 @@ class Stylizer:
         results = []
         cost = 0
         own_views = views[self.job.team.own_group :: self.job.team.groups]
-        for position, index in enumerate(own_views):
+        for index in own_views:
             scales = self._scales(index, phase, self.step, views[0])
             background = self.drawn_background(index)
             with self.job.timer("prepare", whole=True):
                 self.job.views.cache_weights(index)
                 target = self.job.view_targets.target(index, list(scales), background)
-                self._prefetch(own_views[position + 1 :], phase)
                 style = self.job.style_targets(self.job.views.cameras[index])
             assert target.division is not None
             cost += target.division.cost(self.job.group.rank, self.job.network.halo)
@@ -656,24 +642,6 @@ class Stylizer:
             evaluations = [terms for part in every for terms in part]
         return mean_evaluation(evaluations)
 
-    def _prefetch(self, left: Sequence[int], phase: Phase) -> None:
-        """Announce the view that this group processes next, so that its data can be read while the device works.
-
-        The queue is only inspected, not refilled: a new round is drawn only when it is needed, because checkpoints
-        contain the queue and the random state.
-
-        Args:
-            left: Remaining views of this group in the present step.
-        """
-        if left:
-            index = left[0]
-        elif self.step + 1 < self.job.total_steps and len(self._order.left) > self.job.team.own_group:
-            index, phase = self._order.left[-1 - self.job.team.own_group], phase_at(self.job.schedule, self.step + 1)
-        else:
-            return
-        step, first = (self.step, self.latest[0]) if left else (self.step + 1, self._order.left[-1])
-        self.job.view_targets.prefetch(index, list(self._scales(index, phase, step, first)))
-
     def _scales(self, index: int, phase: Phase, step: int, first: int) -> Sequence[int] | Mapping[int, float]:
         """Return the scales of a view that a step evaluates, finest first; with their weights if they are drawn.
 
@@ -727,10 +695,10 @@ class Stylizer:
         steps, self._visited_before = self._visited_before, 0
         if not steps:
             return
-        order = drawn_views(self.job.views.covered, self.job.settings.seed)
+        order = ViewOrder(self.job.views.covered, self.job.settings.seed)
         with self.job.timer("prepare"):
             for _ in range(steps):
-                views = [next(order) for _ in range(self.job.settings.views_per_step)]
+                views = [order.next_view() for _ in range(self.job.settings.views_per_step)]
                 for index in views[self.job.team.own_group :: self.job.team.groups]:
                     self.job.views.cache_weights(index)
 

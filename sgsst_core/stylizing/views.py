@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -58,7 +57,7 @@ class Views:
     Args:
         scene: Scene that provides the frozen part of the colors.
         covered: Indices of the views that see anything.
-        memory: See `limit`.
+        memory: Memory budget in bytes for everything that is cached about views; a quarter of it is for colors.
         clamp_aware_gradient: Whether to use the clamp-aware gradient (`view_colors_gradient`).
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
         divider: Divider of each view among the ranks that render it together; None for a single rank.
@@ -92,21 +91,15 @@ class Views:
         self._divider = divider
         self._regions = regions
         self._shares: dict[int, Shares] = {}
-        self._shown: Cache[int, ShownGaussians] = Cache(0)
-        self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory)
-        self.limit(memory)
+        shown = memory // 16 if self.collectives.size > 1 else 0
+        self._shown: Cache[int, ShownGaussians] = Cache(shown)
+        self.colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 4 - shown)
         self._sh_dc = scene.sh_dc.to(rasterizer.device)
 
     @property
     def caches(self) -> dict[str, Cache[Any, Any]]:
         """Caches of data of the views by name, "weights" before "intersections"."""
         return {"colors": self.colors.cache, "shown": self._shown, **self.rasterizer.caches}
-
-    def limit(self, memory: int) -> None:
-        """Set the memory budget in bytes for everything that is cached about views; a quarter of it is for colors."""
-        shown = memory // 16 if self.collectives.size > 1 else 0
-        self._shown.limit(shown)
-        self.colors.cache.limit(memory // 4 - shown)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -248,65 +241,6 @@ class Views:
 PhotoLoader = Callable[[int], Tensor]
 
 
-class PhotosAhead:
-    """Loader that copies photos to a GPU without synchronizing, and prefetches one of them in a thread.
-
-    Photos are loaded into pinned memory, so that a copy is just another entry in the device's stream. This memory is
-    not overwritten before the copy is done: PyTorch marks pinned memory with an event at each such copy, and reuses it
-    only once the device has reached that event. At most one photo is prefetched at a time, and the thread exists only
-    between `start` and `stop`.
-
-    The thread may allocate pinned memory while a graph is being captured, which invalidates the capture, unless the
-    capture is restricted to its own thread (`capture_error_mode="thread_local"`).
-
-    Args:
-        load: Function that reads a photo; also called in the thread.
-    """
-
-    def __init__(self, load: PhotoLoader, device: torch.device) -> None:
-        self._load = load
-        # A new thread starts on the first device, so the device must be explicit.
-        self._device = torch.device("cuda", torch.cuda.current_device()) if device.index is None else device
-        self._thread: ThreadPoolExecutor | None = None
-        self._next: tuple[int, Future[Tensor]] | None = None
-
-    def start(self, index: int) -> None:
-        """Start reading a photo in the thread; a different prefetched photo is discarded."""
-        if self._next is not None:
-            if self._next[0] == index:
-                return
-            self._next[1].cancel()
-            self._next = None
-        if self._thread is None:
-            self._thread = ThreadPoolExecutor(1, thread_name_prefix="photo")
-        self._next = index, self._thread.submit(self._pinned, index)
-
-    def __call__(self, index: int) -> Tensor:
-        """Return a photo [H, W, 3] on the device; it is read now unless it has been prefetched.
-
-        Raises:
-            ImageError: If reading fails.
-        """
-        if self._next is not None and self._next[0] == index:
-            photo, self._next = self._next[1], None
-            return self._copied(photo.result())
-        return self._copied(self._pinned(index))
-
-    def stop(self) -> None:
-        """Stop the thread, and discard what it has read. `start` starts a new one."""
-        if self._thread is not None:
-            self._thread.shutdown(cancel_futures=True)
-        self._thread = self._next = None
-
-    def _pinned(self, index: int) -> Tensor:
-        photo = self._load(index)
-        with torch.cuda.device(self._device):
-            return photo.pin_memory()
-
-    def _copied(self, photo: Tensor) -> Tensor:
-        return photo.to(self._device, non_blocking=True)
-
-
 _BITS = 53  # bits of a float64's fraction
 
 
@@ -368,8 +302,9 @@ class ViewTargets:
         loss: Loss that prepares the targets, of the same ranks that render the views.
         weighted: Whether statistics are weighted by rendered coverage.
         photos: Function that loads the content image [H, W, 3] of a view by its index; None for unstylized renders.
-            With a GPU it is also called in a thread, see `prefetch`.
-        memory: See `limit`.
+        memory: Memory budget in bytes for everything that is cached about views. A quarter of it is for colors
+            (`Views`), one for coverage, and one for region maps; content uses the rest. On a GPU, content also uses the
+            quarter for coverage if there are no position weights.
         regions: Rectangle of each view that contains all covered pixels; None if unknown.
         background: Background color of the rasterizer.
         drawn: Whether the background color changes from step to step; content images are then cached instead of
@@ -396,20 +331,19 @@ class ViewTargets:
         self.loss = loss
         self.weighted = weighted
         self.photos = photos
-        device = loss.network.device
-        self._ahead = PhotosAhead(photos, device) if photos is not None and device.type == "cuda" else None
         self._regions = regions
         self._background = background
-        self._drawn = drawn
         self._maps = maps
         self._content_maps = content_maps
-        self._coverage: Cache[int, list[Tensor]] = Cache(0, _pyramid_bytes)
+        has_maps = maps is not None or content_maps is not None
+        cached = int(memory * content_fraction(loss.network.device.type, weighted=weighted, has_maps=has_maps))
+        images = cached // 2 if drawn else 0
+        self._coverage: Cache[int, list[Tensor]] = Cache(memory // 4, _pyramid_bytes)
         self._region_weights: Cache[tuple[int, bool], list[list[Tensor]]] = Cache(
-            0, lambda every: sum(map(_pyramid_bytes, every))
+            memory // 4 if has_maps else 0, lambda every: sum(map(_pyramid_bytes, every))
         )
-        self._images: Cache[_ContentKey, ScaledView] = Cache(0, _image_bytes)
-        self._content: Cache[_ContentKey, ContentFeatures] = Cache(0)
-        self.limit(memory)
+        self._images: Cache[_ContentKey, ScaledView] = Cache(images, _image_bytes)
+        self._content: Cache[_ContentKey, ContentFeatures] = Cache(cached - images)
         self._divisions: dict[tuple[int, tuple[int, ...]], Division] = {}
 
     @property
@@ -421,22 +355,6 @@ class ViewTargets:
             "images": self._images,
             "content": self._content,
         }
-
-    def limit(self, memory: int) -> None:
-        """Set the memory budget in bytes for everything that is cached about views.
-
-        A quarter of it is for colors (`Views`), one for coverage, and one for region maps; content uses the rest. On a
-        GPU, content also uses the quarter for coverage if there are no position weights.
-        """
-        has_maps = self._maps is not None or self._content_maps is not None
-        cached = int(
-            memory * content_fraction(self.loss.network.device.type, weighted=self.weighted, has_maps=has_maps)
-        )
-        images = cached // 2 if self._drawn else 0
-        self._coverage.limit(memory // 4)
-        self._region_weights.limit(memory // 4 if has_maps else 0)
-        self._images.limit(images)
-        self._content.limit(cached - images)
 
     def target(self, index: int, scales: Sequence[int], background: Color | None = None) -> ViewTarget:
         """Return the target of a view at some scales; cached if it fits.
@@ -477,10 +395,8 @@ class ViewTargets:
 
         Photos are on the GPU if there is one.
         """
-        if self._ahead is not None:
-            return self._ahead(index)
         if self.photos is not None:
-            return self.photos(index)
+            return self.photos(index).to(self.loss.network.device)
         return self.views.unstylized(index)
 
     def coverage(self, index: int) -> list[Tensor]:
@@ -514,30 +430,12 @@ class ViewTargets:
             coverage = coverage[shares.windows[self.views.collectives.rank].slices]
         return replace_background(image.to(self.loss.network.device), coverage, color, self._background)
 
-    def prefetch(self, index: int, scales: Sequence[int]) -> None:
-        """Start reading, on a GPU, the photo of the view whose target is requested next, if it will be needed."""
-        if self._ahead is not None and self._needs_content(index, scales):
-            self._ahead.start(index)
-
-    def end_prefetch(self) -> None:
-        """Stop prefetching until the next call of `prefetch`."""
-        if self._ahead is not None:
-            self._ahead.stop()
-
     def forget_division(self) -> None:
         """Clear the caches that depend on the division of work, because it is about to change."""
         self._content.clear()
         self._images.clear()
         self._divisions.clear()
         self.views.forget_shares()
-
-    def _needs_content(self, index: int, scales: Sequence[int]) -> bool:
-        """Return whether the content features of a view at some scales, or their images, are not cached."""
-        if not self.loss.content_weight:
-            return False
-        cache = self._images if self._drawn else self._content
-        division = self._divisions.get((index, tuple(scales)))  # content is cached only after its division is known
-        return division is None or any((index, scale, division.pieces[scale]) not in cache for scale in scales)
 
     def _content_images(self, index: int, division: Division) -> ViewImages:
         """Return the content image of a view at the scales of a division."""

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from benchmarks.stability.sos_reference import layer_statistics_reference
 from sgsst_core.constants import ALPHA_MIN
 from sgsst_core.features.layers import (
     convolve_pixels,
@@ -19,7 +20,7 @@ from sgsst_core.features.layers import (
     max_pool_backward_reference,
     pixel_gradient,
 )
-from sgsst_core.features.statistics import fused_statistics, layer_statistics_reference
+from sgsst_core.features.statistics import fused_statistics
 from sgsst_core.loss.terms import StyleGradient, fused_add_content_gradient, fused_add_style_gradient, fused_content_sum
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.cached import CachedRasterizer

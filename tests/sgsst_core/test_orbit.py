@@ -39,6 +39,7 @@ from sgsst_core.scene.camera import Camera, resized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import JobInputs
 from sgsst_core.stylizing.planner import plan_job
 from tests.sgsst_core.objects import UP, ball, box, figure, ground, joined, moved, scene_of
 from tests.small_scenes import style
@@ -692,9 +693,11 @@ def test_plan_starts_with_the_lines_about_the_orbit(tiny_weights) -> None:  # ty
     scene = figure()
     orbit = make_orbit(scene, OrbitRequest(count=3))
     cameras = [resized(camera, 64) for camera in orbit.cameras]
-    plan = plan_job(scene, cameras, Style.of(style()), make_settings(), weights=tiny_weights, orbit=orbit).plan
+    plan = plan_job(
+        JobInputs(scene, cameras, Style.of(style()), make_settings(), weights=tiny_weights, orbit=orbit)
+    ).plan
     assert [decision.item for decision in plan.decisions[:3]] == ["up", "cameras", "frames"]
-    without = plan_job(scene, cameras, Style.of(style()), make_settings(), weights=tiny_weights).plan
+    without = plan_job(JobInputs(scene, cameras, Style.of(style()), make_settings(), weights=tiny_weights)).plan
     assert "up" not in {decision.item for decision in without.decisions}
 
 

@@ -189,7 +189,7 @@ def test_only_the_content_term_depends_on_content_weights(tiny_weights: Backbone
     network = FeatureNetwork(tiny_weights, dtype=torch.float64)
     half, whole = (evaluate(network, coverage, own, None) for own in (coverage / 2, coverage))
     for scale, terms in whole.terms.items():
-        for name, value in terms.items():
+        for name, value in vars(terms).items():
             expected = value / 2 if name == "content" else value
             assert half.terms[scale][name] == pytest.approx(expected, rel=1e-12)
 

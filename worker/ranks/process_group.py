@@ -10,30 +10,24 @@ same bits, and repeated runs are bit-identical.
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from datetime import timedelta
-from importlib import import_module
 from ipaddress import ip_address
-from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
 import torch.distributed as dist
-from safetensors.torch import load, save
 from torch import Tensor
 
 from sgsst_core.errors import SgsstError
 from sgsst_core.features.statistics import LayerStatistics
-from sgsst_core.loss.terms import LossTerms
-from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, Traffic
-from sgsst_core.parallel.division import ImageExchange
+from sgsst_core.messages import decode, encode
+from sgsst_core.parallel.collectives import ALONE, TRAFFIC, Collectives, ImageExchange, Traffic
 from worker.processes import interface_towards, listen, split_address
 
 T = TypeVar("T")
@@ -375,147 +369,3 @@ class ProcessGroupCollectives(Collectives):
 def _machine() -> tuple[str, str]:
     """Return an identifier of the machine. A container counts as a machine, because it has its own memory limit."""
     return socket.gethostname(), os.environ.get("HOSTNAME", "")
-
-
-# --- values that ranks send each other, as JSON and tensors -----------------------------------------------------------
-
-#: Packages whose dataclasses and errors a message may hold.
-_PACKAGES = ("sgsst_core", "worker")
-#: Name of the JSON among the tensors of a message.
-_JSON = "json"
-
-
-def encode(value: Any) -> Tensor:
-    """Return a message as a tensor [n] uint8.
-
-    Raises:
-        TypeError: If the value holds an object of an unsupported type.
-    """
-    tensors: dict[str, Tensor] = {}
-    text = json.dumps(_to_json(value, tensors)).encode()
-    tensors[_JSON] = torch.frombuffer(bytearray(text), dtype=torch.uint8)
-    return torch.frombuffer(bytearray(save(tensors)), dtype=torch.uint8)
-
-
-def decode(message: Tensor) -> Any:
-    """Return the value of a message [n] uint8.
-
-    Raises:
-        ValueError: If the bytes are not a valid message.
-    """
-    try:
-        tensors = load(message.numpy().tobytes())
-        return _from_json(json.loads(tensors[_JSON].numpy().tobytes()), tensors)
-    except Exception as error:  # safetensors raises its own type, and a value of a wrong type can fail anywhere
-        raise ValueError(f"Another rank sent something that is not a message of this program: {error}") from error
-
-
-def _to_json(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """Convert a value to JSON.
-
-    Scalars and lists stay as they are. Any other value becomes an object whose only key is the kind of the value.
-    """
-
-    def each(values: Any) -> list[Any]:
-        return [_to_json(item, tensors) for item in values]
-
-    def add(tensor: Tensor) -> str:
-        name = str(len(tensors))
-        tensors[name] = tensor.detach().cpu().clone(memory_format=torch.contiguous_format)  # must not share memory
-        return name
-
-    match value:
-        case None | bool() | int() | float() | str():
-            return value
-        case list():
-            return each(value)
-        case tuple() if type(value) in (tuple, torch.Size):
-            return {"tuple": each(value)}
-        case dict():
-            return {"dict": each(value.items())}
-        case bytes():
-            return {"bytes": value.decode("latin-1")}
-        case Path():
-            return {"path": str(value)}
-        case Tensor():
-            return {"tensor": [add(value), value.device.type]}
-        case np.ndarray():
-            return {"array": add(torch.from_numpy(value))}
-        case LossTerms():
-            return {"terms": dict(value)}
-        case SgsstError():
-            return {"error": [_name_of(type(value)), each(value.args)]}
-    if is_dataclass(value) and not isinstance(value, type):
-        members = {field.name: _to_json(getattr(value, field.name), tensors) for field in fields(value)}
-        return {"object": [_name_of(type(value)), members]}
-    raise TypeError(f"A message between ranks cannot hold a {type(value).__name__}")
-
-
-def _from_json(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """Convert JSON from `_to_json` back to a value."""
-
-    def each(values: Any) -> list[Any]:
-        return [_from_json(item, tensors) for item in values]
-
-    if isinstance(value, list):
-        return each(value)
-    if not isinstance(value, dict):
-        return value
-    ((kind, content),) = value.items()
-    match kind:
-        case "tuple":
-            return tuple(each(content))
-        case "dict":
-            return dict(each(content))
-        case "bytes":
-            return content.encode("latin-1")
-        case "path":
-            return Path(content)
-        case "tensor":
-            name, device = content
-            return tensors[name].to(device)
-        case "array":
-            return tensors[content].numpy()
-        case "terms":
-            return LossTerms(**content)
-        case "error":
-            return _error(content[0])(*each(content[1]))
-        case "object":
-            return _object(content[0], {name: _from_json(member, tensors) for name, member in content[1].items()})
-    raise ValueError(f"unknown kind {kind!r}")
-
-
-def _object(name: str, members: dict[str, Any]) -> Any:
-    """Return an instance of a dataclass with these members, without calling its constructor."""
-    kind = _class(name)
-    if not is_dataclass(kind) or members.keys() != {field.name for field in fields(kind)}:
-        raise ValueError(f"{name} is not a dataclass with the members {', '.join(members)}")
-    instance = object.__new__(kind)
-    for member, value in members.items():
-        object.__setattr__(instance, member, value)  # works for frozen dataclasses, too
-    return instance
-
-
-def _error(name: str) -> type[SgsstError]:
-    kind = _class(name)
-    if not issubclass(kind, SgsstError):
-        raise ValueError(f"{name} is not an error of this program")
-    return kind
-
-
-def _name_of(kind: type) -> str:
-    name = f"{kind.__module__}:{kind.__qualname__}"
-    if _class(name) is not kind:
-        raise TypeError(f"A message between ranks cannot hold a {name}")
-    return name
-
-
-def _class(name: str) -> type:
-    """Return the class that a "module:name" refers to; it must belong to this project."""
-    module, _, own = name.partition(":")
-    if module.partition(".")[0] not in _PACKAGES:
-        raise TypeError(f"{name} is not a class of {' or '.join(_PACKAGES)}")
-    kind = getattr(import_module(module), own)
-    if not isinstance(kind, type) or kind.__module__ != module:
-        raise TypeError(f"{name} is not a class")
-    return kind

@@ -6,14 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sgsst_core.features.statistics import (
-    LayerStatistics,
-    _is_far,
-    _shift,
-    layer_statistics,
-    layer_statistics_reference,
-    merge,
-)
+from benchmarks.stability.sos_reference import layer_statistics_reference
+from sgsst_core.features.statistics import LayerStatistics, _is_far, _shift, layer_statistics, merge
 
 
 def features(height=40, width=50, channels=24, *, ratio=1.0, dtype=torch.float64, seed=0):

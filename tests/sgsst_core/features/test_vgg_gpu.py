@@ -14,7 +14,7 @@ from sgsst_core.devices import Timer
 from sgsst_core.features import vgg
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_tf32, use_whole_float32
-from sgsst_core.loss.gradient_error import Difference
+from sgsst_core.quality.measure import Difference
 from tests.sgsst_core.synthetic_images import synthetic_image
 
 HAS_GPU = torch.cuda.is_available()

@@ -78,11 +78,6 @@ def test_even_scales_differ_only_in_the_color_layers(renormalized: BackboneWeigh
         torch.testing.assert_close(after[layer], before[layer] * scaled.scales[layer], rtol=0, atol=0)
 
 
-def test_scaling_is_idempotent(renormalized: BackboneWeights) -> None:
-    scaled = at_scale(renormalized, "even")
-    assert at_scale(scaled, "even") is scaled
-
-
 def test_papers_network_is_returned_unchanged(tiny_weights: BackboneWeights) -> None:
     assert at_scale(tiny_weights, "paper") is tiny_weights
     assert at_scale(tiny_weights, "even") is tiny_weights

@@ -18,9 +18,8 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.graphs import FIRST_VISITS, LossGraphs, can_be_captured, can_use_graphs
 from sgsst_core.loss.sos import SosLoss, SosResult
-from sgsst_core.loss.terms import StyleTargets, ViewTarget, layers_of
+from sgsst_core.loss.terms import StyleTargets, ViewTarget
 from sgsst_core.parallel.division import Tiling
-from sgsst_core.settings import StyleLossName
 from sgsst_core.style import Style
 from tests.pretend_cuda.counts import Counts
 from tests.pretend_cuda.interpreter import leave_out_kernels
@@ -136,28 +135,6 @@ def test_kernels_agree_with_tensor_functions_and_pass_relus(
 
 
 @pytest.mark.usefixtures("without_triton")
-@pytest.mark.parametrize("style_loss", ["mixed"])
-def test_graphs_include_feature_matching(
-    counts: Counts, tiny_weights: BackboneWeights, style_loss: StyleLossName
-) -> None:
-    network = FeatureNetwork(tiny_weights, layers_of(style_loss, tiny_weights, content=True), device="cuda")
-    loss = SosLoss(network, style_loss=style_loss, coarsest=16, timer=Timer("cuda"))
-    style, view, graphs = style_of(loss), view_of(loss, 2, weighted=True), LossGraphs(loss)
-    for step in range(FIRST_VISITS + 1):
-        pixels = image(step)
-        expected = loss.evaluate(pixels, style, view, SCALES)
-        counts.clear()
-        actual = graphs.evaluate(pixels, style, view, SCALES)
-        if step >= FIRST_VISITS:
-            assert not counts.waits
-            assert not counts.copies
-        assert_same(actual, expected)
-    assert graphs.problem is None
-    assert graphs.captured == 1
-    assert all(terms["nearest"] > 0 for terms in expected.terms.values())
-
-
-@pytest.mark.usefixtures("without_triton")
 def test_graphs_copy_the_content_weights_of_each_view(tiny_weights: BackboneWeights) -> None:
     loss = make_loss(tiny_weights, content_weight=1e4)
     style, views, graphs = style_of(loss), [view_of(loss, 2) for _ in range(3)], LossGraphs(loss)
@@ -169,44 +146,6 @@ def test_graphs_copy_the_content_weights_of_each_view(tiny_weights: BackboneWeig
         assert_same(graphs.evaluate(image(7), style, view, SCALES), expected)
     assert graphs.problem is None
     assert graphs.captured == 2  # with and without content weights
-
-
-@pytest.mark.usefixtures("without_triton")
-def test_each_kind_of_evaluation_has_its_own_graph(tiny_weights: BackboneWeights) -> None:
-    """Graphs differ by scales and style targets, and interleaved ones do not interfere."""
-    loss = make_loss(tiny_weights)
-    whole, other = (
-        style_of(loss),
-        loss.targets.of_style(Style.of(synthetic_image(60, 60, seed=7, dtype=torch.float32)), (HEIGHT, WIDTH)),
-    )
-    content = image(8)
-    graphs = LossGraphs(loss)
-
-    def view(scales: list[int]) -> ViewTarget:
-        share = loss.divider.divide({scale: (HEIGHT >> scale, WIDTH >> scale) for scale in scales})
-        own = {
-            scale: loss.targets.content_features(loss.targets.scaled(content, scale), tiles)
-            for scale, tiles in share.tiles.items()
-        }
-        return ViewTarget(content=own, division=share)
-
-    for step in range(3):
-        for style, scales in ((whole, SCALES), (whole, [1]), (other, [1])):
-            expected = loss.evaluate(image(step), style, view(scales), scales)
-            actual = graphs.evaluate(image(step), style, view(scales), scales)
-            assert_same(actual, expected)
-    assert graphs.captured == 3
-
-
-@pytest.mark.usefixtures("without_triton")
-def test_number_of_graphs_is_limited(tiny_weights: BackboneWeights) -> None:
-    loss = make_loss(tiny_weights, content_weight=0.0)
-    view, styles = loss.targets.of_view(image(2)), [style_of(loss), style_of(loss)]
-    graphs = LossGraphs(loss, most=1)
-    for step in range(3):
-        for style in styles:
-            assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
-    assert graphs.captured == 1
 
 
 @pytest.mark.usefixtures("without_triton")
@@ -255,26 +194,6 @@ def test_only_scales_of_one_tile_that_fit_twice_are_captured(
     for step in range(FIRST_VISITS):
         assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
     assert (graphs.captured, graphs.problem) == (int(fits == 2.1), None)
-
-
-@pytest.mark.usefixtures("without_triton")
-def test_view_without_cached_content_is_not_captured(tiny_weights: BackboneWeights) -> None:
-    """A graph would recompute the content features of the captured view in every replay."""
-    loss = make_loss(tiny_weights)
-    style, view = style_of(loss), loss.targets.of_view(image(2), cache_content=False)
-    graphs = LossGraphs(loss)
-    for step in range(FIRST_VISITS):
-        assert_same(graphs.evaluate(image(step), style, view, SCALES), loss.evaluate(image(step), style, view))
-    assert (graphs.captured, graphs.problem) == (0, None)
-
-
-@pytest.mark.slow
-def test_gpu_tiles_need_no_64_bit_indices(counts: Counts, tiny_weights: BackboneWeights) -> None:
-    network = FeatureNetwork(tiny_weights, device="cuda")
-    side, channels = 40_000, max(network.channels("relu1_1"), network.channels("relu1_2"))
-    tiles = SosLoss(network, memory=1 << 60).tiling.tiles((side, side))
-    assert side**2 * channels > 2**31 > max(tile.outer.pixels for tile in tiles) * channels
-    assert len(SosLoss(FeatureNetwork(tiny_weights), memory=1 << 60).tiling.tiles((side, side))) == 1
 
 
 def test_graphs_require_a_gpu_enough_memory_and_one_rank(tiny_weights: BackboneWeights) -> None:

@@ -1,14 +1,18 @@
-"""Tests of the SOS gradient with various partitions into tiles, against the untiled autograd reference."""
+"""Tests of the SOS loss of a view, also with regions, against float64."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from benchmarks.stability.sos_reference import sos_reference
-from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, Activations, FeatureNetwork
+from benchmarks.stability.sos_reference import StyledWeights, sos_reference
+from sgsst_core.errors import SettingsError
+from sgsst_core.features.vgg import CONTENT_LAYER, STYLE_LAYERS, FeatureNetwork
 from sgsst_core.loss.sos import SosLoss
-from sgsst_core.loss.terms import StyleTarget, layers_of
+from sgsst_core.loss.terms import combined, layers_of
+from sgsst_core.regions import Region, Regions, check_regions
 from sgsst_core.scales import scale_count
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.style import Style
@@ -55,30 +59,6 @@ def test_compared_pixels_agree_with_untiled_autograd(tiny_weights, covered, gray
     check_against_untiled_autograd(weights, (129, 190), [None, 64], covered, 100)
 
 
-def test_compared_pixels_are_the_first_layer_without_gram_matrix(tiny_weights):
-    """The pixel loss compares means and standard deviations of values from 0 to 256, times the squared factor."""
-    weights = comparing_pixels(tiny_weights, 3.0)
-    network = FeatureNetwork(weights, (PIXELS, "relu1_1"))
-    loss = SosLoss(network, content_weight=0)
-    image, style = synthetic_image(40, 56, seed=1).float(), synthetic_image(40, 56, seed=3).float()
-    only = {
-        scale: (StyleTarget({PIXELS: own[0].layers[PIXELS]}),)
-        for scale, own in loss.targets.of_style(Style.of(style), (40, 56)).items()
-    }
-    result = loss.evaluate(image, only, loss.targets.of_view(image))
-    values = [(256 * part.double()).flatten(0, 1) for part in (image, style)]
-    means, deviations = (
-        [own(part) for part in values] for own in (lambda x: x.mean(0), lambda x: x.std(0, correction=0))
-    )
-    assert result.terms[0]["gram"] == 0
-    assert result.terms[0]["mean"] == pytest.approx(9e4 * float((means[0] - means[1]).square().mean()), rel=1e-5)
-    assert result.terms[0]["std"] == pytest.approx(
-        9e4 * float((deviations[0] - deviations[1]).square().mean()), rel=1e-5
-    )
-    matched = loss.evaluate(style, only, loss.targets.of_view(style))
-    assert matched.loss < 1e-9 * result.loss
-
-
 def test_real_network_agrees_with_untiled_autograd(vgg16_weights):
     check_against_untiled_autograd(vgg16_weights, (64, 99), [48], True, 32)
 
@@ -112,42 +92,6 @@ def test_float32_does_not_depend_on_the_partition(tiny_weights, size, tile_sizes
         tiled = evaluate(network, case, tile_size)
         assert tiled.loss == pytest.approx(whole.loss, rel=1e-5)
         assert relative_error(tiled.image_gradient, whole.image_gradient) < FLOAT32_TOLERANCE
-
-
-class DecisionsOf(FeatureNetwork):
-    """Float64 network whose backward pass uses the ReLU masks and max pooling positions of a float32 network."""
-
-    def __init__(self, weights, other: FeatureNetwork):
-        super().__init__(weights, dtype=torch.float64)
-        self.other = other
-        self.flips = 0
-        self.decisions = 0
-
-    def forward(self, rgb, *, cache=True, until=None) -> Activations:
-        own = super().forward(rgb, cache=cache, until=until)
-        theirs = self.other.forward(rgb.float(), cache=cache, until=until)
-        for mine, other in zip(own.decisions(), theirs.decisions(), strict=True):
-            self.flips += int((mine != other).sum())
-            self.decisions += mine.numel()
-        own.outputs = [output.double() for output in theirs.outputs]
-        return own
-
-
-def test_float32_differs_from_float64_mostly_by_flips(vgg16_weights):
-    case = setting((80, 112))
-    image, style, content, _ = case
-    _, exact = sos_reference(vgg16_weights, image, style, content)
-    network = FeatureNetwork(vgg16_weights)
-    actual = evaluate(network, case, None).image_gradient
-    same_decisions = DecisionsOf(vgg16_weights, network)
-    expected = evaluate(same_decisions, case, None).image_gradient
-    with_flips, without = relative_error(actual, exact), relative_error(actual, expected)
-    flipped = same_decisions.flips / same_decisions.decisions
-    print(f"float32 against float64: {with_flips:.1e}, of it without flips {without:.1e}; {flipped:.1e} flipped")
-    assert without < 1e-5
-    assert same_decisions.flips > 0
-    assert flipped < 1e-5
-    assert with_flips < 5e-3
 
 
 @pytest.mark.parametrize("held", [0, 1.5])
@@ -186,16 +130,6 @@ def test_unneeded_content_and_layers_are_not_computed(tiny_weights):
     assert len(shallow.forward(image).outputs) == 4  # conv1_1, conv1_2, pool1, conv2_1
 
 
-def test_loss_without_gradient_is_identical(tiny_weights):
-    network = FeatureNetwork(tiny_weights)
-    image, style, content, coverage = (t.float() for t in setting((200, 300), covered=True))
-    loss = SosLoss(network)
-    targets, view = loss.targets.of_style(Style.of(style), (200, 300)), loss.targets.of_view(content, coverage)
-    only = loss.evaluate(image, targets, view, gradient=False)
-    assert only.image_gradient is None
-    assert only.terms == loss.evaluate(image, targets, view).terms
-
-
 @pytest.mark.parametrize("size", [(1, 1), (15, 17), (16, 16), (3, 200)])
 def test_tiny_views_have_finite_gradients(tiny_weights, size):
     case = (synthetic_image(*size, seed=1), synthetic_image(40, 30, seed=2), synthetic_image(*size, seed=3), None)
@@ -216,14 +150,123 @@ def test_pixels_far_from_covered_cells_have_zero_gradient(tiny_weights):
     assert result.image_gradient[64 + 16 + 64 :].abs().max() == 0
 
 
-def test_scales_are_averaged(tiny_weights):
-    size = (520, 600)
-    assert scale_count(*size) == 2
-    image, style, content, _ = (None if t is None else t.float() for t in setting(size))
-    loss = SosLoss(FeatureNetwork(tiny_weights))
-    targets, view = loss.targets.of_style(Style.of(style), size), loss.targets.of_view(content)
-    both = loss.evaluate(image, targets, view)
-    single = [loss.evaluate(image, targets, view, [scale]) for scale in (0, 1)]
-    assert both.loss == pytest.approx((single[0].loss + single[1].loss) / 2, rel=1e-12)
-    mean = (single[0].image_gradient + single[1].image_gradient) / 2
-    assert relative_error(both.image_gradient, mean) < 1e-6
+SIZE = (112, 150)
+
+
+def coverage_maps(size, count):
+    """Return coverage maps of `count` regions, which add up to 1 with the background; the first have hard borders."""
+    raw = torch.stack([synthetic_image(*size, seed=10 + number)[:, :, 0] ** 4 for number in range(count + 1)])
+    raw[0, :, size[1] // 2 :] = 0
+    raw[1, : size[0] // 2] = 0
+    return list((raw / raw.sum(dim=0))[:count])
+
+
+def targets_of(loss, styles, weights):
+    return combined([loss.targets.of_style(Style.of(style), SIZE) for style in styles], weights)
+
+
+def evaluate_regions(network, image, content, styles, maps, weights, **options):
+    dtype = network.dtype
+    loss = SosLoss(network, coarsest=60, **options)
+    view = loss.targets.of_view(content.to(dtype))
+    view.regions = [loss.targets.position_weights(share) for share in maps]
+    return loss.evaluate(image.to(dtype), targets_of(loss, [s.to(dtype) for s in styles], weights), view)
+
+
+@pytest.fixture
+def case():
+    styles = [resize_area(synthetic_image(90, 130, seed=s) ** s, style_size((90, 130), SIZE)) for s in (1, 2, 3)]
+    return (
+        synthetic_image(*SIZE, seed=5),
+        synthetic_image(*SIZE, seed=6),
+        styles,
+        coverage_maps(SIZE, 3),
+        [1.0, 0.3, 7.0],
+    )
+
+
+@pytest.mark.parametrize(
+    ("tile_size", "style_loss", "pixels"), [(64, "sos", False), (None, "sos", True), (64, "mixed", False)]
+)
+def test_float64_agrees_with_autograd(tiny_weights, case, tile_size, style_loss, pixels):
+    tiny_weights = comparing_pixels(tiny_weights) if pixels else tiny_weights
+    image, content, styles, maps, weights = case
+    parts = [StyledWeights(*part) for part in zip(styles, maps, weights, strict=True)]
+    expected, gradient = sos_reference(tiny_weights, image, parts, content, coarsest=60, style_loss=style_loss)
+    layers = layers_of(style_loss, tiny_weights, content=True)
+    network = FeatureNetwork(tiny_weights, layers, torch.float64)
+    actual = evaluate_regions(network, *case, tile_size=tile_size, style_loss=style_loss)
+    assert actual.loss == pytest.approx(expected, rel=1e-9)
+    assert relative_error(actual.image_gradient, gradient) < 1e-9
+
+
+def test_float32_tiles_agree_with_untiled_float64(tiny_weights, case):
+    whole = evaluate_regions(FeatureNetwork(tiny_weights, dtype=torch.float64), *case)
+    tiled = evaluate_regions(FeatureNetwork(tiny_weights), *case, tile_size=64, memory=1)
+    assert tiled.loss == pytest.approx(whole.loss, rel=1e-5)
+    assert relative_error(tiled.image_gradient, whole.image_gradient) < 1e-5
+
+
+def test_single_region_is_bit_identical_to_no_regions(tiny_weights, case):
+    """Results are bit-identical: same statistics, same position weights."""
+    image, content, styles, maps, _ = case
+    network = FeatureNetwork(tiny_weights)
+    loss = SosLoss(network, coarsest=60)
+    content = content.float()
+    plain = loss.evaluate(
+        image.float(), loss.targets.of_style(Style.of(styles[0]), SIZE), loss.targets.of_view(content, maps[2])
+    )
+    view = loss.targets.of_view(content, maps[2])
+    view.regions = [loss.targets.position_weights(maps[2])]
+    result = loss.evaluate(image.float(), targets_of(loss, styles[:1], [1.0]), view)
+    assert torch.equal(result.values, plain.values)
+    assert torch.equal(result.image_gradient, plain.image_gradient)
+
+
+def test_weights_scale_only_the_style_terms(tiny_weights, case):
+    image, content, styles, maps, _ = case
+    network = FeatureNetwork(tiny_weights, dtype=torch.float64)
+    one, two = (evaluate_regions(network, image, content, styles, maps, [w] * 3) for w in (1.0, 2.0))
+    for scale, terms in one.terms.items():
+        for name, value in vars(terms).items():
+            assert two.terms[scale][name] == pytest.approx(value if name == "content" else 2 * value, rel=1e-12)
+
+
+# --- resolved regions ----------------------------------------------------------------------------------------------
+
+
+def regions(labels, **frozen):
+    names = ("rest", "a", "b")
+    every = tuple(Region(name, freeze=frozen.get(name, False)) for name in names)
+    return Regions(every, torch.tensor(labels, dtype=torch.uint8))
+
+
+def test_regions_outside_all_views_join_the_rest():
+    resolved = regions([0, 1, 2, 2]).resolved(torch.tensor([1.0, 0, 0, 2]))
+    assert resolved.labels.tolist() == [0, 0, 2, 2]
+    assert resolved.active == (0, 2)
+    assert resolved.mapped
+
+
+def test_frozen_regions_outside_all_views_stay_frozen():
+    resolved = regions([0, 1, 2, 2], a=True).resolved(torch.tensor([1.0, 0, 1, 2]))
+    assert resolved.frozen.tolist() == [False, True, False, False]
+    assert not resolved.frozen_in_view
+
+
+def test_region_of_all_seen_gaussians_needs_no_map():
+    resolved = regions([0, 1, 1]).resolved(torch.tensor([0.0, 1, 1]))
+    assert resolved.active == (1,)
+    assert not resolved.mapped
+
+
+def test_freezing_everything_is_an_error():
+    all_frozen = regions([1, 1, 2], a=True, b=True)
+    with pytest.raises(SettingsError, match=r"Every Gaussian is frozen \(a, b\)"):
+        check_regions(all_frozen)
+    partly = regions([0, 1, 2], a=True, b=True)
+    check_regions(partly)
+    with pytest.raises(SettingsError, match=r"--sh-attenuation 0\.5 changes the Gaussians of every region"):
+        check_regions(partly, 0.5)
+    with pytest.raises(SettingsError, match="that a view sees is frozen"):
+        partly.resolved(torch.tensor([0.0, 1, 1]))

@@ -1,22 +1,39 @@
-import copy
-import pickle
+"""Tests of the terms of the loss: values and gradients against autograd in float64."""
+
+from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
-from benchmarks.stability.sos_reference import style_loss_reference
+from benchmarks.stability.sos_reference import sos_reference, style_loss_reference
+from sgsst_core.errors import ImageError
+from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.statistics import layer_statistics
+from sgsst_core.features.vgg import CONTENT_LAYER, PIXELS, STYLE_LAYERS, FeatureNetwork
+from sgsst_core.loss import terms as nearest
+from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.loss.terms import (
+    MAX_VECTORS,
+    NEAREST_WEIGHTS,
     TERMS,
     ContentDifference,
     LayerTarget,
     LossTerms,
-    StyleGradient,
+    Matches,
+    StyleVectors,
     TermWeights,
     content_factor,
+    layers_of,
+    search,
     style_loss,
 )
-from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error
+from sgsst_core.scales import ScaleWeights
+from sgsst_core.settings import StyleLossName
+from sgsst_core.style import Style, chosen_positions
+from tests.networks import comparing_pixels
+from tests.networks import tiny_weights as make_tiny_weights
+from tests.sgsst_core.synthetic_images import nearly_one_color, relative_error, synthetic_image
 
 
 def make_features(height, width, channels, seed, dtype=torch.float64):
@@ -113,48 +130,201 @@ def test_loss_and_gradient_are_zero_without_positions():
 def test_terms_are_summed_in_their_order():
     """An exact sum (`math.fsum`, or `sum` in later versions of Python) has another last digit."""
     terms = LossTerms(content=3.0, std=1e16, mean=1.0, gram=1.0)
-    assert list(terms) == list(TERMS)
+    assert list(vars(terms)) == list(TERMS)
     assert terms.total == ((1.0 + 1.0) + 1e16) + 3.0 == 1e16 + 4
     assert LossTerms(gram=1e16, mean=1.0, std=1.0).total == 1e16
 
 
-def test_terms_add_divide_and_compare_by_name():
-    total = LossTerms(gram=1.0, mean=2.0) + LossTerms(mean=4.0, content=5.0)
-    assert total == LossTerms(gram=1.0, mean=6.0, content=5.0)
-    assert dict(total / 4) == dict.fromkeys(TERMS, 0.0) | {"gram": 0.25, "mean": 1.5, "content": 1.25}
-    assert total != LossTerms(gram=1.0)
-    assert LossTerms().total == 0.0
+EPS = torch.finfo(torch.float64).eps
+MATCHED: tuple[StyleLossName, ...] = ("nnfm", "mixed")
 
 
-def test_terms_are_picklable_and_immutable():
-    terms = LossTerms(gram=1 / 3, content=2.5e-30)
-    assert pickle.loads(pickle.dumps(terms)) == copy.deepcopy(terms) == terms
-    with pytest.raises(TypeError):
-        terms["gram"] = 1.0
+def loss_of(
+    weights: BackboneWeights, style_loss: StyleLossName, dtype: torch.dtype = torch.float64, **options: object
+) -> SosLoss:
+    network = FeatureNetwork(weights, layers_of(style_loss, weights, content=True), dtype)
+    return SosLoss(network, style_loss=style_loss, **options)  # type: ignore[arg-type]
 
 
-def test_undeclared_terms_are_refused():
-    with pytest.raises(TypeError, match="no term color; it has gram, mean"):
-        LossTerms(color=1.0)
-    with pytest.raises(KeyError):
-        LossTerms()["color"]
+def setting(
+    height: int, width: int, *, covered: bool = False, style: tuple[int, int] = (90, 110)
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Return image, style, content and coverage (None unless `covered`) for a view of this size."""
+    coverage = None
+    if covered:
+        coverage = (synthetic_image(height, width, seed=4)[:, :, 0] * 3 - 1).clamp(0, 1)
+        coverage[: height // 3] = 0
+    return (
+        synthetic_image(height, width, seed=1),
+        synthetic_image(*style, seed=3) ** 2,
+        synthetic_image(height, width, seed=2),
+        coverage,
+    )
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("columns", [slice(None), slice(3, 120)])
-def test_style_gradient_is_added_block_by_block(dtype, weighted, columns):
-    """Blocks are whole rows, or those of a partition tile's inner rectangle; the surroundings stay unchanged."""
-    x = make_features(90, 130, 40, 1).to(dtype)
-    a = torch.rand((90, 130), generator=torch.Generator().manual_seed(3)) if weighted else None
-    random = torch.randn((42, 40), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    gradient = StyleGradient(random[:40], 3 * random[40], random[41])
-    before = make_features(90, 130, 40, 2).to(dtype)
-    actual, expected, own = before.clone(), before.double(), (slice(5, 80), columns)
-    gradient.add_to(actual[own], x[own], None if a is None else a[own])
-    weights = 1 if a is None else a[own][:, :, None].double()
-    expected[own] += weights * ((x[own].double() - gradient.mean) @ gradient.matrix + gradient.offset)
-    tolerance = {torch.float64: 1e-13, torch.float32: 1e-6, torch.bfloat16: 4e-3}[dtype]
-    assert relative_error(actual, expected) < tolerance
-    assert torch.equal(actual[:5], before[:5])
-    assert torch.equal(actual[80:], before[80:])
+def evaluate(loss: SosLoss, case: tuple[Tensor, Tensor, Tensor, Tensor | None]) -> SosResult:
+    image, style, content, coverage = (None if part is None else part.to(loss.network.dtype) for part in case)
+    assert image is not None
+    assert style is not None
+    assert content is not None
+    targets = loss.targets.of_style(Style.of(style), (image.shape[0], image.shape[1]))
+    return loss.evaluate(image, targets, loss.targets.of_view(content, coverage))
+
+
+def gradient_of(result: SosResult) -> Tensor:
+    assert result.image_gradient is not None
+    return result.image_gradient
+
+
+def features(positions: tuple[int, int], channels: tuple[int, ...], seed: int) -> dict[str, Tensor]:
+    """Return nonnegative float64 features by layer, like a ReLU's output, without zero vectors."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        f"relu3_{place}": torch.randn((*positions, count), generator=generator, dtype=torch.float64).relu() + 0.01
+        for place, count in enumerate(channels, start=1)
+    }
+
+
+def vectors_of(parts: dict[str, Tensor]) -> StyleVectors:
+    return StyleVectors.of({layer: part.flatten(0, 1) for layer, part in parts.items()})
+
+
+@pytest.mark.parametrize(
+    ("network", "style_loss", "tile_size", "covered"),
+    [
+        ("vgg16", MATCHED[0], None, False),
+        ("vgg19", MATCHED[0], 64, True),
+        ("vgg16", MATCHED[1], 48, False),
+        ("vgg19", MATCHED[1], None, True),
+    ],
+)
+def test_any_partition_agrees_with_untiled_autograd(
+    network: str, style_loss: StyleLossName, tile_size: int | None, covered: bool
+) -> None:
+    weights = make_tiny_weights(network)  # type: ignore[arg-type]
+    image, style, content, coverage = case = setting(101, 150, covered=covered)
+    expected, gradient = sos_reference(
+        weights, image, style, content, coverage=coverage, style_loss=style_loss, coarsest=60
+    )
+    result = evaluate(loss_of(weights, style_loss, tile_size=tile_size, coarsest=60), case)
+    assert result.scales == (0, 1)
+    assert result.loss == pytest.approx(expected, rel=1e-9)
+    assert relative_error(gradient_of(result), gradient) < 1e-9
+    assert all(terms["nearest"] > 0 for terms in result.terms.values())
+    assert all((terms["gram"] > 0) == (style_loss == "mixed") for terms in result.terms.values())
+
+
+@pytest.mark.parametrize("style_loss", MATCHED)
+def test_gradient_matches_finite_differences(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
+    image, style, content, coverage = setting(48, 64, covered=True)
+    loss = loss_of(tiny_weights, style_loss)
+    gradient = gradient_of(evaluate(loss, (image, style, content, coverage)))
+    direction = torch.randn(image.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    step = 1e-7
+    ahead, behind = (evaluate(loss, (image + way * direction, style, content, coverage)).loss for way in (step, -step))
+    assert (ahead - behind) / (2 * step) == pytest.approx(float((gradient * direction).sum()), rel=1e-5)
+
+
+def test_lower_precisions_agree_with_float64(vgg16_weights: BackboneWeights) -> None:
+    case = setting(84, 100)
+    exact, *lower = (
+        evaluate(loss_of(vgg16_weights, "nnfm", dtype), case)
+        for dtype in (torch.float64, torch.float32, torch.bfloat16)
+    )
+    for actual, loss, gradient in zip(lower, (1e-5, 1e-2), (1e-2, 0.5), strict=True):
+        assert actual.loss == pytest.approx(exact.loss, rel=loss)
+        assert relative_error(gradient_of(actual), gradient_of(exact)) < gradient
+
+
+def test_first_of_equally_near_vectors_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(nearest._BLOCK, "cpu", (2, 2))
+    units = torch.eye(3)
+    style = units[[2, 1, 1, 0, 2, 0, 0]]
+    values, places = search(units, style)
+    assert values.tolist() == [1, 1, 1]
+    assert places.tolist() == [3, 1, 0]
+
+
+def test_zero_vectors_match_nothing() -> None:
+    """Zero vectors, and vectors of rounding size, count as far from everything and get no gradient."""
+    own, style = features((3, 4), (6, 4), 1), features((2, 2), (6, 4), 2)
+    for part in own.values():
+        part[0] = 0
+        part[1] *= 1e-17
+    vectors = vectors_of(style)
+    matches = Matches.of(own, vectors, EPS)
+    away = 1 - matches.cosine
+    assert torch.equal(away[:2], torch.ones_like(away[:2]))
+    assert (away[2] < 0.9).all()
+    gradient = torch.zeros_like(own["relu3_1"])
+    matches.add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
+    assert gradient[:2].abs().max() == 0
+    assert torch.isfinite(gradient).all()
+    assert gradient[2].abs().max() > 0
+
+
+def test_zero_style_vectors_give_no_gradient() -> None:
+    own = features((3, 4), (6,), 1)
+    vectors = vectors_of({"relu3_1": torch.zeros((2, 2, 6), dtype=torch.float64)})
+    matches = Matches.of(own, vectors, EPS)
+    gradient = torch.zeros_like(own["relu3_1"])
+    matches.add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
+    assert float(matches.distance()) == 12
+    assert gradient.abs().max() == 0
+
+
+def test_nan_features_give_nan_gradients() -> None:
+    """NaN reaches the gradient, which stops a run that diverges."""
+    own, style = features((3, 4), (6,), 1), features((2, 2), (6,), 2)
+    own["relu3_1"][1, 2, 3] = torch.nan
+    vectors = vectors_of(style)
+    gradient = torch.zeros_like(own["relu3_1"])
+    Matches.of(own, vectors, EPS).add_gradient(gradient, own["relu3_1"], "relu3_1", vectors, torch.tensor(1.0))
+    assert gradient[1, 2].isnan().all()
+    assert torch.isfinite(gradient[0]).all()
+
+
+@pytest.mark.parametrize("style_loss", MATCHED)
+def test_uncovered_positions_are_ignored(tiny_weights: BackboneWeights, style_loss: StyleLossName) -> None:
+    image, style, content, _ = setting(96, 64)
+    coverage = torch.zeros((96, 64), dtype=torch.float64)
+    loss = loss_of(tiny_weights, style_loss)
+    nothing = evaluate(loss, (image, style, content, coverage))
+    assert nothing.loss == 0
+    assert gradient_of(nothing).abs().max() == 0
+    coverage[:32] = 1
+    other = image.clone()
+    other[80:] = 0  # outside the receptive field of covered cells
+    lean = loss_of(tiny_weights, "nnfm")
+    results = [evaluate(lean, (each, style, content, coverage)) for each in (image, other)]
+    assert results[0].terms[0]["nearest"] == results[1].terms[0]["nearest"] > 0
+
+
+def test_style_without_vectors_is_refused(tiny_weights: BackboneWeights) -> None:
+    with pytest.raises(ImageError, match="The style is used at 200 x 3 pixels, too few to match"):
+        loss_of(tiny_weights, "nnfm").targets.of_style(Style.of(synthetic_image(3, 200)), (100, 80))
+    without_full_size = loss_of(tiny_weights, "nnfm", coarsest=40, scales=ScaleWeights((0.0, 1.0)))
+    with pytest.raises(ImageError, match="The style is used at 100 x 2 pixels, too few to match"):
+        without_full_size.targets.of_style(Style.of(synthetic_image(4, 200)), (100, 80))
+
+
+def test_large_styles_are_thinned_evenly() -> None:
+    assert chosen_positions(MAX_VECTORS, MAX_VECTORS).tolist() == list(range(MAX_VECTORS))
+    places = chosen_positions(1000 * 700, 5000)
+    assert len(places) == 5000
+    assert (places.diff() >= 0).all()
+    assert 0 <= int(places[0]) <= int(places[-1]) < 700_000
+    for count, most in ((places // 700, 1000), (places % 700, 700)):  # rows and columns are both uniform
+        assert torch.histc(count.double(), 10, 0, most).sub(500).abs().max() < 25
+    # With fewer than two positions per sample, all are in range and few repeat.
+    assert len(chosen_positions(6001, 6000).unique()) > 4000
+
+
+def test_layers_depend_on_the_style_loss() -> None:
+    small, large = make_tiny_weights("vgg16"), make_tiny_weights("vgg19")
+    assert layers_of("sos", large, content=True) == (*STYLE_LAYERS, CONTENT_LAYER)
+    assert layers_of("sos", comparing_pixels(small), content=False) == (PIXELS, *STYLE_LAYERS)
+    assert layers_of("nnfm", comparing_pixels(small), content=False) == ("relu3_1", "relu3_2", "relu3_3")
+    assert layers_of("nnfm", large, content=True) == (CONTENT_LAYER, "relu3_1", "relu3_2", "relu3_3", "relu3_4")
+    assert layers_of("mixed", small, content=False) == (*STYLE_LAYERS, "relu3_2", "relu3_3")
+    assert NEAREST_WEIGHTS["sos"] == 0

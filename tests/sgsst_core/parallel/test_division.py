@@ -1,4 +1,4 @@
-"""Tests of the division of work among ranks: complete, without overlap, and as even as multiples of 16 px allow."""
+"""Tests of the division of views among ranks, and of the sets of Gaussians that views show."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.parallel.division import Piece, Shares, divide, rounds
+from sgsst_core.parallel.collectives import DENSE_FRACTION, ShownGaussians, gaussians_sent
+from sgsst_core.parallel.division import Piece, Shares, divide
 
 HALO = 64
 
@@ -122,6 +123,22 @@ def test_coarse_scales_are_spread_over_the_ranks() -> None:
     assert max(received) < 0.55 * (size[0] // 2) * (size[1] // 2)
 
 
-def test_several_ranks_evaluate_all_scales_together() -> None:
-    assert rounds([0, 1, 2], 1) == [[0], [1], [2]]
-    assert rounds([0, 1, 2], 2) == [[0, 1, 2]]
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("gaussians", [0, 1, 7, 8, 9, 1001])
+def test_set_contains_the_gaussians_of_its_mask(gaussians: int, share: float) -> None:
+    mask = torch.rand(gaussians, generator=torch.Generator().manual_seed(gaussians)) < share
+    shown = ShownGaussians(mask)
+    for indices in (shown.indices(), shown._device_indices()):
+        assert torch.equal(indices, mask.nonzero()[:, 0])
+    assert (shown.count, shown.total) == (int(mask.sum()), gaussians)
+    assert shown._bits.nbytes == ShownGaussians.nbytes(gaussians)
+
+
+def test_whole_gradient_is_sent_if_nearly_all_are_shown() -> None:
+    assert gaussians_sent(300, 1000) == 300
+    assert gaussians_sent(DENSE_FRACTION * 1000 + 1, 1000) == 1000
+    assert gaussians_sent(2000, 1000) == 1000, "a survey counts pruned ones too"
+    mask = torch.arange(1000) < 600
+    assert ShownGaussians(mask).sparse
+    assert not ShownGaussians(torch.roll(mask, 500) | mask).sparse
+    assert not ShownGaussians(mask[:0]).sparse

@@ -14,7 +14,7 @@ from sgsst_core.planning.facts import equip
 from sgsst_core.quality.measure import Float32Reference, Measurements, approximations
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.steps import mean_loss
@@ -28,7 +28,9 @@ STEPS = 8
 
 def make(weights: BackboneWeights, measure: float = 0.75, **values: Any) -> Stylizer:
     settings = make_settings(steps_sos=STEPS, steps_coarse=0, measure=measure, precision="float32", **values)
-    return Stylizer(plan_job(wall(), cameras(5), Style.of(style()), settings, weights=weights, measured=True))
+    return Stylizer(
+        plan_job(JobInputs(wall(), cameras(5), Style.of(style()), settings, weights=weights, measured=True))
+    )
 
 
 def measured(stylizer: Stylizer, stop: Any = None) -> list[int]:
@@ -84,9 +86,9 @@ def prepared(weights: BackboneWeights, scene: object = None, **values: Any) -> S
 def in_bfloat16(weights: BackboneWeights) -> Stylizer:
     """Return a job whose plan is constructed by hand, so that the precision does not depend on the processor."""
     scene, settings = ball(500), make_settings(steps_sos=12, training_background="background", warm_start=False)
-    plan = plan_job(scene, cameras(2), Style.of(style()), settings, weights=weights).plan
+    plan = plan_job(JobInputs(scene, cameras(2), Style.of(style()), settings, weights=weights)).plan
     plan = replace(plan, precision="bfloat16")
-    return Stylizer(prepare_job(plan, scene, cameras(2), Style.of(style()), settings, weights=weights))
+    return Stylizer(prepare_job(plan, JobInputs(scene, cameras(2), Style.of(style()), settings, weights=weights)))
 
 
 def test_float32_job_agrees_with_its_reference(tiny_weights: BackboneWeights) -> None:
@@ -106,14 +108,16 @@ def test_tf32_is_measured_against_full_float32(tiny_weights: BackboneWeights) ->
     scene, settings = ball(500), make_settings(steps_coarse=0, steps_sos=12, warm_start=False)
     context = equip(scene, cameras(2), settings, tiny_weights, ALONE)
     plan = replace(
-        plan_job(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights).plan, precision="tf32"
+        plan_job(JobInputs(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights)).plan, precision="tf32"
     )
     rounded = RoundedToTf32(tiny_weights, context.network().layers)
     errors = []
     for shop in (None, replace(context, networks={"tf32": rounded})):
         stylizer = Stylizer(
             prepare_job(
-                plan, scene, cameras(2), Style.of(style()), settings, weights=tiny_weights, planning_context=shop
+                plan,
+                JobInputs(scene, cameras(2), Style.of(style()), settings, weights=tiny_weights),
+                planning_context=shop,
             )
         )
         assert approximations(stylizer) == ["TF32 convolutions"]

@@ -23,7 +23,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.rasterizer.references import assert_close_outside_band, relative_error
@@ -239,8 +239,8 @@ def test_job_uses_the_requested_rasterizer(tiny_weights: BackboneWeights) -> Non
     settings = make_settings("preview", steps_coarse=0, steps_sos=1, cached_weights="half", precision="float32")
     for name, used_name in (("cpu", "cpu"), ("triton", "cached")):
         inputs = (scene, VIEWS[:1], Style.of(style()), settings)
-        job = plan_job(*inputs, weights=tiny_weights, rasterizer=name)
-        used, resumed = Stylizer(job), Stylizer(prepare_job(job.plan, *inputs, weights=tiny_weights))
+        job = plan_job(JobInputs(*inputs, weights=tiny_weights, rasterizer=name))
+        used, resumed = Stylizer(job), Stylizer(prepare_job(job.plan, JobInputs(*inputs, weights=tiny_weights)))
         for stylizer in (used, resumed):
             rasterizer = stylizer.job.views.rasterizer
             assert (rasterizer.name, rasterizer.uncached.name) == (used_name, name)

@@ -11,6 +11,7 @@ from sgsst_core.regions import Region, Regions
 from sgsst_core.scene.colors import luminance
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
+from sgsst_core.stylizing.job import JobInputs
 from sgsst_core.stylizing.refining import refine
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.stylizing.test_refining import large_wall
@@ -42,8 +43,10 @@ def stylized(stylizer: Stylizer) -> torch.Tensor:
 
 def test_frozen_gaussians_are_not_split_and_children_keep_regions(tiny_weights: BackboneWeights) -> None:
     settings, regions = make_settings("preview", refine=2.0), halves()
-    free = refine(large_wall(), cameras(), Style.of(style()), settings, weights=tiny_weights)
-    refinement = refine(large_wall(), cameras(), Style.of(style()), settings, weights=tiny_weights, regions=regions)
+    free = refine(JobInputs(large_wall(), cameras(), Style.of(style()), settings, weights=tiny_weights))
+    refinement = refine(
+        JobInputs(large_wall(), cameras(), Style.of(style()), settings, weights=tiny_weights, regions=regions)
+    )
     assert free is not None
     assert refinement is not None
     assert bool((piece_counts(free.pieces)[regions.frozen] > 1).any()), "nothing is proved"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+
+from sgsst_core.stylizing.job import JobInputs
 
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, which does not pretend", allow_module_level=True)
@@ -16,7 +17,6 @@ from sgsst_core.loss.graphs import FIRST_VISITS
 from sgsst_core.planning.plan import Plan
 from sgsst_core.planning.survey import survey_views
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.report.document import Sources, build_report
 from sgsst_core.settings import PlannedBackground, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import prepare_job
@@ -70,7 +70,7 @@ def make(
         uncached=rasterizer,
         graphs=graphs,
     )
-    return Stylizer(prepare_job(plan, scene, views, Style.of(style()), settings, weights=weights))
+    return Stylizer(prepare_job(plan, JobInputs(scene, views, Style.of(style()), settings, weights=weights)))
 
 
 @pytest.mark.slow
@@ -121,30 +121,3 @@ def test_one_graph_serves_every_background_color(
     assert (graphs.job.graphs.captured, graphs.job.graphs.problem) == (1, None)
     assert launches["drawn"][-1] == launches["fixed"][-1]
     assert launches["drawn"][-1][0] == 1
-
-
-@pytest.mark.slow
-def test_graphs_support_several_views_per_step_and_resuming(
-    counts: Counts, tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The second view of a step does not change the first one's results, and a resumed run captures new graphs.
-
-    The kernels are PyTorch's, and the rasterizer runs on the CPU.
-    """
-    leave_out_kernels(monkeypatch)
-    options: dict[str, Any] = {"rasterizer": "cpu", "views_per_step": 2, "scan": True, "steps_sos": 5}
-    plain, graphs, resumed = (make(tiny_weights, graphs=graphs, **options) for graphs in (False, True, True))
-    losses = [stylizer.run_step().loss for stylizer in (plain, graphs) for _ in range(5)]
-    assert losses[:5] == losses[5:]
-    resumed.load_state(graphs.state())
-    expected, *others = ([s.run_step().terms for _ in range(3)] for s in (plain, graphs, resumed))
-    assert others == [expected, expected]
-    for stylizer in (graphs, resumed):
-        assert stylizer.stylized().equal(plain.stylized())
-        assert stylizer.job.graphs is not None
-        assert stylizer.job.graphs.captured == (2 if stylizer is graphs else 1)
-        assert stylizer.job.graphs.problem is None
-    sources = Sources(Path("scene.ply"), 0, (Path("style.png"),), None, None, tiny_weights)
-    report = build_report(graphs, sources, "finished", graphs.start(), graphs.evaluate([0]))
-    assert report["graphs"] == {"captured": 2, "problem": None}
-    assert report["seconds_by_part"]["network"] > 0

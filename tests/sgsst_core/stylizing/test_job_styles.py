@@ -13,7 +13,7 @@ from sgsst_core.loss.sos import SosLoss
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.settings import MAX_RESOLUTION, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import _inside, check_style_size, prepared_style, rotated
+from sgsst_core.stylizing.job import check_style_size, prepared_style, rotated
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.small_scenes import cameras, wall
 
@@ -53,28 +53,6 @@ def test_brightness_ramp_rotates_with_the_image(degrees: float, size: tuple[int,
     assert abs(float(image.mean()) - 0.5) <= shift
 
 
-@pytest.mark.parametrize("degrees", [0.5, 10, 30, 45, 60, 89.5])
-@pytest.mark.parametrize("size", [(100, 100), (80, 200), (300, 90)])
-def test_crop_is_the_largest_that_lies_inside(degrees: float, size: tuple[int, int]) -> None:
-    (height, width), angle = size, math.radians(degrees)
-    sine, cosine = math.sin(angle), math.cos(angle)
-
-    def fits(across: float, down: float) -> bool:
-        corners = ((across / 2, down / 2), (across / 2, -down / 2))
-        rotated_back = [(x * cosine + y * sine, y * cosine - x * sine) for x, y in corners]
-        return all(abs(x) <= width / 2 + 1e-9 and abs(y) <= height / 2 + 1e-9 for x, y in rotated_back)
-
-    down, across = _inside(height, width, angle)
-    assert fits(across, down)
-    sides = [step / 2 for step in range(2, 800)]
-    best = max((a * d for a in sides[::2] for d in sides[::4] if fits(a, d)), default=0)
-    assert (across + 3) * (down + 3) >= best * 0.99
-
-
-def test_style_of_one_pixel_can_be_rotated() -> None:
-    assert rotated(torch.full((1, 1, 3), 0.25), 30).shape == (1, 1, 3)
-
-
 def test_matched_colors_have_the_scenes_mean_and_covariance() -> None:
     generator = torch.Generator().manual_seed(1)
     colors = 0.5 + 0.08 * torch.randn(5000, 3, generator=generator) @ torch.tensor(
@@ -100,11 +78,6 @@ def test_uniform_style_gets_the_mean_of_the_scene() -> None:
     torch.testing.assert_close(image, torch.full((4, 4, 3), 0.5))
 
 
-def test_default_settings_leave_the_style_unchanged() -> None:
-    style = Style.of(synthetic_image())
-    assert prepared_style(style, make_settings("standard"), torch.zeros(2, 3), torch.ones(2).double()) is style
-
-
 @pytest.mark.parametrize("scale", [0.5, 2.0])
 def test_style_scale_uses_statistics_of_a_resized_style(tiny_weights: BackboneWeights, scale: float) -> None:
     style, view = synthetic_image(96, 120), (64, 96)
@@ -115,12 +88,6 @@ def test_style_scale_uses_statistics_of_a_resized_style(tiny_weights: BackboneWe
     wanted = SosLoss(network).targets.of_style(Style.of(resize_area(style, size)), size)[0][0]
     for layer in actual.layers:
         torch.testing.assert_close(actual.layers[layer].gram, wanted.layers[layer].gram)
-
-
-def test_small_style_is_not_enlarged_by_default() -> None:
-    assert style_size((50, 70), (64, 96)) == (50, 70)
-    assert style_size((50, 70), (64, 96), 2) == (100, 140)
-    assert style_size((1, 1), (64, 96), 0.25) == (1, 1)
 
 
 def test_style_size_has_the_limit_of_views() -> None:

@@ -62,15 +62,6 @@ def test_unknown_rate_is_tried_on_a_small_image(cache: Path, network: FeatureNet
     assert rates(network).rate(1000) == pytest.approx(3.0)
 
 
-def test_rates_are_forgotten_where_they_cannot_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: FeatureNetwork
-) -> None:
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("SGSST_CACHE", str(tmp_path / "file"))
-    rates(network).remember(1000, 3.0)
-    assert (tmp_path / "file").read_bytes() == b""
-
-
 def test_remaining_time_follows_the_estimate_then_the_own_pace(cache: Path, tiny_weights: BackboneWeights) -> None:
     """An earlier job has left behind a rate of a pixel per second, as if steps took hours."""
     stylizer = Stylizer.planned(

@@ -9,7 +9,8 @@ import torch
 
 from sgsst_core import refine as choice
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.gradient_error import psnr
+from sgsst_core.parallel.collectives import Collectives
+from sgsst_core.planning.survey import psnr
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.refine import MIN_PSNR, Footprints, Refinement, parents_of, piece_counts
@@ -17,12 +18,13 @@ from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.settings import Settings, make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing import refining
+from sgsst_core.stylizing.job import JobInputs
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.refining import disagreement, refine, refined, render, spread_evenly
+from sgsst_core.stylizing.refining import disagreement, refine, render
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.networks import tiny_weights as make_tiny_weights
 from tests.sgsst_core.splat_scenes import camera, cloud
-from tests.small_scenes import ball, blind_camera, cameras, style, wall
+from tests.small_scenes import cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -47,7 +49,9 @@ def settings(**values: object) -> Settings:
 
 
 def refinement_of(weights: BackboneWeights, factor: float, scene: Scene | None = None) -> Refinement:
-    refinement = refine(scene or large_wall(), cameras(), Style.of(style()), settings(refine=factor), weights=weights)
+    refinement = refine(
+        JobInputs(scene or large_wall(), cameras(), Style.of(style()), settings(refine=factor), weights=weights)
+    )
     assert refinement is not None
     return refinement
 
@@ -85,7 +89,7 @@ def test_large_gaussians_are_split_within_the_budget_and_images_are_preserved(
     assert refinement.psnr is not None
     assert refinement.lowest_psnr is not None
     assert refinement.psnr >= refinement.lowest_psnr >= MIN_PSNR
-    refined_scene = refined(scene, refinement)
+    refined_scene = refinement.of(scene)
     errors = []
     for view in cameras():  # with the slow float64 rasterizer
         before, after = (render(each, ReferenceRasterizer(each), view).clamp(0, 1) for each in (scene, refined_scene))
@@ -105,12 +109,12 @@ def test_nothing_is_split_if_no_gaussian_is_large(tiny_weights: BackboneWeights)
     refinement = refinement_of(tiny_weights, 8.0, small)
     assert (refinement.split, refinement.gaussians, refinement.reverted) == (0, len(small), 0)
     assert refinement.psnr is None
-    assert refined(small, refinement) is small
+    assert refinement.of(small) is small
 
 
 def test_auto_splits_only_what_is_too_large_for_strokes(tiny_weights: BackboneWeights) -> None:
     scene, views = large_wall(), cameras()
-    refinement = refine(scene, views, Style.of(style()), settings(refine="auto"), weights=tiny_weights)
+    refinement = refine(JobInputs(scene, views, Style.of(style()), settings(refine="auto"), weights=tiny_weights))
     assert refinement is not None
     assert refinement.size is not None
     assert refinement.size >= choice.STROKE_SIZE
@@ -120,22 +124,6 @@ def test_auto_splits_only_what_is_too_large_for_strokes(tiny_weights: BackboneWe
         prints.add(view, rasterizer.survey(view)[1])
     split = piece_counts(refinement.pieces) > 1
     assert float(prints.lengths[split].amax(dim=1).min()) > choice.STROKE_SIZE
-
-
-def test_auto_computes_no_gradient_if_no_gaussian_is_large(tiny_weights: BackboneWeights) -> None:
-    reports: list[int] = []
-    small = replace(wall(), scales=torch.full_like(wall().scales, -5.0))
-    refinement = refine(
-        small,
-        cameras(),
-        Style.of(style()),
-        settings(refine="auto"),
-        weights=tiny_weights,
-        show=lambda now: reports.append(now.step),
-    )
-    assert refinement is not None
-    assert (refinement.split, refinement.gaussians) == (0, len(small))
-    assert reports == [0, 1, 2]  # the survey alone
 
 
 def test_splits_that_would_change_the_image_are_undone(
@@ -151,18 +139,6 @@ def test_splits_that_would_change_the_image_are_undone(
     loose = refinement_of(tiny_weights, 4.0)
     assert loose.reverted == 0
     assert loose.split == refinement.reverted
-
-
-def test_factor_of_one_turns_refinement_off(tiny_weights: BackboneWeights) -> None:
-    scene = large_wall()
-    assert refine(scene, cameras(), Style.of(style()), settings(refine=1), weights=tiny_weights) is None
-    assert refined(scene, None) is scene
-
-
-def test_cameras_that_see_nothing_cause_no_splits(tiny_weights: BackboneWeights) -> None:
-    refinement = refine(ball(), [blind_camera()], Style.of(style()), settings(refine=2), weights=tiny_weights)
-    assert refinement is not None
-    assert refinement.split == 0
 
 
 def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> None:
@@ -184,37 +160,17 @@ def test_stylizer_contains_the_refined_scene(tiny_weights: BackboneWeights) -> N
 def test_refinement_reports_its_progress(tiny_weights: BackboneWeights) -> None:
     reports: list[tuple[str, int, int]] = []
     refine(
-        large_wall(),
-        cameras(),
-        Style.of(style()),
-        settings(refine=2.0),
-        weights=tiny_weights,
+        JobInputs(large_wall(), cameras(), Style.of(style()), settings(refine=2.0), weights=tiny_weights),
         show=lambda now: reports.append((now.stage, now.step, now.total)),
     )
     stages = [(stage, done, 3) for stage in ("planning", "refining") for done in range(3)]
     assert reports == [*stages, ("refining", 0, 0)]
 
 
-def test_views_are_spread_evenly() -> None:
-    assert spread_evenly([3, 5, 8], 6) == [3, 5, 8]
-    assert spread_evenly(list(range(10)), 4) == [0, 2, 5, 7]
-    assert spread_evenly([], 4) == []
-
-
-def test_footprints_agree_with_the_fast_rasterizer() -> None:
-    scene, camera = wall(sh_degree=1), cameras()[1]
-    slow, fast = ReferenceRasterizer(scene), CpuRasterizer(scene)
-    assert torch.allclose(render(scene, slow, camera).float(), render(scene, fast, camera), atol=1e-5)
-
-
-def on_a_rank(collectives: object, factor: float) -> Refinement | None:
+def on_a_rank(collectives: Collectives, factor: float) -> Refinement | None:
     """Refine the wall on one of several ranks, each of which runs this function in its own process."""
     weights = make_tiny_weights()
     return refine(
-        large_wall(),
-        cameras(),
-        Style.of(style()),
-        settings(refine=factor),
-        weights=weights,
-        collectives=collectives,  # type: ignore[arg-type]
+        JobInputs(large_wall(), cameras(), Style.of(style()), settings(refine=factor), weights=weights),
+        collectives=collectives,
     )

@@ -78,15 +78,6 @@ def test_job_continues_with_half_of_its_activations(memory: Memory, tiny_weights
     torch.testing.assert_close(actual.sh_dc.cpu(), expected.sh_dc.cpu(), rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_evaluations_get_a_second_attempt(memory: Memory, tiny_weights: BackboneWeights) -> None:
-    stylizer = planned(tiny_weights)
-    stylizer.run_step()  # computes the style's targets
-    memory.pixels = TILE * HEIGHT
-    assert stylizer.start()
-    assert memory.failures == 1
-
-
 def test_too_little_memory_is_a_clear_error(memory: Memory, tiny_weights: BackboneWeights) -> None:
     stylizer = planned(tiny_weights)
     before, memory.pixels = stylizer.sh_dc.cpu().clone(), 100

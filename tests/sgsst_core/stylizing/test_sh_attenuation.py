@@ -14,7 +14,6 @@ from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import harmonics_energy
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.loop import run, stylize
@@ -73,15 +72,6 @@ def test_written_result_renders_as_optimized(
             for each in (stylizer, again)
         ]
         assert torch.equal(*images)
-
-
-def test_plan_measures_the_view_dependent_color(tiny_weights: BackboneWeights) -> None:
-    scene = wall(sh_degree=1)
-    strong = replace(scene, sh_rest=held(scene.sh_rest) * 10)
-    plans = [make(tiny_weights, each).job.plan for each in (scene, strong)]
-    lines = [[each.reason for each in plan.decisions if each.item == "view-dependent color"] for plan in plans]
-    energy = harmonics_energy(strong, plans[1].survey.total_blend_weights)
-    assert lines == [[], [f"{energy:.0%} of the color variance depends on the view direction"]]
 
 
 def test_plan_describes_the_attenuation(tiny_weights: BackboneWeights) -> None:

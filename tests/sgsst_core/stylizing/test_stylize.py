@@ -114,14 +114,6 @@ def test_split_and_attenuated_results_have_the_form_of_the_scene(
             run(result, tiny_weights, refine=2)
 
 
-def test_result_can_be_stylized_again(tiny_weights: BackboneWeights, tmp_path: Path) -> None:
-    source = in_form("ply", wall(sh_degree=1), tmp_path)
-    twice = run(run(source, tiny_weights, sh_attenuation=0.5), tiny_weights, sh_attenuation=0.5)
-    save(tmp_path / "out.ply", twice)
-    assert torch.equal(held(load_scene(tmp_path / "out.ply").scene.sh_rest), held(source.scene.sh_rest) * 0.25)
-    assert torch.equal(held(twice.scene.sh_rest), held(source.scene.sh_rest) * 0.25)
-
-
 def test_readme_example_runs(tiny_installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ply, _, image = write_files(tmp_path)
     image.rename(tmp_path / "style.jpg")

@@ -12,19 +12,15 @@ from torch import Tensor
 
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.loss.terms import ViewTarget
-from sgsst_core.quality.measure import Float32Reference
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions import Region, RegionMaps, Regions
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, fingerprint, load_checkpoint, versions
-from sgsst_core.stylizing.job import prepare_job
+from sgsst_core.stylizing.job import JobInputs, prepare_job
 from sgsst_core.stylizing.loop import run
-from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer, neighbors_change_by_region, transferred_colors
-from tests.sgsst_core.synthetic_images import relative_error
 from tests.small_scenes import ball, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -49,8 +45,9 @@ def make(weights: BackboneWeights, scene: Scene, regions: Regions | None, image:
 # --- maps ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.3, 1.0, 0.1)])
-@pytest.mark.parametrize("name", ["cpu", "cached", "reference"])
+@pytest.mark.parametrize(
+    ("name", "background"), [("cpu", (0.0, 0.0, 0.0)), ("cached", (0.3, 1.0, 0.1)), ("reference", (0.3, 1.0, 0.1))]
+)
 def test_maps_sum_to_the_coverage(name: Any, background: tuple[float, float, float]) -> None:
     scene, (view, *_) = ball(), cameras()
     labels = torch.arange(len(scene), dtype=torch.uint8) % 5
@@ -127,18 +124,6 @@ def test_region_of_everything_is_bit_identical_to_no_regions(tiny_weights: Backb
     assert [record.loss for record in actual.history] == [record.loss for record in wanted.history]
 
 
-def test_empty_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
-    scene = wall()
-    labels = torch.zeros(len(scene), dtype=torch.uint8)
-    empty = Regions((Region("rest"), Region("empty", style=Style.of(other_style()))), labels)
-    actual, wanted = make(tiny_weights, scene, empty), make(tiny_weights, scene, None)
-    for stylizer in (actual, wanted):
-        run(stylizer)
-    assert torch.equal(actual.stylized(), wanted.stylized())
-    (line,) = [each for each in actual.job.plan.decisions if each.item == "region empty"]
-    assert line.decision == "warning: ignored, because it has no Gaussians"
-
-
 def test_each_region_approaches_its_own_style(tiny_weights: BackboneWeights) -> None:
     """A region does not approach another region's style; the styles are a uniform dark and a uniform bright image."""
     scene = wall()
@@ -164,20 +149,6 @@ def test_warm_start_uses_the_style_of_each_region(tiny_weights: BackboneWeights)
             colors[regions.labels[stylizer.job.plan.seen] == place].mean(), torch.tensor(gray), atol=1e-3, rtol=0
         )
     assert bool(seen.any())
-
-
-def test_names_and_order_of_disjoint_regions_do_not_matter(tiny_weights: BackboneWeights) -> None:
-    scene = wall()
-    one = halves(scene, left=Region("rest", style=Style.of(style())))
-    two = Regions(
-        (Region("rest"), Region("b", style=one.every[1].style), Region("a", style=one.every[0].style)),
-        torch.where(one.labels == 1, 1, 2).to(torch.uint8),
-    )
-    gradients = []
-    for regions in (one, two):
-        stylizer = make(tiny_weights, scene, regions)
-        gradients.append(stylizer.gradient(0, stylizer.job.scales(0))[0])
-    assert relative_error(gradients[1], gradients[0]) < 1e-6
 
 
 # --- resuming, reference and plan ----------------------------------------------------------------------------------
@@ -208,12 +179,7 @@ def test_resumed_job_is_bit_identical(tiny_weights: BackboneWeights, tmp_path: P
     again = Stylizer(
         prepare_job(
             checkpoint.plan,
-            scene,
-            cameras(),
-            Style.of(style()),
-            first.job.settings,
-            weights=tiny_weights,
-            regions=regions,
+            JobInputs(scene, cameras(), Style.of(style()), first.job.settings, weights=tiny_weights, regions=regions),
         )
     )
     again.load_state(checkpoint.state)
@@ -234,32 +200,3 @@ def test_fingerprint_depends_on_regions() -> None:
     fingerprints = [fingerprint(scene, views, Style.of(style()), settings, "w", "", each) for each in every]
     assert len(set(fingerprints)) == len(every)
     assert fingerprints[0] == fingerprint(scene, views, Style.of(style()), settings, "w")
-
-
-def test_float32_reference_has_the_same_regions(tiny_weights: BackboneWeights) -> None:
-    scene = wall()
-    stylizer = make(tiny_weights, scene, halves(scene), warm_start=False)
-    reference = Float32Reference(stylizer)
-    scales = stylizer.job.scales(0)
-    own, exact = stylizer.gradient(0, scales)[0], reference.gradient(0, scene.sh_dc, scales)[0]
-    assert relative_error(own, exact[stylizer.job.plan.seen]) < 1e-6
-
-
-def test_plan_includes_region_maps(tiny_weights: BackboneWeights) -> None:
-    scene, settings = wall(), make_settings(steps_sos=20, coarsest_side=24)
-    plan = plan_job(scene, cameras(), Style.of(style()), settings, weights=tiny_weights, regions=halves(scene)).plan
-    lines = {line.item: line for line in plan.decisions}
-    assert "2 renders at a view's first visit, 0.1 MB for all views" in lines["regions"].decision
-    assert "% of what the views show, use the style" in lines["region rest"].decision
-    assert "use image 1" in lines["region right"].decision
-
-
-def test_view_without_region_maps_is_an_error(tiny_weights: BackboneWeights) -> None:
-    scene = wall()
-    stylizer = make(tiny_weights, scene, halves(scene))
-    view = stylizer.job.view_targets.target(0, [0])
-    targets = stylizer.job.style_targets(stylizer.job.views.cameras[0])
-    image = stylizer.job.views.render(0, stylizer.job.views.colors(0, stylizer.sh_dc.detach()))
-    bare = ViewTarget(view.content_image, view.content, view.coverage, view.division)
-    with pytest.raises(ValueError, match="not prepared for the regions"):
-        stylizer.job.loss.evaluate(image, targets, bare, [0])

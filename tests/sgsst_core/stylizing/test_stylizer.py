@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.devices import Timer
 from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.progress import Progress
-from sgsst_core.rasterizer.projection import TileIntersections, build_tile_intersections
 from sgsst_core.scales import smoothed
-from sgsst_core.scene.camera import Camera, fit_cameras
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import PresetName, make_settings
-from sgsst_core.style import Style
 from sgsst_core.stylizing.checkpoint import Checkpoint, Checkpoints, load_checkpoint, versions
-from sgsst_core.stylizing.job import prepare_job
 from sgsst_core.stylizing.loop import Callbacks, run
-from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.steps import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.synthetic_images import synthetic_image
@@ -54,33 +47,6 @@ def test_runs_with_the_same_seed_are_bit_identical(tiny_weights: BackboneWeights
     assert torch.equal(first.sh_dc, second.sh_dc)
     assert [record.loss for record in first.history] == [record.loss for record in second.history]
     assert not torch.equal(first.sh_dc, other.sh_dc)
-
-
-def test_tile_intersections_of_the_survey_are_reused(
-    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The job reduces the plan's intersections to rendered Gaussians, bit-identical to recomputed intersections."""
-    built: list[int] = []
-
-    def build(scene: Scene, camera: Camera, **options: Any) -> TileIntersections:
-        built.append(len(scene))
-        return build_tile_intersections(scene, camera, **options)
-
-    monkeypatch.setattr("sgsst_core.rasterizer.cpu.build_tile_intersections", build)
-    scene, views = ball(), cameras(3)
-    scene.means[-10:, 2] *= -1  # behind the cameras
-    settings = make_settings(steps_sos=6)
-    job = plan_job(scene, views, Style.of(style()), settings, weights=tiny_weights)
-    plan, results = job.plan, []
-    assert not plan.seen.all()
-    assert built == [len(scene)] * 3
-    built.clear()
-    for each in (job, prepare_job(plan, scene, views, Style.of(style()), settings, weights=tiny_weights)):
-        stylizer = Stylizer(each)
-        run(stylizer)
-        results.append(stylizer.stylized())
-    assert built == [int(plan.seen.sum())] * 3
-    assert torch.equal(*results)
 
 
 def test_resumed_run_is_bit_identical(tiny_weights: BackboneWeights, scene: Scene, tmp_path: Path) -> None:
@@ -171,19 +137,6 @@ def test_features_approach_the_style(
     assert stylizer.seconds_by_part["matching"] > 0
 
 
-def test_evaluating_changes_nothing(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    stylizer = make(tiny_weights, scene)
-    stylizer.run_step()
-    before = stylizer.state()
-    stylizer.evaluate([0, 1])
-    after = stylizer.state()
-    assert {k: v for k, v in asdict(before).items() if not isinstance(v, torch.Tensor)} == {
-        k: v for k, v in asdict(after).items() if not isinstance(v, torch.Tensor)
-    }
-    assert torch.equal(before.generator, after.generator)
-    assert torch.equal(before.sh_dc, after.sh_dc)
-
-
 def test_time_budget_stops_the_run_with_a_checkpoint(tiny_weights: BackboneWeights, scene: Scene) -> None:
     """The clock advances by a second before each step but the first; the next step and the end need less than one."""
     stylizer = make(tiny_weights, scene)
@@ -231,22 +184,6 @@ def test_first_and_last_step_are_reported_and_others_at_intervals(tiny_weights: 
     ended, stopped = list[Progress](), make(tiny_weights, scene)
     run(stopped, Callbacks(progress=ended.append, progress_seconds=math.inf, stop=lambda: stopped.step == 3))
     assert [report.step for report in ended] == [1, 3], "a job that ends early reports its last step too"
-
-
-def test_result_is_cached_for_the_same_colors(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    stylizer = make(tiny_weights, scene)
-    first = stylizer.stylized()
-    assert stylizer.stylized() is first
-    colors = stylizer.sh_dc.clone()
-    with stylizer.with_colors(scene.sh_dc + 1):
-        assert torch.equal(stylizer.stylized()[stylizer.job.plan.seen], scene.sh_dc[stylizer.job.plan.seen] + 1)
-    assert stylizer.stylized() is first
-    assert torch.equal(stylizer.sh_dc, colors)
-    stylizer.run_step()
-    second = stylizer.stylized()
-    assert not torch.equal(second, first)
-    stylizer.load_state(make(tiny_weights, scene).state())
-    assert torch.equal(stylizer.stylized(), first)
 
 
 def test_target_is_a_fraction_of_the_initial_loss(tiny_weights: BackboneWeights, scene: Scene) -> None:
@@ -339,43 +276,3 @@ def test_given_photos_are_the_content(tiny_weights: BackboneWeights, scene: Scen
     given = Stylizer.planned(scene, cameras(1), style(), settings, weights=tiny_weights, photos=lambda index: photo)
     assert own.evaluate([0])[0]["content"] == 0
     assert given.evaluate([0])[0]["content"] > 0
-
-
-def test_larger_views_are_reduced_to_the_limit() -> None:
-    views = [*cameras(1), *cameras(1, width=200, height=150)]
-    fitted = fit_cameras(views, make_settings(max_resolution=100))
-    assert fitted[0] is views[0]
-    assert (fitted[1].width, fitted[1].height) == (100, 75)
-    assert fit_cameras(views, make_settings()) == views
-
-
-class ClockEvent:
-    """Simulated event in the stream of a device that finishes all work immediately."""
-
-    def record(self) -> None:
-        self.at = time.perf_counter()
-
-    def query(self) -> bool:
-        return True
-
-    def synchronize(self) -> None:
-        pass
-
-    def elapsed_time(self, end_event: Any) -> float:
-        return 1000 * float(end_event.at - self.at)
-
-
-def test_step_timed_by_events_has_every_part(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    """The seconds of all parts are known when the step has finished, as with a GPU's events."""
-    clock, events = (make(tiny_weights, scene) for _ in range(2))
-    events.job.loss.timer = events.job.views.timer = Timer(event=ClockEvent)
-    timed = 0.0
-    for step in range(6):
-        expected, actual = clock.run_step(), events.run_step()
-        timed += sum(actual.parts.values()) if step else 0.0
-        assert actual.parts.keys() == expected.parts.keys()
-        assert all(seconds > 0 for seconds in actual.parts.values())
-        assert sum(actual.parts.values()) < events.seconds
-        assert actual.loss == expected.loss
-    assert events.seconds_by_part.keys() == clock.seconds_by_part.keys()
-    assert timed > 0.2 * (events.seconds - events.history[0].seconds)

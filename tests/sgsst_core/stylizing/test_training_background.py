@@ -22,7 +22,7 @@ from sgsst_core.stylizing.steps import mean_loss
 from sgsst_core.stylizing.stylizer import Stylizer
 from sgsst_core.stylizing.views import drawn_color, replace_background
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
-from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style, wall
+from tests.small_scenes import HEIGHT, WIDTH, ball, cameras, style
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -48,15 +48,6 @@ def test_color_depends_only_on_seed_step_and_view() -> None:
     assert len(set(colors.values())) == len(colors)
     assert all(drawn_color("random", *numbers, image) == color for numbers, color in colors.items())
     assert drawn_color("background", 0, 0, 0, image) is None
-
-
-def test_random_colors_are_uniform() -> None:
-    drawn = torch.tensor([drawn_color("random", 7, step, 2, Style.of(style())) for step in range(4000)])
-    assert 0 <= float(drawn.min()) < 0.01
-    assert 0.99 < float(drawn.max()) < 1
-    # Standard errors are 0.0046 for the means and about 0.0013 for the covariances.
-    torch.testing.assert_close(drawn.mean(0), torch.full((3,), 0.5), rtol=0, atol=0.02)
-    torch.testing.assert_close(torch.cov(drawn.T), torch.eye(3) / 12, rtol=0, atol=0.006)
 
 
 def test_palette_colors_are_those_of_style_pixels() -> None:
@@ -159,46 +150,8 @@ def test_repeated_and_resumed_runs_are_bit_identical(tiny_weights: BackboneWeigh
     assert losses[0] == losses[1]
 
 
-def test_covered_scene_ignores_the_training_background(tiny_weights: BackboneWeights) -> None:
-    """Results are bit-identical to those with a fixed background."""
-    plain = make(tiny_weights, wall(), training_background="background")
-    automatic = make(tiny_weights, wall())
-    for stylizer in (plain, automatic):
-        run(stylizer)
-    assert torch.equal(plain.sh_dc, automatic.sh_dc)
-    items = [[line.item for line in stylizer.job.plan.decisions] for stylizer in (plain, automatic)]
-    assert items[0] == items[1]
-    assert "training background" not in items[0]
-
-
 def test_paper_preset_uses_a_fixed_background_for_scans(tiny_weights: BackboneWeights) -> None:
     settings = make_settings("paper", steps_coarse=1, steps_sos=1)
     stylizer = Stylizer.planned(ball(), cameras(2), style(), settings, weights=tiny_weights)
     assert (stylizer.job.plan.training_background, stylizer.job.plan.warm_start) == ("background", False)
     assert torch.equal(stylizer.sh_dc, ball().sh_dc[stylizer.job.plan.seen])
-
-
-@pytest.mark.slow
-def test_changing_backgrounds_do_not_stop_a_run_early(
-    tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A target is compared with the loss on the fixed background, once per round."""
-    drawn, fixed = (
-        make(
-            tiny_weights,
-            ball(),
-            training_background=kind,
-            early_stop=True,
-            learning_rate=1e-9,
-            steps_sos=60,
-            steps_coarse=0,
-        )
-        for kind in ("palette", "background")
-    )
-    assert run(fixed) == "converged"
-    assert run(drawn) == "finished"
-    target = make(tiny_weights, ball(), training_background="random", target_loss=0.9, warm_start=False, steps_sos=90)
-    assert run(target) == "target-loss"
-    assert mean_loss(target.evaluate(target.job.evaluation_views)) <= 0.9 * mean_loss(target.start())
-    assert target.step % target.job.round_length == 0
-    assert target.seconds_by_part["measuring"] > 0

@@ -27,7 +27,7 @@ from sgsst_core.scene.colors import gray
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import StyleLossName, make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.job import JobStyles, prepare_job
+from sgsst_core.stylizing.job import JobInputs, JobStyles, prepare_job
 from sgsst_core.stylizing.loop import run
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import Stylizer
@@ -244,13 +244,12 @@ def stylize_each(collectives: Collectives) -> list[dict[str, Any]]:
         own: dict[str, Any] = {"steps_coarse": 1, "steps_sos": 1, "learning_rate": 0.01, "views_per_step": count}
         settings = make_settings("standard", coarsest_side=40, early_stop=False, **own)
         inputs, weights = (wall(), cameras(8), Style.of(style().double()), settings), tiny_weights()
-        job = plan_job(*inputs, weights=weights, collectives=collectives)
+        job = plan_job(JobInputs(*inputs, weights=weights), collectives=collectives)
         stylizer = Stylizer(job)
         run(stylizer)
         exact = prepare_job(
             replace(job.plan, uncached="reference", cached_weights="none"),
-            *inputs,
-            weights=weights,
+            JobInputs(*inputs, weights=weights),
             collectives=collectives,
         )
         exact.loss.use(FeatureNetwork(weights, job.network.layers, torch.float64))
@@ -313,8 +312,8 @@ def planned_in_groups(collectives: Collectives) -> dict[str, Any]:
     """Plan a job of small views whose steps are not given, and plan it again as after the loss of a rank."""
     inputs = wall(), cameras(4), Style.of(style())
     settings = make_settings(coarsest_side=24, measure=0)
-    job = plan_job(*inputs, settings, weights=tiny_weights(), collectives=collectives)
-    resumed = plan_job(*inputs, settings, weights=tiny_weights(), groups=job.plan.groups)
+    job = plan_job(JobInputs(*inputs, settings, weights=tiny_weights()), collectives=collectives)
+    resumed = plan_job(JobInputs(*inputs, settings, weights=tiny_weights()), groups=job.plan.groups)
     stylizer = Stylizer(job)
     losses = [stylizer.run_step().loss for _ in range(2)]
     shape = job.plan.groups, job.team.groups, job.settings.views_per_step, job.total_steps

@@ -18,11 +18,13 @@ import torch.distributed as dist
 from safetensors.torch import save
 from torch import Tensor
 
+from benchmarks.stability.sos_reference import layer_statistics_reference
 from sgsst_core.errors import RanksDriftedError, SceneError
 from sgsst_core.features.partition import Rectangle
-from sgsst_core.features.statistics import LayerStatistics, layer_statistics, layer_statistics_reference
+from sgsst_core.features.statistics import LayerStatistics, layer_statistics
 from sgsst_core.files.photos import Photo
 from sgsst_core.loss.terms import LossTerms
+from sgsst_core.messages import decode, encode
 from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, Team, same_on_all
 from sgsst_core.planning.facts import Machine
 from sgsst_core.progress import Decision
@@ -36,7 +38,7 @@ from tests.small_scenes import cameras, style, wall
 from tests.worker.ranks.spawn import on_ranks
 from worker.capture import Capture
 from worker.outputs import Outputs
-from worker.ranks.process_group import _backend, _meet, decode, encode
+from worker.ranks.process_group import _backend, _meet
 
 HEIGHT = 70
 
@@ -330,7 +332,7 @@ def message(value: Any) -> Tensor:
         {"error": ["builtins:eval", ["1"]]},
         {"error": ["os:system", ["true"]]},
         {"error": ["sgsst_core.scene.camera:Camera", []]},
-        {"error": ["worker.ranks.process_group:import_module", ["antigravity"]]},
+        {"error": ["sgsst_core.messages:import_module", ["antigravity"]]},
         {"error": ["worker.processes:kill", [[]]]},
         {"object": ["pathlib:Path", {}]},
         {"object": ["worker.ranks.rank:RankProcess", {}]},

@@ -11,8 +11,9 @@ import torch
 import torch.multiprocessing as multiprocessing
 from torch import Tensor
 
+from benchmarks.stability.sos_reference import layer_statistics_reference
 from sgsst_core.features.network_weights import load_network_weights
-from sgsst_core.features.statistics import layer_statistics, layer_statistics_reference
+from sgsst_core.features.statistics import layer_statistics
 from sgsst_core.parallel.collectives import ALONE, Collectives
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.stylizer import Stylizer

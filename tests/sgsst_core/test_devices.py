@@ -107,30 +107,6 @@ def test_gpu_block_is_timed_by_device_events() -> None:
     assert stream.waits == 1
 
 
-def test_reading_after_a_wait_does_not_wait_again() -> None:
-    stream = Stream()
-    timer = Timer(event=stream.event)
-    for rounds in (1, 2):
-        step(timer, stream.launch)
-        stream.wait()
-        timer.read()
-        assert stream.waits == rounds
-        assert timer.seconds == pytest.approx({name: rounds * value for name, value in SECONDS.items()})
-
-
-def test_clearing_discards_unread_measurements() -> None:
-    stream = Stream()
-    timer = Timer(event=stream.event)
-    step(timer, stream.launch)
-    timer.clear()
-    assert timer.read() == {}
-    with timer("loss"):
-        stream.launch(1.0)
-        timer.clear()
-        stream.launch(2.0)
-    assert timer.read() == pytest.approx({"loss": 2.0})
-
-
 def test_failing_block_is_timed_and_closed() -> None:
     stream = Stream()
     timer = Timer(event=stream.event)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from sgsst_core.loss.gradient_error import Difference
+from sgsst_core.quality.measure import Difference
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
-"""Tests of scale weights: the weighted loss matches its definition, and scales with weight 0 are not computed."""
+"""Tests of scales: their weights in the loss, the scales that are drawn, and windows of rounds of views."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,13 +15,16 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork
 from sgsst_core.loss.sos import SosLoss, SosResult
 from sgsst_core.planning.facts import check_scales
-from sgsst_core.scales import EVEN, ScaleWeights
+from sgsst_core.quality.measure import Float32Reference, Measurements
+from sgsst_core.scales import EVEN, ScaleWeights, has_converged, has_reached, smoothed
 from sgsst_core.scene.colors import resize_area, style_size
 from sgsst_core.settings import make_settings
 from sgsst_core.style import Style
-from sgsst_core.stylizing.steps import drawn_scales
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.steps import drawn_scales, mean_loss
+from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.synthetic_images import relative_error, synthetic_image
-from tests.small_scenes import cameras
+from tests.small_scenes import cameras, style, wall
 
 SIZE, COARSEST = (160, 233), 50
 
@@ -91,35 +95,11 @@ def test_mean_gradient_of_all_draws_is_that_of_the_whole_loss(
     assert relative_error(mean, expected) < 1e-9
 
 
-def test_cost_of_drawn_scales_is_the_mean_over_draws() -> None:
-    assert EVEN.evaluated(3) == pytest.approx(1 + 1 / 4 + 1 / 16)
-    assert EVEN.evaluated(3, 2) == pytest.approx(1 / 4 + 1 / 8 + 1 / 16)
-    assert ScaleWeights((1.0, 0.0, 2.0)).evaluated(3, 3) == pytest.approx(1 / 3 + 1 / 16)
-    assert EVEN.sampled_cost(3, 1) == EVEN.sampled_cost(1, 5) == 1
-    assert EVEN.sampled_cost(2, 4) == pytest.approx(1 / 4)
-    assert EVEN.sampled_cost(3, 2) == pytest.approx((16 / 4 + 4 / 2) / 20)
-    assert ScaleWeights((1.0, 0.0, 2.0)).sampled_cost(3, 3) == pytest.approx(1 / 3)
-
-
 def test_scales_without_weight_are_not_computed(tiny_weights: BackboneWeights) -> None:
     result, seen = evaluate(tiny_weights, (0.0, 1.0))
     assert result.scales == (1,)
     assert all(height <= SIZE[0] // 2 and width <= SIZE[1] // 2 for height, width in seen)
     assert len(seen) == 3  # content, style and view, once each
-
-
-@pytest.mark.parametrize("values", [(1.0, 1.0, 1.0), (7.0, 7.0, 7.0)])
-def test_equal_weights_are_bit_identical_to_none(tiny_weights: BackboneWeights, values: tuple[float, ...]) -> None:
-    actual, _ = evaluate(tiny_weights, values, dtype=torch.float32)
-    expected, _ = evaluate(tiny_weights, (), dtype=torch.float32)
-    assert actual.image_gradient is not None
-    assert expected.image_gradient is not None
-    assert torch.equal(actual.values, expected.values)
-    if values[0] == 1:
-        assert actual.loss == expected.loss
-        assert torch.equal(actual.image_gradient, expected.image_gradient)
-    else:
-        torch.testing.assert_close(actual.image_gradient, expected.image_gradient)
 
 
 def test_fractions_sum_to_one_and_need_a_weighted_scale() -> None:
@@ -149,3 +129,100 @@ def test_scales_beyond_those_of_the_views_are_refused() -> None:
         check_scales((0.0, 1.0), views, 96)
     with pytest.raises(SettingsError, match="gives no weight to the 1 of 3 scales that view 'view_0' has"):
         check_scales((0.0, 1.0), [*cameras(1, 30, 20), *cameras(2, 128, 96)[1:]], 24)
+
+
+def test_smoothed_loss_is_the_geometric_mean_of_the_last_steps() -> None:
+    assert smoothed([100.0, 1.0, 4.0], 2) == pytest.approx(2.0)
+    assert smoothed([8.0, 2.0], 10) == pytest.approx(4.0)
+    assert smoothed([0.0, 0.0], 2) < 1e-200
+
+
+def test_convergence_ignores_differences_between_views() -> None:
+    """The losses of three views alternate in the ratio 1 : 10 : 100."""
+    views = [1.0, 10.0, 100.0]
+    falling = [views[step % 3] * math.exp(-0.01 * step) for step in range(120)]
+    assert not has_converged(falling, 3)
+    assert has_converged([views[step % 3] for step in range(60)], 3)
+    assert not has_converged([views[step % 3] for step in range(47)], 3)  # less than two windows of 24
+
+
+def test_target_is_reached_only_after_a_whole_round() -> None:
+    assert not has_reached([0.1], 0.5, 2)
+    assert has_reached([0.9, 0.2], 0.5, 2)
+    assert not has_reached([0.9, 0.9], 0.5, 2)
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def make(weights: BackboneWeights, steps_coarse: int = 2, **values: Any) -> Stylizer:
+    settings = make_settings(
+        **({"steps_coarse": steps_coarse, "steps_sos": 3, "coarsest_side": 16, "scale_sampling": 1} | values)
+    )
+    return Stylizer.planned(wall(), cameras(), style(), settings, weights=weights)
+
+
+def line(stylizer: Stylizer, item: str) -> str:
+    return next((each.decision for each in stylizer.job.plan.decisions if each.item == item), "")
+
+
+def test_phase_1_uses_the_coarsest_weighted_scale(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, scales=(1.0, 0.5))
+    run(stylizer)
+    assert [sorted(record.terms) for record in stylizer.history] == [[1], [1], [0, 1], [0, 1], [0, 1]]
+    record = stylizer.history[-1]
+    assert record.loss == pytest.approx((record.terms[0].total + 0.5 * record.terms[1].total) / 1.5)
+    assert line(stylizer, "weights of scales") == "scale 0 1, scale 1 0.5; 1 of 3 scales are not computed"
+
+
+def test_evaluated_loss_covers_the_weighted_scales(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, scales=(1.0, 0.0, 0.5), warm_start=False)
+    evaluation = stylizer.evaluate([0, 1])
+    assert sorted(evaluation) == [0, 2]
+    weights = stylizer.job.loss.weights
+    assert mean_loss(evaluation, weights) == pytest.approx((evaluation[0].total + 0.5 * evaluation[2].total) / 1.5)
+    reference = Float32Reference(stylizer).evaluate([0, 1], stylizer.job.scene.sh_dc)
+    assert mean_loss(reference, weights) == pytest.approx(mean_loss(evaluation, weights), rel=1e-5)
+    run(stylizer)
+    stylizer.job = replace(stylizer.job, plan=replace(stylizer.job.plan, novel_views=1))
+    Measurements(stylizer).at_the_end()
+    assert set(map(int, stylizer.measured[-1]["novel_views"]["gram"])) == {0, 2}
+
+
+def test_missing_scales_are_refused_before_the_survey(tiny_weights: BackboneWeights) -> None:
+    with pytest.raises(SettingsError, match="the views have 3 scales"):
+        make(tiny_weights, scales=(1.0, 0.0, 0.0, 1.0))
+
+
+def test_drawn_scales_are_the_same_after_a_resume_and_losses_cover_all(tiny_weights: BackboneWeights) -> None:
+    """Each of three views shows the finer scales once in two and four visits."""
+    values = {"steps_coarse": 0, "steps_sos": 12, "scale_sampling": 2, "early_stop": False}
+    whole, first, second = (make(tiny_weights, **values) for _ in range(3))
+    run(whole)
+    for _ in range(7):
+        first.run_step()
+    second.load_state(first.state())
+    run(second)
+    assert torch.equal(second.stylized(), whole.stylized())
+    assert [record.terms for record in second.history] == [record.terms for record in whole.history]
+    for view in range(3):
+        visits = [len(record.evaluated) for record in whole.history if record.view == view]
+        assert sorted(visits) == [1, 1, 2, 3]
+    known: set[int] = set()
+    for record in whole.history:
+        known |= set(record.evaluated)
+        assert set(record.terms) == known
+        assert record.loss == pytest.approx(sum(terms.total for terms in record.terms.values()) / len(known))
+
+
+def test_losses_of_scales_that_were_not_drawn_follow_the_coarsest(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights, steps_coarse=0, steps_sos=9, scale_sampling=3, scales=(1.0, 1.0))
+    run(stylizer)
+    ratios: dict[int, float] = {}
+    for record in stylizer.history:
+        if 0 in record.terms:
+            ratio = record.terms[0].total / record.terms[1].total
+            if record.evaluated == (0, 1):
+                ratios[record.view] = ratio
+            assert ratio == pytest.approx(ratios.get(record.view, ratio))
+    assert len(ratios) == 3

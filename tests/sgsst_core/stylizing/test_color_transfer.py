@@ -1,0 +1,294 @@
+"""Tests of transfers of the style's colors: before the first step, in previews, and after the last step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sgsst_core.constants import SH_C0
+from sgsst_core.features.network_weights import BackboneWeights
+from sgsst_core.planning.plan import Plan
+from sgsst_core.regions import Region, Regions
+from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import Settings, make_settings
+from sgsst_core.style import Style
+from sgsst_core.stylizing.color_transfer import (
+    _drawn,
+    _round_axes,
+    _rounds,
+    _through,
+    _through_compiled,
+    luminance_start,
+    transported,
+    warm_start,
+    with_moments,
+)
+from sgsst_core.stylizing.loop import run
+from sgsst_core.stylizing.stylizer import Stylizer, render_first_view
+from tests.sgsst_core.stylizing.test_stylized_regions import halves
+from tests.sgsst_core.synthetic_images import synthetic_image
+from tests.small_scenes import cameras, style, wall
+
+Start = Callable[[Tensor, Tensor, Style], Tensor]
+
+
+def moments(colors: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute weighted mean and covariance of colors in plain loops."""
+    share = weights / weights.sum()
+    mean = (colors * share[:, None]).sum(0)
+    covariance = torch.zeros(3, 3, dtype=torch.float64)
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = (share * (colors[:, i] - mean[i]) * (colors[:, j] - mean[j])).sum()
+    return mean, covariance
+
+
+def colors_of(sh_dc: Tensor) -> Tensor:
+    return 0.5 + SH_C0 * sh_dc.double()
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
+def test_weighted_mean_and_covariance_match_the_style(scale: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    # A style of low contrast in the middle of the range, so that no color is clamped.
+    style = 0.45 + 0.1 * synthetic_image(40, 50, seed=3).float()
+    sh_dc = torch.randn(500, 3, generator=generator) @ torch.tensor([[1.0, 0.5, 0], [0, 1, 0.3], [0, 0, 0.2]])
+    weights = scale * torch.rand(500, generator=generator, dtype=torch.float64) ** 4
+    actual = moments(colors_of(with_moments(sh_dc, weights, Style.of(style))), weights)
+    pixels = style.reshape(-1, 3).double()
+    wanted = moments(pixels, torch.ones(len(pixels), dtype=torch.float64))
+    torch.testing.assert_close(actual[0], wanted[0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(actual[1], wanted[1], rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.parametrize("start", [with_moments, luminance_start])
+def test_extreme_color_does_not_flatten_the_others(start: Start) -> None:
+    style = synthetic_image(30, 30, seed=2).float()
+    sh_dc = (torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) - 0.5) / SH_C0
+    extreme = sh_dc.clone()
+    extreme[0] = 1e4
+    ones = torch.ones(2000, dtype=torch.float64)
+    usual = start(sh_dc, ones, Style.of(style))
+    torch.testing.assert_close(start(extreme, ones, Style.of(style))[1:], usual[1:], rtol=0, atol=0.02)
+
+
+def test_dark_scene_gets_both_colors_of_a_bright_style() -> None:
+    """Matching only mean and covariance gives the brighter color to most Gaussians that should get the darker one."""
+    style = torch.full((30, 30, 3), 0.9)
+    style[:10] = torch.tensor([0.1, 0.2, 0.6])
+    generator = torch.Generator().manual_seed(4)
+    sh_dc = (0.2 * torch.rand(3000, 1, generator=generator) ** 4 - 0.5).expand(-1, 3) / SH_C0
+    colors = colors_of(warm_start(sh_dc, torch.ones(3000, dtype=torch.float64), Style.of(style)))
+    blue = (colors - style[0, 0]).norm(dim=1) < 0.1
+    white = (colors - style[-1, 0]).norm(dim=1) < 0.1
+    assert float(blue.double().mean()) == pytest.approx(1 / 3, abs=0.02)
+    assert float(white.double().mean()) == pytest.approx(2 / 3, abs=0.02)
+
+
+def test_style_images_count_by_their_weights() -> None:
+    """Colors are as frequent as in the mixture, whatever the sizes of the images."""
+    images = [torch.full((8, 8, 3), 0.2), torch.full((300, 400, 3), 0.8)]
+    mixture = Style.weighted(images, [3.0, 1.0])
+    sh_dc = torch.randn(4000, 3, generator=torch.Generator().manual_seed(5))
+    colors = colors_of(warm_start(sh_dc, torch.ones(4000, dtype=torch.float64), mixture))
+    assert float((colors < 0.5).all(dim=1).double().mean()) == pytest.approx(0.75, abs=0.02)
+
+
+@pytest.mark.parametrize("start", [with_moments, warm_start])
+@pytest.mark.parametrize("case", ["gray scene", "one color", "one Gaussian", "style of one color", "black style"])
+def test_flat_scenes_and_styles_give_finite_colors_in_range(case: str, start: Start) -> None:
+    generator = torch.Generator().manual_seed(1)
+    style = synthetic_image(30, 30, seed=2).float()
+    sh_dc = torch.randn(50, 3, generator=generator)
+    if case == "gray scene":
+        sh_dc = sh_dc[:, :1].expand(-1, 3).contiguous()
+    elif case == "one color":
+        sh_dc = torch.full((50, 3), 0.3)
+    elif case == "one Gaussian":
+        sh_dc = sh_dc[:1]
+    elif case == "style of one color":
+        style = torch.full((10, 10, 3), 0.25)
+    else:
+        style = torch.zeros((10, 10, 3))
+    colors = colors_of(start(sh_dc, torch.ones(len(sh_dc), dtype=torch.float64), Style.of(style)))
+    assert bool(colors.isfinite().all())
+    assert -1e-6 <= float(colors.min()) <= float(colors.max()) <= 1 + 1e-6
+    expected = style.reshape(-1, 3).double().mean(0)
+    torch.testing.assert_close(colors.mean(0), expected, rtol=0, atol=0.06)  # clamping changes the mean slightly
+
+
+Array = NDArray[np.float64]
+
+
+def colors(count: int, seed: int) -> Tensor:
+    """Return two clusters of colors, one of them long and thin."""
+    generator = torch.Generator().manual_seed(seed)
+    heap = 0.2 + 0.05 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    long = 0.7 + 0.2 * torch.randn(count, 1, generator=generator, dtype=torch.float64) * torch.tensor([0.6, 0.3, -0.7])
+    chosen = torch.rand(count, 1, generator=generator) < 0.3
+    return torch.where(chosen, heap, long + 0.01 * torch.randn(count, 3, generator=generator)).clamp(0, 1)
+
+
+def weights(count: int, seed: int) -> Tensor:
+    return torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 4
+
+
+def plain(moved: Array, weight: Array, wanted: Array) -> Array:
+    """Transport all colors by a reference implementation without sampling and interpolation.
+
+    Along each direction, a value is replaced by the target value at the same cumulative weight.
+    """
+    moved = moved.copy()
+    for axes in (rotation.numpy() for rotation in _round_axes()):
+        rotated, targets = moved @ axes, np.sort(wanted @ axes, axis=0)
+        for axis in range(3):
+            order = np.argsort(rotated[:, axis])
+            share = np.cumsum(weight[order]) - 0.5 * weight[order]
+            places = np.linspace(0, weight.sum(), len(targets))
+            rotated[order, axis] = np.interp(share, places, targets[:, axis])
+        moved = rotated @ axes.T
+    return moved
+
+
+def distance(first: Tensor, second: Tensor) -> float:
+    """Return the mean distance between the quantiles of two color distributions along many directions."""
+    directions = torch.randn(50, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    shares = torch.linspace(0, 1, 300, dtype=torch.float64)
+    parts = [
+        (torch.quantile(first @ direction, shares) - torch.quantile(second @ direction, shares)).abs().mean()
+        for direction in directions / directions.norm(dim=1, keepdim=True)
+    ]
+    return float(torch.stack(parts).mean())
+
+
+def sampled(own: Tensor, weight: Tensor) -> Tensor:
+    indices, counts = _drawn(weight)
+    return own[indices.repeat_interleave(counts)]
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
+def test_weighted_colors_get_the_target_distribution(scale: float) -> None:
+    own, count, wanted = colors(4000, 0), scale * weights(4000, 1), 1 - colors(3000, 2)
+    actual = transported(own, count, wanted)
+    assert distance(sampled(own, count), wanted) > 0.1
+    assert distance(sampled(actual, count), wanted) < 0.01
+
+
+def test_equal_colors_stay_equal_and_zero_weights_are_ignored() -> None:
+    own, count, wanted = colors(500, 7), weights(500, 8), colors(500, 9)
+    more = torch.cat([own, own[:100], 5 - own])
+    less = torch.cat([count, torch.zeros(600, dtype=torch.float64)])
+    actual = transported(more, less, wanted)
+    torch.testing.assert_close(actual[:500], transported(own, count, wanted), rtol=0, atol=1e-12)
+    torch.testing.assert_close(actual[500:600], actual[:100], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("case", ["heaps", "far", "flat", "two"])
+def test_compiled_kernel_agrees_with_tensor_operations(case: str) -> None:
+    own, count, wanted = colors(3000, 13), weights(3000, 14), colors(700, 15)
+    if case == "far":  # most knots fall into one cell
+        own[::100] *= 50
+    if case == "flat":
+        own[:] = 0.3
+    if case == "two":
+        own[:] = torch.where(own[:, :1] < own[:, :1].median(), 0.2, 0.7)
+    begun = own.clamp(-10, 10)
+    indices, counts = _drawn(count)
+    rounds = _rounds(begun[indices], counts, wanted)
+    outside = torch.cat([begun, 3 * begun - 1, torch.full((1, 3), -10.0), torch.full((1, 3), 10.0)])
+    for only in rounds:  # one round at a time, because slopes of up to 1e6 amplify rounding errors
+        torch.testing.assert_close(_through_compiled(outside, [only]), _through(outside, [only]), rtol=0, atol=1e-8)
+    errors = (_through_compiled(outside, rounds) - _through(outside, rounds)).abs()
+    assert float(errors.median()) < 1e-12
+
+
+CAMERA = cameras(1)[0]
+
+
+@pytest.mark.parametrize(
+    ("values", "right"),
+    [
+        ({}, None),
+        ({"sh_attenuation": 0.5, "background": (0.2, 0.4, 0.6)}, None),
+        ({"preserve_colors": "luminance", "warm_start": True}, None),
+        ({"preserve_colors": "match", "style_rotation": 30.0}, None),
+        ({}, Region("right", freeze=True)),
+        ({}, Region("right", style=Style.of(style().flip(2)))),
+        ({}, Region("right", content_weight=1e4)),
+    ],
+    ids=["plain", "attenuated", "luminance", "match", "frozen", "own style", "content"],
+)
+def test_first_view_has_warm_start_colors(
+    tiny_weights: BackboneWeights, values: dict[str, Any], right: Region | None
+) -> None:
+    scene = wall(sh_degree=1)
+    scene.means[:5] += 1000  # the view does not show them
+    settings, regions = (
+        make_settings("preview", coarsest_side=24, **values),
+        None if right is None else halves(scene, right=right),
+    )
+    planned = Stylizer.planned(scene, [CAMERA], style(), settings, weights=tiny_weights, regions=regions)
+    views = planned.job.views
+    expected = views.rasterizer.render(views.colors(0, planned.sh_dc), CAMERA)
+    actual = render_first_view(scene, CAMERA, Style.of(style()), settings, regions)
+    assert actual is not None
+    assert torch.equal(actual, expected)
+    assert not torch.equal(actual, views.unstylized(0))
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def make(
+    weights: BackboneWeights, scene: Scene | None = None, regions: Regions | None = None, **values: Any
+) -> Stylizer:
+    settings = settings_of(**values)
+    return Stylizer.planned(scene or wall(60, 40), cameras(), style(), settings, weights=weights, regions=regions)
+
+
+def settings_of(**values: Any) -> Settings:
+    return make_settings(**{"style_loss": "nnfm", "steps_sos": 6, "early_stop": False, **values})
+
+
+def plan_mentions_transfer(plan: Plan) -> bool:
+    return any("after the last step" in line.decision for line in plan.decisions)
+
+
+def test_transfer_changes_results_but_not_optimized_colors(tiny_weights: BackboneWeights) -> None:
+    stylizer = make(tiny_weights)
+    run(stylizer)
+    optimized = stylizer.sh_dc.detach().clone()
+    rows = stylizer.job.plan.optimized
+    assert rows.any()
+    stylized = stylizer.stylized()
+    weights = stylizer.job.plan.survey.total_blend_weights[stylizer.job.plan.seen]
+    wanted = warm_start(optimized, weights, stylizer.job.style)
+    assert torch.equal(stylized[rows], wanted[rows[stylizer.job.plan.seen]])
+    assert float((wanted - optimized).abs().mean()) > 0.01
+    assert torch.equal(stylizer.sh_dc, optimized)
+    assert torch.equal(stylizer.shown(), stylized[stylizer.job.plan.seen])
+    assert plan_mentions_transfer(stylizer.job.plan)
+
+
+def test_regions_get_colors_of_their_styles_and_frozen_ones_none(tiny_weights: BackboneWeights) -> None:
+    scene = wall(60, 40)
+    dark, bright = (Style.of(torch.full((40, 40, 3), gray)) for gray in (0.2, 0.7))
+    labels = (scene.means[:, 0] > 0.5).to(torch.uint8)
+    labels[scene.means[:, 1] > 1] = 2
+    regions = Regions(
+        (Region("rest", style=dark), Region("right", style=bright), Region("low", freeze=True)),
+        labels,
+    )
+    stylizer = make(tiny_weights, scene, regions)
+    run(stylizer)
+    stylized = stylizer.stylized()
+    assert torch.equal(stylized[labels == 2].view(torch.int32), scene.sh_dc[labels == 2].view(torch.int32))
+    for place, gray in enumerate((0.2, 0.7)):
+        own = 0.5 + SH_C0 * stylized[(labels == place) & stylizer.job.plan.optimized]
+        assert float((own - gray).abs().max()) < 1e-3
