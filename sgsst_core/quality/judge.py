@@ -41,6 +41,8 @@ from sgsst_core.stylizing.job import JobStyles
 #: Maximum longer side of judged views in pixels. The limit keeps results at different resolutions comparable, and
 #: bounds the cost of large views.
 JUDGED_SIDE = 1024
+#: Measures of each image.
+_MEASURES = ("style", "color_distance", "content", "features", "interior_style", "sliced_features")
 #: Gray values of the backgrounds that each view is judged on: black and white.
 _BACKGROUNDS = (0.0, 1.0)
 #: Minimum coverage of judged views.
@@ -135,14 +137,10 @@ class Judge:
             return None
         sh_dc = sh_dc.detach().to(self._rasterizer.device)
         views = [self._view(camera, sh_dc) for camera in self.cameras]
-        style, color_distance, content, features = map(
-            fmean, zip(*(one[:4] for view in views for one in view), strict=True)
-        )
-        background_sensitivity = fmean(abs(view[0][0] - view[1][0]) for view in views)
-        every = ([one[index] for view in views for one in view] for index in (4, 5))
-        known = ([value for value in values if value is not None] for values in every)
-        interior = (fmean(values) if values else None for values in known)
-        return Judgment(style, color_distance, content, features, background_sensitivity, saturated(sh_dc), *interior)
+        known = {name: [image[name] for view in views for image in view if name in image] for name in _MEASURES}
+        means = {name: fmean(values) if values else None for name, values in known.items()}
+        sensitivity = fmean(abs(on_black["style"] - on_white["style"]) for on_black, on_white in views)
+        return Judgment(**means, background_sensitivity=sensitivity, saturated=saturated(sh_dc))  # type: ignore[arg-type]
 
     @torch.no_grad()
     def renders(self, sh_dc: Tensor, camera: Camera) -> list[Tensor]:
@@ -150,8 +148,8 @@ class Judge:
         image, coverage = self._render(sh_dc.detach().to(self._rasterizer.device), camera)
         return [self._on(image, coverage, camera, level) for level in _BACKGROUNDS]
 
-    def _view(self, camera: Camera, sh_dc: Tensor) -> list[_Measures]:
-        """Return the measures of a view, on black and on white background."""
+    def _view(self, camera: Camera, sh_dc: Tensor) -> list[dict[str, float]]:
+        """Return the measures of a view, on black and on white background, by their names in `Judgment`."""
         image, coverage = self._render(sh_dc, camera)
         before, _ = self._render(self.scene.sh_dc.to(sh_dc), camera)
         weights = coverage.to(self._lpips.device)
@@ -162,13 +160,15 @@ class Judge:
             own, theirs = self._lpips.features(stylized), self._lpips.features(original)
             distance = self._lpips.between(own, theirs, (camera.height, camera.width)).map
             measures.append(
-                (
-                    sum(fraction * judge.distance(own, part) for judge, part, fraction in parts),
-                    sum(fraction * judge.color_distance(stylized, part) for judge, part, fraction in parts),
-                    _weighted_mean(distance, weights),
-                    fmean(_change_of_direction(x, y, weights) for x, y in zip(own, theirs, strict=True)),
-                    *_interior(own, parts),
-                )
+                {
+                    "style": sum(fraction * judge.distance(own, part) for judge, part, fraction in parts),
+                    "color_distance": sum(
+                        fraction * judge.color_distance(stylized, part) for judge, part, fraction in parts
+                    ),
+                    "content": _weighted_mean(distance, weights),
+                    "features": fmean(_change_of_direction(x, y, weights) for x, y in zip(own, theirs, strict=True)),
+                    **_interior(own, parts),
+                }
             )
         return measures
 
@@ -196,24 +196,19 @@ class Judge:
         return [(judge, fraction, own / sum(sums)) for judge, fraction, own in parts if own > 0]
 
 
-#: Style, color distance, content, features, interior style and sliced features of one image.
-_Measures = tuple[float, float, float, float, float | None, float | None]
-
-
-def _interior(
-    features: list[Tensor], parts: list[tuple[_StyleJudge, Tensor, float]]
-) -> tuple[float | None, float | None]:
-    """Return `interior_style` and `sliced_features` of an image, averaged over the regions that have interior features.
+def _interior(features: list[Tensor], parts: list[tuple[_StyleJudge, Tensor, float]]) -> dict[str, float]:
+    """Return the interior measures of an image, averaged over the regions that have interior features, if any has.
 
     `parts` has the judge, the position weights [H, W] and the fraction of the area of each region.
     """
     distances = [(judge.interior(features, part), fraction) for judge, part, fraction in parts]
     known = [(pair, fraction) for pair, fraction in distances if pair is not None]
     total = sum(fraction for _, fraction in known)
-    if not known:
-        return None, None
-    gram, sliced = (sum(fraction * pair[index] for pair, fraction in known) / total for index in range(2))
-    return gram, sliced
+    return {
+        name: sum(fraction * pair[index] for pair, fraction in known) / total
+        for index, name in enumerate(("interior_style", "sliced_features"))
+        if known
+    }
 
 
 #: A style's Gram matrix [c, c] of one layer, and quantiles of its features along random directions,

@@ -12,7 +12,6 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from sgsst_core.errors import OutputError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
 from sgsst_core.report.charts import AGAINST, BINS, draw_figures, novel_view_moments, round_length
@@ -109,22 +108,13 @@ def write_page(path: Path, report: dict[str, Any], sheet_path: Path | None, view
         views_path: Sheet of all views, JPEG; None omits it.
 
     Raises:
-        OutputError: If the file cannot be written, or a sheet cannot be read.
+        OutputError: If the file cannot be written.
     """
-    page = render_page(report, _sheet_bytes(sheet_path), _sheet_bytes(views_path))
+    sheets = (each.read_bytes() if each else None for each in (sheet_path, views_path))
+    page = render_page(report, *sheets)
     with atomic_path(path) as temporary:
         # Invalid Unicode in file names is shown as question marks instead of raising an error.
         temporary.write_bytes(page.encode("utf-8", errors="replace"))
-
-
-def _sheet_bytes(path: Path | None) -> bytes | None:
-    """Return the bytes of a sheet, or None if no path is given."""
-    try:
-        return path.read_bytes() if path else None
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot read the contact sheet: {error.strerror}. Write it before the page."
-        ) from error
 
 
 def _time_split(report: dict[str, Any]) -> list[tuple[str, float, float]]:
@@ -258,21 +248,16 @@ def decision_table(report: dict[str, Any]) -> Table:
 def prediction_table(report: dict[str, Any]) -> Table:
     """Return the plan's predictions beside the measured values."""
     predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
+    values = [("step on all scales", duration, "seconds"), ("peak memory (upper bound)", byte_count, "peak_bytes")]
+    if predicted.get("measuring"):
+        values.append(("measuring, total", duration, "measuring"))
+    if any(each.get("device_bytes") is not None for each in (predicted, measured)):
+        values.append(("peak memory of the GPU (upper bound)", byte_count, "device_bytes"))
     rows: list[list[str]] = []
-
-    def add(title: str, text: Callable[[float | None], str], before: float | None, after: float | None) -> None:
+    for title, text, name in values:
+        before, after = predicted.get(name), measured.get(name)
         ratio = after / before if before and after is not None else None
         rows.append([title, text(before), text(after), number(ratio)])
-
-    def add_value(title: str, text: Callable[[float | None], str], name: str) -> None:
-        add(title, text, predicted.get(name), measured.get(name))
-
-    add_value("step on all scales", duration, "seconds")
-    add_value("peak memory (upper bound)", byte_count, "peak_bytes")
-    if predicted.get("measuring"):
-        add_value("measuring, total", duration, "measuring")
-    if any(values.get("device_bytes") is not None for values in (predicted, measured)):
-        add_value("peak memory of the GPU (upper bound)", byte_count, "device_bytes")
     return Table(["", "predicted", "measured", "measured / predicted"], rows)
 
 
