@@ -128,7 +128,7 @@ class _Question:
 def scene_findings(file: SceneFile) -> list[Finding]:
     """Return the findings about a scene read with `drop_invalid`; indices are rows of the file."""
     scene, total = file.scene, len(file.scene)
-    center, extent = scene_extent(scene)
+    center, extent = _scene_extent(scene)
     findings = [Finding("scene", note, total, total, "", "") for note in file.notes]
     if file.retained is not None:
         what, first = "NaN or infinite values, or no rotation", int(np.flatnonzero(~file.retained)[0])
@@ -233,7 +233,7 @@ def _far_from_origin(file: SceneFile, center: Tensor, extent: float) -> list[Fin
     return [Finding("scene", "scene far from its origin", total, total, worst, done)]
 
 
-def scene_extent(scene: Scene) -> tuple[Tensor, float]:
+def _scene_extent(scene: Scene) -> tuple[Tensor, float]:
     """Return the scene's center and extent.
 
     The center is the median position [3] float64. The extent is the 98 % quantile of the distances to it, or 1 if that

@@ -341,7 +341,7 @@ def _change_of_direction(x: Tensor, y: Tensor, coverage: Tensor) -> float:
 
     Positions where both are zero count as unchanged.
     """
-    differences = (unit_features(x) - unit_features(y)).square().sum(dim=2) / 2
+    differences = (_unit_features(x) - _unit_features(y)).square().sum(dim=2) / 2
     return _weighted_mean(differences, _pooled(coverage, x))
 
 
@@ -453,7 +453,7 @@ class Lpips:
         """Compute the distance between two images of size (height, width) from their `features`."""
         mean, spatial = 0.0, torch.zeros(size, dtype=self.dtype, device=self.device)
         for x, y, head in zip(first, second, self._heads, strict=True):
-            distances = ((unit_features(x) - unit_features(y)).square_() @ head)[None, None]
+            distances = ((_unit_features(x) - _unit_features(y)).square_() @ head)[None, None]
             mean += float(distances.mean(dtype=torch.float64))
             spatial += F.interpolate(distances, size=size, mode="bilinear", align_corners=False)[0, 0]
         return PerceptualDistance(mean, spatial)
@@ -469,7 +469,7 @@ def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None =
     return Lpips(device=device, folder=folder) if installed else None
 
 
-def unit_features(features: Tensor) -> Tensor:
+def _unit_features(features: Tensor) -> Tensor:
     """Scale features [h, w, c] to unit length at every position."""
     lengths: Tensor = torch.linalg.vector_norm(features, dim=2, keepdim=True)
     return features / (lengths + _LENGTH_EPS)

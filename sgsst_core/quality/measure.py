@@ -116,7 +116,7 @@ class Measurements:
             source = ExactLoss(stylizer, "sos")
         elif stylizer.job.plan.precision not in WHOLE_FLOAT32:
             source = self.exact
-        rasterizer = rasterizer_beside(stylizer, scene)
+        rasterizer = _rasterizer_beside(stylizer, scene)
         return make_novel_views(
             stylizer,
             scene,
@@ -124,7 +124,7 @@ class Measurements:
             source,
             lpips=load_lpips_or_none(stylizer.job.network.device),
             most=stylizer.job.plan.novel_views,
-            rasterizer_of=partial(rasterizer_beside, stylizer),
+            rasterizer_of=partial(_rasterizer_beside, stylizer),
             maps=stylizer.job.styles.maps(rasterizer),
         )
 
@@ -150,7 +150,7 @@ def make_novel_views(
         job.views.cameras,
         job.views.covered,
         scene,
-        rasterizer or rasterizer_beside(stylizer, scene),
+        rasterizer or _rasterizer_beside(stylizer, scene),
         source.loss,
         source.style_targets,
         weighted=job.plan.weighted,
@@ -176,7 +176,7 @@ def approximations(stylizer: Stylizer) -> list[str]:
     return names
 
 
-def rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
+def _rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
     """Create a rasterizer of another scene with the job's settings.
 
     It shares the job's memory budget for tile intersections, with lower priority.

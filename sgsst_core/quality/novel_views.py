@@ -81,7 +81,7 @@ class NovelViews:
         lpips: LPIPS network; None skips LPIPS.
         most: Maximum number of views whose Gram distance is measured, and of pairs compared per range.
         memory: Memory budget in bytes for coverage, colors, warps and images. What does not fit is recomputed.
-        rasterizer_of: Function that creates a rasterizer for a sample of the Gaussians; see `choose_novel_cameras`.
+        rasterizer_of: Function that creates a rasterizer for a sample of the Gaussians; see `_choose_novel_cameras`.
         maps: Region maps that match `style_targets`; None if the scene has no regions.
 
     Attributes:
@@ -123,7 +123,7 @@ class NovelViews:
             coarsest=loss.tiling.coarsest,
             scales=loss.weights,
         )
-        self.cameras, self.views, self.pairs = choose_novel_cameras(
+        self.cameras, self.views, self.pairs = _choose_novel_cameras(
             [cameras[index] for index in covered], scene, rasterizer, most=most, rasterizer_of=rasterizer_of
         )
         self._colors = ViewColors(scene, self.cameras, rasterizer.device, memory // 8)
@@ -512,7 +512,7 @@ def neighbors(cameras: list[Camera]) -> list[tuple[Camera, Camera]]:
     return in_order if 2 * len(in_order) >= len(cameras) - 1 else max(in_order, pairs(walk), key=len)
 
 
-def choose_novel_cameras(
+def _choose_novel_cameras(
     cameras: list[Camera],
     scene: Scene,
     rasterizer: Rasterizer,

@@ -221,7 +221,7 @@ def write_frames(
         progress: Callback that receives the numbers of completed and of all frames.
     """
     for index, camera in enumerate(cameras):
-        fraction = 1.0 if unstylized is None else shown_fraction(index / max(len(cameras) - 1, 1))
+        fraction = 1.0 if unstylized is None else _shown_fraction(index / max(len(cameras) - 1, 1))
         if unstylized is None or fraction == 1:
             image = layer.image(camera, alpha=alpha)
         elif fraction == 0:
@@ -235,7 +235,7 @@ def write_frames(
         progress(index + 1, len(cameras))
 
 
-def shown_fraction(time: float) -> float:
+def _shown_fraction(time: float) -> float:
     """Return how much of the stylized scene a transition shows, in 0..1, at a time in 0..1 of the video.
 
     It is smooth, and holds both ends for 15 % of the video.

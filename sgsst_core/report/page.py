@@ -172,7 +172,7 @@ class Table:
     texts: Sequence[str] = ("",)
 
 
-def loss_table(report: dict[str, Any]) -> Table:
+def _loss_table(report: dict[str, Any]) -> Table:
     """Return the loss before and after the job, as a mean over scales and for each scale."""
     loss = report["loss"]
     rows = [["mean over scales", loss["before"]["total"], loss["after"]["total"], loss["relative"]]]
@@ -185,12 +185,12 @@ def loss_table(report: dict[str, Any]) -> Table:
     )
 
 
-def consistency_at(moment: dict[str, Any], reach: str) -> dict[str, Any]:
+def _consistency_at(moment: dict[str, Any], reach: str) -> dict[str, Any]:
     """Return a moment's consistency at a range, "short" or "long"; empty if it has none."""
     return (moment.get("consistency") or {}).get(reach) or {}
 
 
-def novel_views_table(report: dict[str, Any]) -> Table | None:
+def _novel_views_table(report: dict[str, Any]) -> Table | None:
     """Return all measurements of novel views, without empty columns; None if there are none."""
     moments = novel_view_moments(report)
     if not moments:
@@ -204,7 +204,7 @@ def novel_views_table(report: dict[str, Any]) -> Table | None:
     for scale in scales:
         columns[f"scale {scale}, absolute"] = [number((moment.get("gram") or {}).get(scale)) for moment in moments]
     for reach in ("short", "long"):
-        consistencies = [consistency_at(moment, reach) for moment in moments]
+        consistencies = [_consistency_at(moment, reach) for moment in moments]
         columns[f"RMSE, {reach} range"] = [number(entry.get("rmse")) for entry in consistencies]
         columns[f"LPIPS, {reach} range"] = [number(entry.get("lpips")) for entry in consistencies]
         columns[f"compared, {reach} range"] = [percent(entry.get("compared")) for entry in consistencies]
@@ -225,7 +225,7 @@ _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
 }
 
 
-def judged_table(report: dict[str, Any]) -> Table | None:
+def _judged_table(report: dict[str, Any]) -> Table | None:
     """Return the judgment of the result beside that of the unstylized scene; None if there is none."""
     judged = (report.get("novel_views") or {}).get("judged")
     if not judged:
@@ -235,7 +235,7 @@ def judged_table(report: dict[str, Any]) -> Table | None:
     return Table(["", "unstylized", "stylized"], rows)
 
 
-def decision_table(report: dict[str, Any]) -> Table:
+def _decision_table(report: dict[str, Any]) -> Table:
     """Return the plan's decisions with their reasons, savings and costs."""
     texts = ["item", "decision", "reason", "error"]
     rows = [
@@ -245,7 +245,7 @@ def decision_table(report: dict[str, Any]) -> Table:
     return Table([*texts[:3], "saves memory", "error"], rows, texts)
 
 
-def prediction_table(report: dict[str, Any]) -> Table:
+def _prediction_table(report: dict[str, Any]) -> Table:
     """Return the plan's predictions beside the measured values."""
     predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
     values = [("step on all scales", duration, "seconds"), ("peak memory (upper bound)", byte_count, "peak_bytes")]
@@ -261,7 +261,7 @@ def prediction_table(report: dict[str, Any]) -> Table:
     return Table(["", "predicted", "measured", "measured / predicted"], rows)
 
 
-def finding_table(report: dict[str, Any]) -> Table | None:
+def _finding_table(report: dict[str, Any]) -> Table | None:
     """Return the findings about scene, views and style; None if there are none."""
     rows = [
         [
@@ -277,7 +277,7 @@ def finding_table(report: dict[str, Any]) -> Table | None:
     return Table(["input", "finding", "count", "worst", "consequence"], rows, texts) if rows else None
 
 
-def approximation_table(report: dict[str, Any]) -> Table | None:
+def _approximation_table(report: dict[str, Any]) -> Table | None:
     """Return all comparisons of the job's gradient with the exact one; None if there are none."""
     rows = []
     for entry in (report.get("approximations") or {}).get("moments") or []:
@@ -291,11 +291,11 @@ def approximation_table(report: dict[str, Any]) -> Table | None:
 
 #: Tables of the page by their name in its template.
 TABLES: dict[str, Callable[[dict[str, Any]], Table | None]] = {
-    "losses": loss_table,
-    "novel_views": novel_views_table,
-    "judged": judged_table,
-    "decisions": decision_table,
-    "predictions": prediction_table,
-    "findings": finding_table,
-    "approximations": approximation_table,
+    "losses": _loss_table,
+    "novel_views": _novel_views_table,
+    "judged": _judged_table,
+    "decisions": _decision_table,
+    "predictions": _prediction_table,
+    "findings": _finding_table,
+    "approximations": _approximation_table,
 }
