@@ -88,8 +88,8 @@ def _measure(scene: Scene, views: list[Camera], change: Callable[[Scene, Tensor]
 
     wanted, painted = change(scene, original.clamp(0, 1)), views[len(views) // 2]
     held_out = spread([view for view in views if view is not painted], JUDGED)
-    picture = image(wanted, painted).float()
-    view = PaintedView(painted, picture, torch.ones(picture.shape[:2]))
+    target = image(wanted, painted).float()
+    view = PaintedView(painted, target, torch.ones(target.shape[:2]))
     started = time.perf_counter()
     result = paint(scene, [view], rasterizer, others=spread(views, 12))
     seconds = time.perf_counter() - started
@@ -97,7 +97,7 @@ def _measure(scene: Scene, views: list[Camera], change: Callable[[Scene, Tensor]
     seen, solved = alone.weights > 0.05, alone.solve(original).colors
     colors = {
         "nothing": original,
-        "one map": _one_map(image(original, painted), picture.double(), original),
+        "one map": _one_map(image(original, painted), target.double(), original),
         "neighbors": _of_neighbors(scene, original, solved, seen),
         "ours": COLOR_OFFSET + SH_C0 * result.sh_dc,
     }
