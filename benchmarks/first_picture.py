@@ -20,7 +20,7 @@ from typing import Any
 
 import httpx2
 
-from benchmarks.common import write_result
+from benchmarks.common import add_pair
 from tests.api.page.browser import Watched, chromium, open_browser
 from tests.api.service import SETTINGS, Service
 
@@ -104,7 +104,7 @@ def main() -> None:
             aim = _AIMS.get(what, 1.1 * times["budget"])
             if what in times:
                 print(f"{name:10}{what:10}{times[what]:9.1f}{aim:9.1f}")
-    print(write_result(f"first_picture_{arguments.scene.stem}", figures))
+    add_pair("first_picture", arguments.scene.stem, {}, figures)
 
 
 if __name__ == "__main__":
