@@ -22,7 +22,6 @@ from torch import Tensor
 
 from sgsst_core.errors import CameraError, OutputError, SceneError, SettingsError
 from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.blending import blend_scenes, check_same_shape, common_rests, encode_blend
 from sgsst_core.files.formats import format_of_name, read_scene_header, scene_path
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
@@ -40,6 +39,7 @@ from sgsst_core.files.scene_file import (
     write_sog_folder,
     write_usd,
 )
+from sgsst_core.files.stylized_ply import blend_scenes, check_same_shape, common_rests, encode_blend
 from sgsst_core.files.video import check_video_path, encoder, frames_folder, is_encoded, video_writer
 from sgsst_core.orbit import ELEVATION, find_upright_subject, turntable
 from sgsst_core.progress import Decision, warnings_of

@@ -13,10 +13,9 @@ import torch
 from sgsst_core.constants import NEAR, RASTER_TILE
 from sgsst_core.errors import SettingsError
 from sgsst_core.rasterizer.base import Color, Rasterizer
-from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 

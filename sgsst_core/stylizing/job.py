@@ -31,7 +31,7 @@ from sgsst_core.planning.time_budget import TimeChoice
 from sgsst_core.progress import Decision
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.rasterizer.base import Color
-from sgsst_core.rasterizer.cached import CachedRasterizer
+from sgsst_core.rasterizer.triton import CachedRasterizer
 from sgsst_core.refine import Refinement
 from sgsst_core.regions import ContentMaps, RegionMaps, Regions
 from sgsst_core.scene.camera import Camera, fit_cameras, spread

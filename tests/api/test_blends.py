@@ -14,9 +14,9 @@ from service.inspection.derived import MOST_BLENDS
 from service.settings import ServiceSettings
 from service.states import Published
 from service.store import open_store
-from sgsst_core.files.blending import blend_scenes
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.stylized_ply import blend_scenes
 from tests.api.page.actions import done, submit
 from tests.api.service import Service
 from tests.small_scenes import wall, write_files

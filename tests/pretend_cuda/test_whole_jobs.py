@@ -11,6 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
+from sgsst_core.bench import device_checks
+
 if torch.cuda.is_available():
     pytest.skip("there is a GPU, on which the tests marked gpu run", allow_module_level=True)
 
@@ -231,3 +233,17 @@ def test_losses_match_cpu(tmp_path: Path, regions: bool) -> None:
             assert ours.loss == pytest.approx(theirs.loss, rel=2e-4)
     assert stylizer.job.plan.device == "cuda"
     assert expected.job.plan.device == "cpu"
+
+
+@pytest.mark.slow
+def test_doctor_describes_the_gpu(counts: Counts) -> None:
+    assert device_checks._gpu().text.startswith("1 x pretend, compute capability 9.0, CUDA ")
+    assert device_checks._memory(torch.device("cuda", 0)).text == "jobs plan with 105.2 GB of the GPU's memory"
+    assert device_checks._precision().text == "jobs use float16; possible: float32, float16, bfloat16, tf32"
+
+
+def test_doctor_explains_why_a_gpu_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "exists", lambda path: str(path) == "/dev/nvidia0")
+    finding = device_checks._gpu()
+    assert finding.state == "warning"
+    assert ("built for CPUs only" if torch.version.cuda is None else "PyTorch cannot use it") in finding.text

@@ -20,9 +20,7 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime.driver import driver
 
 from sgsst_core.rasterizer.triton import TritonRasterizer
-from tests.ptx.machine import Kernel
-from tests.ptx.memory import GlobalMemory
-from tests.ptx.program import parse
+from tests.ptx.machine import GlobalMemory, Kernel, parse
 
 
 class PtxDriver:

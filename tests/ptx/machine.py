@@ -1,33 +1,480 @@
-"""Interpreter of PTX programs on arrays: all threads of several program instances advance together.
-
-Threads that diverge have program counters of their own; the lowest one is executed first. A barrier must be reached by
-all threads of a program instance. The tensor-core instructions of sm_90 and newer (`wgmma`, `tcgen05`) are unsupported.
-"""
+"""Interpreter of PTX, which checks accesses: parser, memory, operations, and a machine that runs kernels."""
 
 from __future__ import annotations
 
+import ctypes
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import numpy as np
+import torch
 
-from tests.ptx.copies import AsyncCopies
-from tests.ptx.memory import FaultError, GlobalMemory, SharedMemory
-from tests.ptx.operations import (
-    UNSIGNED,
-    UnsupportedError,
-    arithmetic,
-    comparison,
-    conversion,
-    dtype_of,
-    from_bfloat16,
-    select,
-    to_bfloat16,
-)
-from tests.ptx.program import Instruction, Program
+_GUARDED = re.compile(r"@(!?)(%\w+)\s+(.*)", re.DOTALL)
+_LABEL = re.compile(r"(\$\w+):$")
+
+
+@dataclass(frozen=True)
+class Instruction:
+    """One PTX instruction.
+
+    Attributes:
+        opcode: Parts of the opcode, as in ("ld", "global", "v4", "b32").
+        operands: Operands as written; a vector in braces is one operand.
+        guard: Predicate register that enables the instruction in each thread; None if it always executes.
+        negated: Whether the guard enables the instruction where it is false.
+    """
+
+    opcode: tuple[str, ...]
+    operands: tuple[str, ...]
+    guard: str | None
+    negated: bool
+
+    def __str__(self) -> str:
+        guard = f"@{'!' * self.negated}{self.guard} " if self.guard else ""
+        return f"{guard}{'.'.join(self.opcode)} {', '.join(self.operands)}"
+
+
+@dataclass(frozen=True)
+class Program:
+    """Parsed kernel.
+
+    Attributes:
+        name: Name of the kernel.
+        threads: Threads per program instance (CTA).
+        parameters: Names of the parameters, in order.
+        instructions: Instructions in the order of the text.
+        labels: Index of the instruction after each label.
+    """
+
+    name: str
+    threads: int
+    parameters: tuple[str, ...]
+    instructions: tuple[Instruction, ...]
+    labels: dict[str, int]
+
+
+def parse(ptx: str) -> Program:
+    """Parse the only kernel of a PTX module."""
+    ptx = re.sub(r"//.*", "", ptx)
+    entry = re.search(r"\.visible \.entry (\w+)\((.*?)\)\s*\.reqntid (\d+)(.*?)\{(.*)\}", ptx, re.DOTALL)
+    if entry is None:
+        raise ValueError("no kernel with `.reqntid` in the PTX")
+    name, parameters, threads, _, body = entry.groups()
+    instructions: list[Instruction] = []
+    labels: dict[str, int] = {}
+    statement = ""
+    # A scope with a register of its own, as in `{ .reg .b32 tmp; mov.b64 {%r5, tmp}, %rd99; }`: only its statement.
+    body = re.sub(r"\{\s*\.reg[^;]*;([^;]*;)\s*\}", r"\1", body)
+    for line in map(str.strip, body.splitlines()):
+        if not line or line.startswith("."):
+            continue
+        label = _LABEL.match(line)
+        if label:
+            labels[label[1]] = len(instructions)
+            continue
+        statement += " " + line
+        if line.endswith(";"):
+            instructions += [_instruction(part) for part in statement.split(";") if part.strip()]
+            statement = ""
+    if statement.strip(" {}"):
+        raise ValueError(f"unterminated statement: {statement}")
+    return Program(name, int(threads), tuple(re.findall(r"\w+_param_\d+", parameters)), tuple(instructions), labels)
+
+
+def _instruction(text: str) -> Instruction:
+    guarded = _GUARDED.match(text.strip())
+    opcode, _, operands = re.sub(r"\s", " ", guarded[3] if guarded else text.strip()).partition(" ")
+    guard, negated = (guarded[2], bool(guarded[1])) if guarded else (None, False)
+    return Instruction(tuple(opcode.split(".")), tuple(_operands(operands)), guard, negated)
+
+
+def _operands(text: str) -> list[str]:
+    """Split operands at commas outside braces and brackets."""
+    return [part.strip() for part in re.split(r",(?![^{\[]*[}\]])", text) if part.strip()]
+
+
+#: Tensors above this size are not checked for races: the trackers take eight times their size.
+MAX_TRACKED_BYTES = 1 << 28
+
+
+class FaultError(Exception):
+    """Access that a GPU would refuse, or whose result depends on the order of threads."""
+
+
+class Region:
+    """Memory of one tensor, with the last program that wrote each byte and the programs that read it.
+
+    Trackers hold 0 for "none", otherwise the program's number plus 1; `SEVERAL` stands for more than one reader.
+    """
+
+    SEVERAL = -1
+
+    def __init__(self, tensor: torch.Tensor) -> None:
+        storage = tensor.untyped_storage()
+        self.start, self.size = storage.data_ptr(), storage.nbytes()
+        self.bytes = np.ctypeslib.as_array(
+            ctypes.cast(self.start, ctypes.POINTER(ctypes.c_uint8)), (max(self.size, 1),)
+        )
+        self.tracked = self.size <= MAX_TRACKED_BYTES
+        size = self.size if self.tracked else 0
+        self.writer, self.reader = np.zeros(size, np.int32), np.zeros(size, np.int32)
+
+
+class GlobalMemory:
+    """Memory of all tensors that a launch may access.
+
+    Args:
+        tensors: Tensors on the CPU. Views of one storage are one region, as on a GPU.
+    """
+
+    def __init__(self, tensors: Iterable[torch.Tensor]) -> None:
+        regions = {tensor.untyped_storage().data_ptr(): Region(tensor) for tensor in tensors if tensor.numel()}
+        self.regions = [regions[start] for start in sorted(regions)]
+        self.starts = np.array([region.start for region in self.regions], np.uint64)
+
+    def load(self, addresses: np.ndarray, width: int, programs: np.ndarray) -> np.ndarray:
+        """Return bytes [n, width] at addresses [n] uint64, read by programs [n] int32 (number plus 1)."""
+        result = np.empty((len(addresses), width), np.uint8)
+        for region, lanes, index in self._locate(addresses, width):
+            result[lanes] = region.bytes[index]
+            if region.tracked:
+                reader, program = region.reader[index], programs[lanes, None]
+                if ((region.writer[index] != 0) & (region.writer[index] != program)).any():
+                    raise FaultError("race: a program reads what another one wrote")
+                region.reader[index] = np.where((reader == 0) | (reader == program), program, Region.SEVERAL)
+                if (region.reader[index] != program).any():  # several programs in this instruction
+                    shared = index[(region.reader[index] != program).any(axis=1)]
+                    region.reader[shared] = Region.SEVERAL
+        return result
+
+    def store(self, addresses: np.ndarray, width: int, values: np.ndarray, programs: np.ndarray) -> None:
+        """Store bytes [n, width] at addresses [n] uint64, written by programs [n] int32 (number plus 1)."""
+        for region, lanes, index in self._locate(addresses, width):
+            region.bytes[index] = values[lanes]
+            if (region.bytes[index] != values[lanes]).any():
+                raise FaultError("race: threads write different values to one address at once")
+            if region.tracked:
+                program = programs[lanes, None]
+                writer, reader = region.writer[index], region.reader[index]
+                region.writer[index] = program
+                if ((writer != 0) & (writer != program)).any() or (region.writer[index] != program).any():
+                    raise FaultError("race: two programs write to one address")
+                if ((reader != 0) & (reader != program)).any():
+                    raise FaultError("race: a program writes what another one read")
+
+    def _locate(self, addresses: np.ndarray, width: int) -> Iterable[tuple[Region, np.ndarray, np.ndarray]]:
+        """Yield region, lanes and byte index [lanes, width] of each tensor accessed by an instruction."""
+        if (addresses % np.uint64(width)).any():
+            raise FaultError(f"misaligned access of {width} bytes")
+        index = np.searchsorted(self.starts, addresses, side="right") - 1
+        for number in np.unique(index):
+            lanes = np.nonzero(index == number)[0]
+            region = self.regions[number]
+            offset = (addresses[lanes] - np.uint64(region.start)).astype(np.int64)
+            if number < 0 or int(offset.max()) + width > region.size:
+                raise FaultError(
+                    f"access outside of all tensors, {int(offset.max()) - region.size} bytes after the end"
+                )
+            yield region, lanes, offset[:, None] + np.arange(width)
+
+
+class SharedMemory:
+    """Shared memory of several programs, with each byte's last writer and its readers since the last barrier.
+
+    Args:
+        programs: Number of programs.
+        size: Shared memory per program in bytes.
+        threads: Threads per program.
+    """
+
+    def __init__(self, programs: int, size: int, threads: int) -> None:
+        self.size = size
+        self.warp = np.tile(np.arange(threads) // 32, programs).astype(np.int32)
+        self.program = np.repeat(np.arange(programs), threads)
+        self.bytes = np.zeros(programs * size, np.uint8)
+        self.barriers = np.zeros(programs, np.int32)
+        self.writer = np.zeros(programs * size, np.int32)
+        self.readers = np.zeros(programs * size, np.uint32)
+        # Number of the barrier after which the last write and the last reads happened.
+        self.written = np.full(programs * size, -1, np.int32)
+        self.read = np.full(programs * size, -1, np.int32)
+
+    def load(self, addresses: np.ndarray, width: int, lanes: np.ndarray) -> np.ndarray:
+        """Return bytes [n, width] at addresses [n] int64, read by threads `lanes` [n]."""
+        index, barrier = self._locate(addresses, width, lanes)
+        fresh = self.read[index] == barrier
+        self.readers[index[~fresh]] = 0
+        self.read[index] = barrier
+        bits = np.broadcast_to(np.uint32(1) << self.warp[lanes].astype(np.uint32)[:, None], index.shape)
+        np.bitwise_or.at(self.readers, index, bits)
+        return self.bytes[index]
+
+    def store(self, addresses: np.ndarray, width: int, values: np.ndarray, lanes: np.ndarray) -> None:
+        """Store bytes [n, width] at addresses [n] int64, written by threads `lanes` [n]."""
+        index, barrier = self._locate(addresses, width, lanes)
+        warp = self.warp[lanes, None]
+        others = self.readers[index] & ~(np.uint32(1) << warp.astype(np.uint32))
+        if ((self.read[index] == barrier) & (others != 0)).any():
+            raise FaultError("race in shared memory: a warp writes what another one read, without a barrier in between")
+        self.writer[index], self.written[index] = warp, barrier
+        self.bytes[index] = values
+        # Replicated data are written by several warps at once.
+        if (self.bytes[index] != values).any():
+            raise FaultError("race in shared memory: threads write different values to one address at once")
+
+    def _locate(self, addresses: np.ndarray, width: int, lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return byte index [n, width], and each thread's barrier count [n, 1]; check earlier writes."""
+        if (addresses % width).any():
+            raise FaultError(f"misaligned access of {width} bytes to shared memory")
+        if addresses.min() < 0 or addresses.max() + width > self.size:
+            raise FaultError(f"access to byte {addresses.max() + width - 1} of {self.size} bytes of shared memory")
+        program = self.program[lanes]
+        index = (addresses + program * self.size)[:, None] + np.arange(width)
+        barrier = self.barriers[program][:, None]
+        if ((self.written[index] == barrier) & (self.writer[index] != self.warp[lanes, None])).any():
+            raise FaultError(
+                "race in shared memory: a warp accesses what another one wrote, without a barrier in between"
+            )
+        return index, barrier
+
+
+UNSIGNED = {8: np.uint8, 16: np.uint16, 32: np.uint32, 64: np.uint64}
+_FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
+_SIGNED = {8: np.int8, 16: np.int16, 32: np.int32, 64: np.int64}
+_KINDS: dict[str, Any] = {"b": UNSIGNED, "u": UNSIGNED, "s": _SIGNED, "f": _FLOATS}
+_ROUNDINGS = {"rni": np.rint, "rzi": np.trunc, "rmi": np.floor, "rpi": np.ceil}
+_COMPARISONS = {
+    **{"eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater},
+    **{"ge": np.greater_equal, "lo": np.less, "ls": np.less_equal, "hi": np.greater, "hs": np.greater_equal},
+}
+Operation = Callable[..., np.ndarray]
+
+
+class UnsupportedError(Exception):
+    """Instruction that the interpreter does not know."""
+
+
+def dtype_of(type_: str) -> type:
+    """Return the NumPy dtype of a PTX type such as "s32"; bfloat16 as its bits."""
+    if type_ == "pred":
+        return np.bool_
+    if type_ == "bf16":
+        return np.uint16
+    match = re.fullmatch(r"([busf])(\d+)", type_)
+    if match is None:
+        raise UnsupportedError(f"type {type_}")
+    return _KINDS[match[1]][int(match[2])]
+
+
+def from_bfloat16(bits: np.ndarray) -> np.ndarray:
+    """Convert the bits of bfloat16 values to float32."""
+    return (bits.astype(np.uint32) << np.uint32(16)).view(np.float32)
+
+
+def to_bfloat16(values: np.ndarray) -> np.ndarray:
+    """Round float32 values to bfloat16, to nearest even, and return their bits."""
+    bits = values.astype(np.float32).view(np.uint32).astype(np.uint64)
+    rounded = ((bits + ((bits >> np.uint64(16)) & np.uint64(1)) + np.uint64(0x7FFF)) >> np.uint64(16)).astype(np.uint16)
+    return np.where(np.isnan(values), np.uint16(0x7FFF), rounded)
+
+
+def flush(values: np.ndarray) -> np.ndarray:
+    """Replace subnormal numbers by 0, as opcodes with `.ftz` do."""
+    return np.where(np.abs(values) < np.finfo(values.dtype).tiny, values.dtype.type(0), values)
+
+
+def select(a: np.ndarray, b: np.ndarray, condition: np.ndarray) -> np.ndarray:
+    """Compute `selp`: `a` where the condition holds, otherwise `b`."""
+    return np.where(condition, a, b)
+
+
+def conversion(opcode: tuple[str, ...]) -> Operation:
+    """Return the function of a `cvt` instruction with one source."""
+    to, source, rounding = opcode[-2], opcode[-1], next((_ROUNDINGS[x] for x in opcode if x in _ROUNDINGS), None)
+
+    def convert(value: np.ndarray) -> np.ndarray:
+        if source == "bf16":
+            value = from_bfloat16(value)
+        if rounding is not None:
+            value = rounding(value)
+        if to == "bf16":
+            return to_bfloat16(value)
+        if value.dtype.kind == "f" and to[0] in "us":
+            limits = np.iinfo(dtype_of(to))
+            value = np.clip(np.nan_to_num(value.astype(np.float64), nan=0.0), limits.min, limits.max)
+        return value.astype(dtype_of(to))
+
+    return convert
+
+
+def comparison(opcode: tuple[str, ...]) -> Operation:
+    """Return the function of a `setp` instruction; comparisons ending in "u" are true for NaN."""
+    if opcode[1] in ("num", "nan"):
+        return lambda a, b: (np.isnan(a) | np.isnan(b)) ^ (opcode[1] == "num")
+    name, is_float = opcode[1], opcode[-1][0] == "f"
+    unordered = is_float and name.endswith("u")
+    compare = _COMPARISONS.get(name[:-1] if unordered else name)
+    if compare is None:
+        raise UnsupportedError(f"comparison {name}")
+    if not is_float:
+        return compare
+
+    def compare_floats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        nan = np.isnan(a) | np.isnan(b)
+        return compare(a, b) | nan if unordered else compare(a, b) & ~nan
+
+    return compare_floats
+
+
+def arithmetic(opcode: tuple[str, ...]) -> Operation:
+    """Return the function of an arithmetic, logical or bit instruction; it takes operands of the opcode's type."""
+    name, type_ = opcode[0], opcode[-1]
+    if type_.endswith("x2"):  # two values side by side in 32 bits
+        each, half = arithmetic((*opcode[:-1], type_[:-2])), dtype_of(type_[:-2])
+        return lambda *v: each(*(np.ascontiguousarray(one).view(half) for one in v)).view(np.uint32)
+    dtype = dtype_of(type_)
+    if "wide" in opcode:
+        wides: dict[Any, Any] = {np.int32: np.int64, np.uint32: np.uint64, np.int16: np.int32, np.uint16: np.uint32}
+        wide = wides[dtype]
+        return lambda a, b, *c: reduce(np.add, c, a.astype(wide) * b.astype(wide))
+    if "hi" in opcode:
+        return lambda a, b, *c: reduce(np.add, c, _high(a, b))
+    operation = (_FLOAT if type_[0] == "f" else _INTEGER).get(name)
+    if operation is None:
+        raise UnsupportedError(".".join(opcode))
+    if "ftz" in opcode:
+        return lambda *v: flush(operation(*map(flush, v)).astype(dtype))
+    return lambda *v: operation(*v).astype(dtype, copy=False)
+
+
+def _high(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    if a.dtype.itemsize != 4:
+        raise UnsupportedError("mul.hi of other than 32 bits")
+    wide = np.int64 if a.dtype == np.int32 else np.uint64
+    return ((a.astype(wide) * b.astype(wide)) >> wide(32)).astype(a.dtype)
+
+
+def _fused(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    return a.astype(np.float64) * b + c
+
+
+def _quotient(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Divide integers, rounding toward 0; the quotient by 0 is undefined on a GPU, and 0 here."""
+    divisor = np.where(b == 0, b.dtype.type(1), b)
+    return np.where(b == 0, b.dtype.type(0), (a - np.fmod(a, divisor)) // divisor)
+
+
+def _shift_left(value: np.ndarray, count: np.ndarray) -> np.ndarray:
+    bits = 8 * value.dtype.itemsize
+    return np.where(count < bits, value << (count % bits).astype(value.dtype), value.dtype.type(0))
+
+
+def _shift_right(value: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Shift right; a count of the width or more leaves only copies of the sign."""
+    bits = 8 * value.dtype.itemsize
+    last = value >> value.dtype.type(bits - 1) if value.dtype.kind == "i" else np.zeros_like(value)
+    return np.where(count < bits, value >> (count % bits).astype(value.dtype), last)
+
+
+def _bit_field(value: np.ndarray, start: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Extract bits of 32-bit integers; of signed ones, the field's first bit is its sign."""
+    wide = value.view(np.uint32).astype(np.uint64)
+    one, start, length = np.uint64(1), start.astype(np.uint64), length.astype(np.uint64)
+    field = (wide >> start) & ((one << length) - one)
+    if value.dtype.kind == "i":
+        negative = (length > 0) & ((field >> (np.maximum(length, one) - one)) & one == one)
+        field = np.where(negative, field | ~((one << length) - one), field)
+    return (field & np.uint64(0xFFFFFFFF)).astype(np.uint32).view(value.dtype)
+
+
+_COMMON: dict[str, Operation] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "neg": np.negative,
+    "abs": np.abs,
+}
+_FLOAT: dict[str, Operation] = {
+    **_COMMON,
+    "fma": _fused,
+    "div": np.divide,
+    "min": lambda *v: reduce(np.fmin, v),
+    "max": lambda *v: reduce(np.fmax, v),
+    "sqrt": np.sqrt,
+    "rsqrt": lambda a: 1 / np.sqrt(a),
+    "rcp": lambda a: 1 / a,
+    "ex2": np.exp2,
+    "lg2": np.log2,
+}
+_INTEGER: dict[str, Operation] = {
+    **_COMMON,
+    "mad": lambda a, b, c: a * b + c,
+    "div": _quotient,
+    "rem": np.fmod,
+    "min": lambda *v: reduce(np.minimum, v),
+    "max": lambda *v: reduce(np.maximum, v),
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "not": np.invert,
+    "shl": _shift_left,
+    "shr": _shift_right,
+    "bfe": _bit_field,
+}
+
+
+@dataclass(frozen=True)
+class _Copy:
+    """Data of one instruction that has not arrived: threads, their current groups, addresses and bytes."""
+
+    lanes: np.ndarray
+    groups: np.ndarray
+    addresses: np.ndarray
+    values: np.ndarray
+
+    def where(self, chosen: np.ndarray) -> _Copy:
+        return _Copy(self.lanes[chosen], self.groups[chosen], self.addresses[chosen], self.values[chosen])
+
+
+class AsyncCopies:
+    """Copies of all threads. Data may arrive at any time until the thread waits for its group.
+
+    The addresses are therefore written twice: by undefined bytes when the copy starts, by the data when the thread
+    waits. Accesses by other threads in between are races, unless barriers separate them.
+
+    Args:
+        threads: Number of threads of all program instances.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._groups = np.zeros(threads, np.int64)
+        self._pending: list[_Copy] = []
+
+    def start(self, shared: SharedMemory, lanes: np.ndarray, addresses: np.ndarray, values: np.ndarray) -> None:
+        """Start copies of some threads: bytes [threads, width] to addresses [threads]."""
+        shared.store(addresses, values.shape[1], np.full_like(values, 0xFF), lanes)
+        self._pending.append(_Copy(lanes, self._groups[lanes], addresses, values))
+
+    def commit(self, lanes: np.ndarray) -> None:
+        """End the current group of some threads."""
+        self._groups[lanes] += 1
+
+    def wait(self, shared: SharedMemory, lanes: np.ndarray, latest: int) -> None:
+        """Let some threads wait for all of their groups except the latest ones."""
+        waits = np.zeros(len(self._groups), bool)
+        waits[lanes] = True
+        pending, self._pending = self._pending, []
+        for copy in pending:
+            due = waits[copy.lanes] & (copy.groups < self._groups[copy.lanes] - latest)
+            arrived, left = copy.where(due), copy.where(~due)
+            if len(arrived.lanes):
+                shared.store(arrived.addresses, arrived.values.shape[1], arrived.values, arrived.lanes)
+            if len(left.lanes):
+                self._pending.append(left)
+
 
 WARP = 32
 #: Threads that advance together: operations on arrays of this size take little longer than on smaller ones.
@@ -467,20 +914,6 @@ class Kernel:
             None if instruction.opcode[0] in _CONTROL else compile_instruction(instruction)
             for instruction in program.instructions
         ]
-
-    @contextmanager
-    def changed(self, number: int, instruction: Instruction) -> Iterator[None]:
-        """Replace one instruction within this block, to test that a defect is reported."""
-        program, code = self.program, self.code
-        instructions = [*program.instructions]
-        instructions[number] = instruction
-        self.program = replace(program, instructions=tuple(instructions))
-        self.code = [*code]
-        self.code[number] = None if instruction.opcode[0] in _CONTROL else compile_instruction(instruction)
-        try:
-            yield
-        finally:
-            self.program, self.code = program, code
 
     def launch(self, grid: tuple[int, int, int], arguments: Sequence[int], memory: GlobalMemory) -> None:
         """Execute all program instances of a grid.

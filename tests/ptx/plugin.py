@@ -27,7 +27,7 @@ def ptx(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Generator[None, object, object]:
     """Skip tests of kernels whose instructions for tensor cores cannot be executed."""
-    from tests.ptx.operations import UnsupportedError
+    from tests.ptx.machine import UnsupportedError
 
     try:
         return (yield)

@@ -12,11 +12,10 @@ import pytest
 import torch
 from PIL import Image
 
-from sgsst_core.files.blending import blend_scenes
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.files.stylized_ply import write_colors, write_stylized
+from sgsst_core.files.stylized_ply import blend_scenes, write_colors, write_stylized
 from sgsst_core.scene.camera import resized
 from tests.api.page.actions import Visit, done, submit
 from tests.api.page.browser import Watched, decoded, psnr, rendered

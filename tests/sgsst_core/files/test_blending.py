@@ -11,13 +11,12 @@ import pytest
 import torch
 
 from sgsst_core.errors import SceneError, SettingsError
-from sgsst_core.files import blending
-from sgsst_core.files.blending import blend_scenes, normalized
+from sgsst_core.files import stylized_ply as blending
 from sgsst_core.files.formats import RESULT_FORMATS
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
-from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.files.stylized_ply import blend_scenes, normalized, write_stylized
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.splat_scenes import cloud

@@ -22,10 +22,9 @@ import torch
 from sgsst_core.errors import SettingsError, TooManyIntersectionsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import Rasterizer, drawing_problem, make_rasterizer
-from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.projection import build_tile_intersections
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering

@@ -16,9 +16,8 @@ from sgsst_core.planning.facts import count_weights
 from sgsst_core.quality.measure import approximations
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Precision
-from sgsst_core.rasterizer.cached import CachedRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
-from sgsst_core.rasterizer.triton import TritonRasterizer
+from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
