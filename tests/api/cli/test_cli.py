@@ -909,6 +909,7 @@ _WRITING = [
     ["convert", "no.ply", "OUT", "meta.json"],
     ["blend", "no.ply", "nor.ply", "--out", "s.ply"],
     ["view", "no.ply", "--out", "s.html"],
+    ["paint", "no.ply", "--orbit", "3", "--export", "front", "--out", "front.png"],
     ["demo", "--out", "demo"],
     ["submit", "no.ply", "--style", "no.png", "--url", "http://127.0.0.1:1", "--out", "s.ply"],
     ["download", "no-job", "--url", "http://127.0.0.1:1", "--out", "s.ply"],
