@@ -1,9 +1,9 @@
-"""Writers of stylized PLYs, which change only the colors, and of the colors alone.
+"""Writers of stylized PLYs, which change only the colors, and of the colors alone; blends of stylized scenes.
 
 With an SH attenuation, `f_rest_*` are multiplied by one factor in float32. The written coefficients equal those that
 the job optimized with, because `Scene.attenuated` multiplies the same float32 values by the same factor.
 
-Blends of scenes that differ only in color: weighted means of their spherical harmonics.
+Scenes that differ only in color are blended as weighted means of their spherical harmonics.
 """
 
 from __future__ import annotations

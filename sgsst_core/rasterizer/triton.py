@@ -1,4 +1,4 @@
-"""`triton`: float32 rasterizer on a GPU, without requiring a compiler.
+"""`triton`: float32 rasterizer on a GPU, without requiring a compiler; `cached`: its cached blend weights.
 
 The same source runs on the CPU in Triton's interpreter.
 
@@ -7,16 +7,14 @@ Tile intersections are computed on the device: a projection kernel, a sort of th
 be the tile alone, because pairs are generated in depth order. This takes half the bits of a combined key, and Gaussians
 of equal float32 depth keep the order of their float64 depths.
 
-Cached blend weights are pieces of 4 x 4 pixels; see `triton_kernels` for the layout. A piece takes 40 bytes in
-half precision and 72 in float32. Including data per tile, Gaussian and pixel, a weight takes 3.0 to 3.4 bytes in half
+Cached blend weights are pieces of 4 x 4 pixels; see `triton_kernels` for the layout. A piece takes 40 bytes in half
+precision and 72 in float32. Including data per tile, Gaussian and pixel, a weight takes 3.0 to 3.4 bytes in half
 precision and 5.3 to 6.1 bytes in float32 for a scene of large Gaussians, and 7.1 and 12.2 bytes for a scene whose
 Gaussians cover few pixels.
 
-`cached`: rasterizer that stores the blend weights of a view and reapplies them in every step.
-
-Geometry is frozen, so the blend weights W of a view never change: an image is W c + T_final background, the color
-gradient is W^T dL/dimage, and rasterization is reduced to reading W from memory. Weights are stored on the device that
-applies them, in a layout for this device.
+`cached` stores the blend weights of a view and reapplies them in every step. Geometry is frozen, so the blend weights W
+of a view never change: an image is W c + T_final background, the color gradient is W^T dL/dimage, and rasterization is
+reduced to reading W from memory. Weights are stored on the device that applies them, in a layout for this device.
 """
 
 from __future__ import annotations

@@ -285,6 +285,7 @@ def make(weights: BackboneWeights, regions: Regions | None, **values: Any) -> St
     return Stylizer.planned(wall(), cameras(), style(), settings, weights=weights, regions=regions)
 
 
+@pytest.mark.slow
 def test_content_weight_of_the_job_in_a_region_changes_nothing(tiny_weights: BackboneWeights) -> None:
     actual, wanted = make(tiny_weights, protected(1.0)), make(tiny_weights, None)
     for stylizer in (actual, wanted):

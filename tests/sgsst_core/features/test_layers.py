@@ -130,6 +130,7 @@ def test_features_and_gradients_are_as_accurate_as_direct_ones(
     assert 0 < fewer < max(4 * direct, 1e-4)
 
 
+@pytest.mark.slow
 def test_tiles_add_up_to_the_gradient_of_the_whole_image(vgg16_weights: BackboneWeights) -> None:
     """Windows of deep layers begin elsewhere in a tile than in the image."""
     network, image = FeatureNetwork(vgg16_weights, STYLE_LAYERS, winograd=True), texture(208, 176, seed=1)

@@ -57,8 +57,6 @@ CLOSE = 2e-5
 #: Rasterizers of the CPU; `test_triton_cached.py` compares `cached`, which runs in Triton's interpreter here.
 ALL = [name for name, kind in RASTERIZERS.items() if not kind.on_gpu and name != "cached"]
 OTHERS = [name for name in ALL if name != "reference"]
-#: Rasterizers whose results are bit-identical for any number of threads.
-REPRODUCIBLE = ["cpu"]
 BLACK = (0.0, 0.0, 0.0)
 
 CASES: dict[str, Callable[[], tuple[Scene, Camera]]] = {
@@ -216,7 +214,7 @@ def test_crops_have_tile_intersections_of_their_own() -> None:
     assert not has_intersections(cpu, crop)
 
 
-@pytest.mark.parametrize("name", REPRODUCIBLE)
+@pytest.mark.parametrize("name", OTHERS)
 def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     scene, view = cloud(2000, seed=13), camera(200, 120)
     colors, pixels = colors_of(scene), pixels_like(view)
@@ -233,7 +231,7 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str) -> None:
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
-@pytest.mark.parametrize("name", REPRODUCIBLE)
+@pytest.mark.parametrize("name", OTHERS)
 def test_python_threads_can_share_a_rasterizer(name: str) -> None:
     scene, view = cloud(500, seed=14), camera()
     colors, pixels = colors_of(scene), pixels_like(view)
