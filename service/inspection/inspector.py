@@ -66,7 +66,8 @@ class Lanes:
         queue.append(granted)
         self._grant_turns()
         try:
-            yield await granted
+            await granted
+            yield
         finally:
             self._end_turn(owner, granted)
 

@@ -274,7 +274,7 @@ def alone() -> list[dict[str, Any]]:
     return results
 
 
-@pytest.mark.parametrize("ranks", [2, 3, 4, 6, 8])
+@pytest.mark.parametrize("ranks", [2, 3, *(pytest.param(ranks, marks=pytest.mark.slow) for ranks in (4, 6)), 8])
 def test_jobs_of_any_shape_match_one_rank(ranks: int) -> None:
     by_rank = on_ranks(ranks, stylize_each)
     for results in by_rank:
