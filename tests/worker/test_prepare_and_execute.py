@@ -73,6 +73,7 @@ def test_transparent_parts_of_photos_get_the_background_of_the_job(
     assert load(1)[0, 40].tolist() == [0, 1, 0]
 
 
+@pytest.mark.slow
 def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
     """Matplotlib scans all fonts when it is first imported on a machine."""
     code = "import sys, worker.prepare, worker.execute; sys.exit('matplotlib' in sys.modules)"
@@ -160,7 +161,9 @@ def test_watchers_get_the_refined_scene(tmp_path: Path) -> None:
     assert (tmp_path / "live" / "colors.f16").stat().st_size == 6 * len(shared)
 
 
-@pytest.mark.parametrize("form", ["ply", "spz", pytest.param("compressed.ply", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "form", ["ply", *(pytest.param(form, marks=pytest.mark.slow) for form in ("spz", "compressed.ply"))]
+)
 def test_resume_refines_identically_and_writes_all_gaussians(tmp_path: Path, form: str) -> None:
     jobs = []
     for name in ("whole", "resumed"):

@@ -222,6 +222,7 @@ def _use(folder: str, number: int) -> None:
         target.unlink()
 
 
+@pytest.mark.slow
 def test_processes_share_the_cache(cache: FileCache, tmp_path: Path) -> None:
     spawned = multiprocessing.get_context("spawn")
     processes = [spawned.Process(target=_use, args=(str(tmp_path), number)) for number in range(3)]

@@ -200,7 +200,7 @@ def test_page_shows_what_a_crop_leaves_upright(tmp_path: Path, monkeypatch: pyte
     assert up(regions=crop) == [1.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("path", ["cameras", "orbit"])
+@pytest.mark.parametrize("path", [pytest.param("cameras", marks=pytest.mark.slow), "orbit"])
 def test_video_shows_what_the_crop_of_a_job_leaves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: Literal["cameras", "orbit"]
 ) -> None:

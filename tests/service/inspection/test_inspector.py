@@ -287,6 +287,7 @@ def test_sizes_of_many_frames_are_checked_in_a_file_of_many_values(tmp_path: Pat
             check_frames_have_sizes(path)
 
 
+@pytest.mark.slow
 def test_registries_of_kernels_are_loaded_before_a_request() -> None:
     """Otherwise, each confined child would load them again."""
     code = (
