@@ -87,7 +87,7 @@ def fetch(
 @weights_app.command("path")
 def print_path() -> None:
     """Print the cache folder for weights; set SGSST_CACHE to change it."""
-    from sgsst_core.features.network_weights import cache_folder
+    from sgsst_core.features.weight_files import cache_folder
 
     out_console.print(str(cache_folder()))
 

@@ -27,9 +27,9 @@ from sgsst_core.bench.variants import (
     compare_quality,
     error_time,
     write_plot,
+    write_quality_plot,
     write_sheet,
 )
-from sgsst_core.bench.variants import write_plot as write_quality_plot
 from sgsst_core.devices import seconds_left
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
