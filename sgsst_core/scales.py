@@ -60,7 +60,7 @@ class ScaleWeights:
         return {scale: weight / total for scale, weight in weights.items()}
 
     def sampled(self, chosen: Sequence[int], drawn: Iterable[int], period: int) -> dict[int, float]:
-        """Return the weights of drawn scales whose mean over all draws (`schedule.drawn_scales`) is `fractions`.
+        """Return the weights of drawn scales whose mean over all draws (`steps.drawn_scales`) is `fractions`.
 
         Args:
             chosen: Scales of a view with a positive weight, finest first.

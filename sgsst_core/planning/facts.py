@@ -85,7 +85,7 @@ class Facts:
         harmonics_energy: See `spherical_harmonics.harmonics_energy`, with the views' blend weights.
         sizes: (height, width) of each view.
         rasterizer: Rasterizer that computes blend weights.
-        precision: Precision of the network (`choices.choose_precision`).
+        precision: Precision of the network (`plan.choose_precision`).
         tiling: Partition of views that the network's activations need.
         pixel_bytes: Bytes of the network's activations per pixel.
         weight_bytes: Bytes of the blend weights of all views in float32 and in half precision; None if the rasterizer

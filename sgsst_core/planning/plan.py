@@ -67,7 +67,7 @@ class Plan:
         novel_views: Number of novel views that are measured before and after the steps.
         ranks: Number of ranks that take part.
         groups: Number of groups of ranks that the plan has formed, each of which evaluates a view of its own in every
-            step (`choices.with_groups`); 1 if the settings decide.
+            step (`with_groups`); 1 if the settings decide.
         work: Work of the steps and of the measurements.
         refinement: Refinement that produced the scene of the plan from the input scene; None if the input scene is not
             refined.

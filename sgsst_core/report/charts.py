@@ -222,7 +222,7 @@ def thinned(x: Floats, values: Floats, window: int, width: float) -> Thinned:
 def running_mean(values: Sequence[float] | Floats, window: int) -> Floats:
     """Return the geometric mean of the last `window` values at each index, or of all values so far if there are fewer.
 
-    The last mean is that of the last window, as in `convergence.smoothed`.
+    The last mean is that of the last window, as in `scales.smoothed`.
     """
     logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), np.finfo(np.float64).tiny))
     sums = np.concatenate([[0.0], np.cumsum(logs)])
