@@ -133,8 +133,8 @@ class _Whole(Divider):
 
 
 def _configurations() -> list[tuple[str, Sequence[str]]]:
-    kept = [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
-    return [*kept, *((label, (label,)) for label in (*WITHOUT, *REPLACED))]
+    parts = [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
+    return [*parts, *((label, (label,)) for label in (*WITHOUT, *REPLACED))]
 
 
 def _in_a_process(scene: str, added: Sequence[str]) -> dict[str, float]:
