@@ -248,7 +248,8 @@ def _decision_table(report: dict[str, Any]) -> Table:
 def _prediction_table(report: dict[str, Any]) -> Table:
     """Return the plan's predictions beside the measured values."""
     predicted, measured = report["plan"].get("prediction") or {}, report["plan"].get("measured") or {}
-    values = [("step on all scales", duration, "seconds"), ("peak memory (upper bound)", byte_count, "peak_bytes")]
+    values: list[tuple[str, Callable[[float | None], str], str]] = [("step on all scales", duration, "seconds")]
+    values.append(("peak memory (upper bound)", byte_count, "peak_bytes"))
     if predicted.get("measuring"):
         values.append(("measuring, total", duration, "measuring"))
     if any(each.get("device_bytes") is not None for each in (predicted, measured)):
