@@ -41,6 +41,7 @@ _PARTS = {
     "prepare": "preparing views and style",
     "loss": "loss and pyramid",
     "checkpoint": "checkpoints",
+    "preview": "previews",
     "measuring": "measuring, besides the steps",
     "start": "start of the program, before the steps",
     "reading": "reading the inputs, before the steps",

@@ -92,7 +92,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
     pace, ended = _Pace(stylizer), partial(_end_requested, stylizer, callbacks, stylizer.step)
     report = _Reports(stylizer, callbacks, pace)
     if callbacks.preview and not stylizer.step:
-        callbacks.preview(stylizer)
+        _timed(stylizer, "preview", callbacks.preview)
     if stylizer.step:  # a resumed job may have had more steps than were chosen at first
         _steer(stylizer, callbacks, pace, at_once=True)
     while stylizer.step < stylizer.job.total_steps:
@@ -102,7 +102,7 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
             pace.remember()
             report(last=True)
             if callbacks.checkpoint:
-                _checkpoint(stylizer, callbacks.checkpoint)
+                _timed(stylizer, "checkpoint", callbacks.checkpoint)
             return reason
         stylizer.queue_step()
         _steer(stylizer, callbacks, pace)
@@ -112,10 +112,10 @@ def run(stylizer: Stylizer, callbacks: Callbacks | None = None) -> Stopped:
             stylizer.read_step()
         report(last=last)
         if callbacks.checkpoint and now - last_checkpoint >= callbacks.checkpoint_seconds:
-            _checkpoint(stylizer, callbacks.checkpoint)
+            _timed(stylizer, "checkpoint", callbacks.checkpoint)
             last_checkpoint = time.perf_counter()
         if callbacks.preview and now - last_preview >= callbacks.preview_seconds:
-            callbacks.preview(stylizer)
+            _timed(stylizer, "preview", callbacks.preview)
             last_preview = time.perf_counter()
         pace.add_beside(time.perf_counter() - now)
     pace.remember()
@@ -275,12 +275,12 @@ def _by_scale(evaluation: Evaluation) -> list[float | None]:
     return [evaluation[scale].total if scale in evaluation else None for scale in range(max(evaluation) + 1)]
 
 
-def _checkpoint(stylizer: Stylizer, save: Callable[[Stylizer], None]) -> None:
-    """Save a checkpoint, and record its time separately from the steps."""
+def _timed(stylizer: Stylizer, part: str, action: Callable[[Stylizer], None]) -> None:
+    """Call an action between steps, and record its time as a part of the job's."""
     started = time.perf_counter()
-    save(stylizer)
+    action(stylizer)
     parts = stylizer.seconds_by_part
-    parts["checkpoint"] = parts.get("checkpoint", 0.0) + time.perf_counter() - started
+    parts[part] = parts.get(part, 0.0) + time.perf_counter() - started
 
 
 def stylize(
