@@ -212,7 +212,7 @@ def test_limits_grow_with_the_size_of_a_scene(files: dict[str, Path], tmp_path: 
 
 
 def test_small_file_that_expands_exceeds_the_memory_limit(files: dict[str, Path], tmp_path: Path) -> None:
-    Image.new("RGB", (6000, 6000)).save(files["style"])  # 432 MB as float32, 100 kB as a file
+    Image.new("RGB", (9_900, 9_900)).save(files["style"])  # 294 MB as pixels, 300 kB as a file
     assert files["style"].stat().st_size < 1_000_000
     with pytest.raises(ServiceError, match="memory") as caught:
         inspect(tmp_path, files, inspection_bytes=64_000_000)
