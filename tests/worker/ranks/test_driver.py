@@ -15,7 +15,7 @@ from sgsst_core.errors import ClusterAwayError, RanksDriftedError, RanksFailedEr
 from sgsst_core.progress import Progress
 from worker.job import memory_beside_gpus, scene_bytes
 from worker.prepare import Prepared
-from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, reserve
+from worker.ranks.cluster import Cluster, NoCapacityError, _bundle, first_line, reserve
 from worker.ranks.driver import MOST_ATTEMPTS, FailedAttempt, Failure, Relay, check_retry, failure_of
 from worker.ranks.rank import RankStatus
 from worker.run import Listener
