@@ -137,6 +137,7 @@ class _Attempts:
         deadline: float | None = None
         done_at: float | None = None
         finishing = False
+        said: str | None = None
         while True:
             if deadline is None and self._listener.stop():
                 deadline = time.monotonic() + STOP_SECONDS
@@ -148,6 +149,8 @@ class _Attempts:
                 return None
             poll_ranks(self._group)
             self._relay.pass_on(first.status)
+            if self._relay.before_steps and (line := long_wait(self._group)) and line != said:
+                self._listener.happened(said := line)
             if first.outcome is not None and first.outcome.kind == "done":
                 done_at = done_at or time.monotonic()
                 if all(rank.outcome for rank in self._group.handles) or time.monotonic() - done_at > _LAST_WORDS:
@@ -232,6 +235,11 @@ class Relay:
     def farthest(self) -> tuple[int, int | None]:
         """Return the highest step and the step of the last checkpoint. One of them changes with any progress."""
         return self.step, self.saved
+
+    @property
+    def before_steps(self) -> bool:
+        """Return whether the current attempt has not made a step."""
+        return self._progress is None or not self._progress.is_step
 
     def begin_attempt(self) -> None:
         """Reset the state of the current attempt for a new set of ranks."""
@@ -474,6 +482,28 @@ def look_for_losses(group: RankGroup, cluster: Cluster, rank_timeout: float) -> 
     failed = [rank for rank in group.handles if rank.outcome and rank.outcome.kind == "failed"]
     if failed:
         _wait_for_the_reason(group, cluster, failed[0])
+
+
+#: Seconds of waiting for others before the first step that are reported.
+LONG_WAIT = 60.0
+
+
+def long_wait(group: RankGroup) -> str | None:
+    """Return a sentence about the ranks that wait long for others, and what these do; None if no rank waits long."""
+    waiting = [rank for rank in group.handles if rank.status.waiting > LONG_WAIT]
+    if not waiting:
+        return None
+    others = [rank for rank in group.handles if rank not in waiting and rank.outcome is None]
+    doing = [
+        f"{group.name_of(rank)} ({rank.status.progress.stage if rank.status.progress else 'reading'})"
+        for rank in others
+    ]
+    names = ", ".join(map(group.name_of, waiting))
+    return f"Waiting for more than {LONG_WAIT:.0f} s: {names}. " + (
+        f"Still at work: {', '.join(doing)}."
+        if others
+        else "All wait for each other's messages: check the network between their machines."
+    )
 
 
 def _wait_for_the_reason(group: RankGroup, cluster: Cluster, failed: RankHandle) -> None:

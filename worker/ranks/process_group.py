@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -39,6 +40,32 @@ PREPARING = timedelta(minutes=30)
 ITERATIONS = 5
 
 
+class Waiting:
+    """Record of whether this process waits for other ranks.
+
+    Attributes:
+        since: Start of the present exchange in monotonic seconds; None while there is none.
+    """
+
+    since: float | None = None
+
+    def __enter__(self) -> None:
+        self.since = time.monotonic()
+
+    def __exit__(self, *error: object) -> None:
+        self.since = None
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the start of the present exchange; 0 while there is none."""
+        since = self.since
+        return 0.0 if since is None else time.monotonic() - since
+
+
+#: Record of this process, which is one rank of one job.
+WAITING = Waiting()
+
+
 @contextmanager
 def process_group(
     rank: int,
@@ -64,13 +91,14 @@ def process_group(
         return
     patience = max(timeout, PREPARING)
     _stay_on_interface(address)
-    device, sharing, store = _meet(rank, size, address, with_index(device), patience, listener)
-    if device.type == "cuda":
-        torch.cuda.set_device(device)
-    backend = _backend(device, sharing)
-    dist.init_process_group(
-        backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device, backend)
-    )
+    with WAITING:
+        device, sharing, store = _meet(rank, size, address, with_index(device), patience, listener)
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        backend = _backend(device, sharing)
+        dist.init_process_group(
+            backend, store=store, rank=rank, world_size=size, timeout=patience, device_id=_named(device, backend)
+        )
     # Subgroups get connections of their own, which ranks that are left out do not close. With a bound device, they
     # would be split off from those of this group.
     world: Any = dist.group.WORLD
@@ -239,7 +267,8 @@ class ProcessGroupCollectives(Collectives):
         )
         into = flat.new_empty(sum(expected))
         self.sent["image"] += flat.nbytes
-        dist.all_to_all_single(into, flat, expected, counts, group=self._group)
+        with WAITING:
+            dist.all_to_all_single(into, flat, expected, counts, group=self._group)
         values = iter(into.split([image[rank].numel() for rank in others for image in received]))
         for rank in range(self.size):
             for source, target in zip(sent, received, strict=True):
@@ -256,7 +285,8 @@ class ProcessGroupCollectives(Collectives):
     def _reduce(self, tensor: Tensor, traffic: Traffic, operation: Any = dist.ReduceOp.SUM) -> Tensor:
         tensor = tensor.contiguous()
         self.sent[traffic] += 2 * (self.size - 1) * tensor.nbytes // self.size
-        dist.all_reduce(tensor, operation, group=self._group)
+        with WAITING:
+            dist.all_reduce(tensor, operation, group=self._group)
         return tensor
 
     def all_reduce_statistics(
@@ -318,11 +348,13 @@ class ProcessGroupCollectives(Collectives):
         """See `Collectives`."""
         message = encode(value)
         sizes = [torch.empty(1, dtype=torch.int64) for _ in range(self.size)]
-        dist.all_gather(sizes, torch.tensor([len(message)]), group=self._group)
+        with WAITING:
+            dist.all_gather(sizes, torch.tensor([len(message)]), group=self._group)
         padded = message.new_zeros(int(max(sizes)))
         padded[: len(message)] = message
         messages = [torch.empty_like(padded) for _ in range(self.size)]
-        dist.all_gather(messages, padded, group=self._group)
+        with WAITING:
+            dist.all_gather(messages, padded, group=self._group)
         return [decode(each[: int(size)]) for each, size in zip(messages, sizes, strict=True)]
 
     def broadcast(self, make: Callable[[], T]) -> T:
@@ -334,10 +366,11 @@ class ProcessGroupCollectives(Collectives):
             except SgsstError as error:
                 message = encode((None, error))
         size = torch.tensor([len(message)])
-        dist.broadcast(size, group=self._group, group_src=0)
-        if self.rank != 0:
-            message = message.new_empty(int(size))
-        dist.broadcast(message, group=self._group, group_src=0)
+        with WAITING:
+            dist.broadcast(size, group=self._group, group_src=0)
+            if self.rank != 0:
+                message = message.new_empty(int(size))
+            dist.broadcast(message, group=self._group, group_src=0)
         value: T
         value, problem = decode(message)
         if problem is not None:
@@ -360,7 +393,8 @@ class ProcessGroupCollectives(Collectives):
             return self
         if len(ranks) == 1:
             return ALONE if self.rank in ranks else None
-        group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING), device_id=self._named)
+        with WAITING:
+            group = dist.new_group(list(ranks), timeout=max(self._timeout, PREPARING), device_id=self._named)
         if self.rank not in ranks:
             return None
         return ProcessGroupCollectives(group, self._device, self._timeout, self.gpu_sharing, self.sent)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sgsst_core.progress import Progress
     from worker.job import JobSpec, Result, Resume
     from worker.prepare import Prepared
+    from worker.ranks.process_group import Waiting
 
 #: Seconds by which the timeout of an exchange between ranks exceeds the driver's. The driver should time out first,
 #: because it knows which rank does not respond.
@@ -179,6 +180,7 @@ class RankStatus:
         progress: Latest progress; None before the first stage. Steps are reported on rank 0 only.
         saved: Step of the last checkpoint. With a workplace, a checkpoint counts once it is stored.
         stored: Descriptions of all files that a workplace has stored so far.
+        waiting: Seconds for which the rank has been waiting for others; 0 if it is not.
     """
 
     prepared: Prepared | None = None
@@ -187,6 +189,7 @@ class RankStatus:
     warnings: tuple[str, ...] = ()
     stored: tuple[Any, ...] = ()
     outcome: Outcome | None = None
+    waiting: float = 0.0
 
 
 class RankProcess:
@@ -194,6 +197,7 @@ class RankProcess:
 
     def __init__(self) -> None:
         self._status = RankStatus()
+        self._waiting: Waiting | None = None  # set once PyTorch is imported
         self._stop, self._finish = threading.Event(), threading.Event()
         self._lock = threading.Lock()
         self._listener: socket.socket | None = None
@@ -223,7 +227,7 @@ class RankProcess:
     def poll(self) -> RankStatus:
         """Return the current status. Any response shows the driver that this process is alive."""
         with self._lock:
-            return self._status
+            return replace(self._status, waiting=self._waiting.seconds if self._waiting else 0.0)
 
     def stop(self) -> None:
         """Interrupt the job after the current step. The driver calls this on rank 0 only."""
@@ -266,8 +270,9 @@ class RankProcess:
     def _work(self, task: RankTask, place: OpenWorkplace | None) -> None:
         import torch
 
-        from worker.ranks.process_group import process_group
+        from worker.ranks.process_group import WAITING, process_group
 
+        self._waiting = WAITING
         torch.set_num_threads(task.threads)
         device = torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else "cpu"
         timeout = timedelta(seconds=task.options.rank_timeout + _PATIENCE)
