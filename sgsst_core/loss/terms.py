@@ -448,7 +448,10 @@ class StatisticsTerms:
             for layer in self._layers:
                 in_view, in_tile = tile.owned_cells(layer, self._view.size)
                 owned, weights = features[layer][in_tile.slices], self._view.weights(layer, in_view, region.positions)
-                statistics.append(layer_statistics(owned, weights))
+                if self._is_nowhere(weights):
+                    statistics.append(LayerStatistics.zero(owned.shape[-1], owned.device))
+                else:
+                    statistics.append(layer_statistics(owned, weights))
         return statistics
 
     def compare(self, statistics: Sequence[LayerStatistics]) -> dict[str, Tensor]:
@@ -491,8 +494,16 @@ class StatisticsTerms:
         relu, passed = layer != PIXELS and added.shape == gradient.shape, False
         for own, region in self._gradients.get(layer, ()):
             weights = self._view.weights(layer, in_view, region.positions)
-            passed = own.add_to(added, owned, weights, relu=relu)
+            if not self._is_nowhere(weights):
+                passed = own.add_to(added, owned, weights, relu=relu)
         return passed
+
+    def _is_nowhere(self, weights: Tensor | None) -> bool:
+        """Return whether the weights of a region in some cells are known to be all 0.
+
+        Weights on a GPU count as unknown, because reading them would synchronize with the device.
+        """
+        return len(self._regions) > 1 and weights is not None and not weights.is_cuda and not bool(weights.any())
 
 
 def fused_style_loss(
