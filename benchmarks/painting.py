@@ -87,7 +87,7 @@ def _measure(scene: Scene, views: list[Camera], change: Callable[[Scene, Tensor]
         return mean(float(-10 * torch.tensor(max(error, 1e-12)).log10()) for error in errors)
 
     wanted, painted = change(scene, original.clamp(0, 1)), views[len(views) // 2]
-    held_out = spread([view for view in views if view is not painted], JUDGED)
+    novel = spread([view for view in views if view is not painted], JUDGED)
     target = image(wanted, painted).float()
     view = PaintedView(painted, target, torch.ones(target.shape[:2]))
     started = time.perf_counter()
@@ -101,7 +101,7 @@ def _measure(scene: Scene, views: list[Camera], change: Callable[[Scene, Tensor]
         "neighbors": _of_neighbors(scene, original, solved, seen),
         "ours": COLOR_OFFSET + SH_C0 * result.sh_dc,
     }
-    figures = {f"{name}, others": psnr(values, held_out) for name, values in colors.items()}
+    figures = {f"{name}, others": psnr(values, novel) for name, values in colors.items()}
     return {"painted": psnr(colors["ours"], [painted]), **figures, "seconds": seconds}
 
 
