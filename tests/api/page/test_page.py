@@ -381,7 +381,7 @@ def test_two_keys_and_their_jobs(browser: Any, files: dict[str, Path], tmp_path:
         ann.page.locator(".tile", has_text="of ann").wait_for()
         ben.page.get_by_text("No jobs yet").wait_for()
         ben.page.goto(f"{service.url}/#/jobs/{job_id}")
-        ben.page.get_by_text("This job doesn't exist").wait_for()
+        ben.page.get_by_role("heading", name="This job doesn't exist").wait_for()
         ann.page.goto(f"{service.url}/#/jobs/{job_id}")
         ann.page.locator(".badge", has_text="Done").wait_for()
         ann.settled()
