@@ -236,33 +236,6 @@ def stored_bytes(service: Service, owner: str) -> int:
 # --- one key beside another ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_small_job_does_not_wait_for_another_keys_files(tmp_path: Path, files: dict[str, bytes]) -> None:
-    """If the process that checks a hostile key's files is stopped, further files of that key wait, and no others."""
-    with (
-        Service(tmp_path / "data", alone=True, SGSST_REQUIRE_KEYS="true") as service,
-        service.client(key(service, NO_QUOTAS)) as hostile,
-        service.client(key(service, NO_QUOTAS)) as other,
-        ThreadPoolExecutor(3) as pool,
-    ):
-        assert hostile.post("/v1/jobs", files=form(files), timeout=PATIENCE).status_code == 202
-        # The spare process starts before the one that gets the first files, whose child must end.
-        wait_for(lambda: len(service.processes("service.inspection.process")) == 2, "the child to end", service.said)
-        both = service.processes("service.inspection.process")
-        checking = max(both, key=lambda process: (process.create_time(), process.pid))
-        checking.suspend()
-        try:
-            new = [form({**files, "cameras": files["cameras"] + b" " * count}) for count in (1, 2, 3)]
-            waiting = [pool.submit(hostile.post, "/v1/jobs", files=each, timeout=PATIENCE) for each in new]
-            wait_for(lambda: any((service.data / "inspections").iterdir()), "the first file to be checked")
-            mine = form({**files, "cameras": files["cameras"] + b"\n"})
-            assert other.post("/v1/jobs", files=mine, timeout=PATIENCE).status_code == 202
-            assert not any(each.done() for each in waiting)
-        finally:
-            checking.resume()
-        assert [each.result().status_code for each in waiting] == [202] * 3
-
-
 # --- many requests at once -----------------------------------------------------------------------------------------
 
 
