@@ -790,7 +790,7 @@ def make_orbit(scene: Scene, request: OrbitRequest, remaining: Tensor | None = N
             hide them, and show where up is.
 
     Raises:
-        SettingsError: If an option is out of range; see `cameras.orbit`.
+        SettingsError: If an option is out of range; see `orbit`.
     """
     subject, up = find_upright_subject(scene, request.up, remaining)
     first = ELEVATION if request.elevation is None else request.elevation

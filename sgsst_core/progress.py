@@ -1,4 +1,4 @@
-"""Texts about a job for people: its progress, the decisions of its plan, and numbers."""
+"""Progress of a job as it is reported, stored and sent; decisions of its plan; texts about both."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ from sgsst_core.scene.gaussians import Scene, rotations
 from sgsst_core.settings import Settings
 
 #: Maximum number of pieces along one axis. Isotropic Gaussians get at most a third as many per axis, because the number
-#: of their children is limited too (`choice.max_children`).
+#: of their children is limited too (`max_children`).
 MAX_PIECES = 32
 #: K pieces are smaller than the parent by the factor r = _SLOPE K + _START, for which the mixture is within 3 % of the
 #: parent.

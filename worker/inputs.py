@@ -518,7 +518,7 @@ def select(selection: Selection, file: SceneFile, cameras: Sequence[Camera], nea
 
 
 def shown_by_masks(folder: Path, file: SceneFile, cameras: Sequence[Camera], near: float) -> Tensor:
-    """Return a flag for each Gaussian, [N] bool: whether the masks of some views select it. See `regions.masks`.
+    """Return a flag for each Gaussian, [N] bool: whether the masks of some views select it. See `sgsst_core.regions`.
 
     Raises:
         ImageError: If there are no masks, or if a mask cannot be used.

@@ -16,7 +16,7 @@ import typer
 
 from api.cli.client_commands import KeyOption, conclude, follow, open_client
 from api.cli.console import FAILURE, JOB_FAILED, Invocation, error_console, print_field, transfer_bar
-from api.cli.options import JobInputs, flags, folder_to_write, local_path, path_to_read, with_options
+from api.cli.options import JobArguments, flags, folder_to_write, local_path, path_to_read, with_options
 from api.cli.stylize_commands import run_job
 from api.client.uploads import camera_files, different_names
 from sgsst_core.errors import InvalidInputError, SettingsError, SgsstError, is_out_of_memory
@@ -157,7 +157,7 @@ def batch(
     pairs = list(product(zip(_names(scenes), scenes, strict=True), zip(_names(style), style, strict=True)))
     names = different_names([Path(f"{scene_name}_{style_name}") for (scene_name, _), (style_name, _) in pairs])
     for name, ((_, scene), (_, image)) in zip(names, pairs, strict=True):
-        inputs = JobInputs(str(scene), [str(image)], str(cameras) if cameras else None)
+        inputs = JobArguments(str(scene), [str(image)], str(cameras) if cameras else None)
         jobs[name] = inputs.request(options, results.result(name))
         for each in scenes:
             check_is_not_input(results.result(name), scene_path(each), "scene of another result")

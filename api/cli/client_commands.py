@@ -25,7 +25,7 @@ from api.cli.console import (
     transfer_bar,
 )
 from api.cli.options import (
-    JobInputs,
+    JobArguments,
     JsonOption,
     cameras_of,
     file_to_write,
@@ -73,9 +73,9 @@ def _webhook_event(text: str) -> str:
 
 
 @with_options(JobParameters)
-@with_arguments(JobInputs)
+@with_arguments(JobArguments)
 def submit(
-    inputs: JobInputs,
+    inputs: JobArguments,
     *,
     options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Additional parameters, as in the REST API.")] = "{}",
@@ -135,7 +135,7 @@ def submit(
 
 
 def _styles_masks_and_parameters(
-    inputs: JobInputs, options: JobParameters, parameters: str
+    inputs: JobArguments, options: JobParameters, parameters: str
 ) -> tuple[list[Path | str], dict[str, Path], dict[str, Any]]:
     """Return the style images to send or their URLs, those of regions last, the masks, and the job's parameters."""
     values = options.model_dump(mode="json", exclude_unset=True)

@@ -275,7 +275,7 @@ def _of_region(metavar: str, help: str) -> Any:
 
 
 @dataclass(frozen=True)
-class JobInputs:
+class JobArguments:
     """Files and regions of a job, as given on the command line; see `with_arguments`.
 
     Scene, style and cameras are texts, because `sgsst submit` also accepts URLs, which a `Path` would change.

@@ -20,7 +20,7 @@ from rich.table import Column, Table
 from api.cli.console import error_console, out_console, print_field, spinner
 from api.cli.options import (
     CamerasOption,
-    JobInputs,
+    JobArguments,
     OptionalStyleOption,
     SceneArgument,
     StyleOption,
@@ -49,10 +49,10 @@ _TIMED_FRAMES = 6
 
 
 @with_options(StylizeOptions, without=("workers",))
-@with_arguments(JobInputs)
+@with_arguments(JobArguments)
 def plan(
     context: typer.Context,
-    inputs: JobInputs,
+    inputs: JobArguments,
     out: Annotated[
         Path, typer.Option(help="JSON file to write the plan to.", callback=file_to_write, rich_help_panel=ESSENTIALS)
     ] = Path("plan.json"),

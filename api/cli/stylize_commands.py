@@ -26,7 +26,7 @@ from api.cli.console import (
     spinner,
 )
 from api.cli.machine_commands import fetch
-from api.cli.options import JobInputs, file_to_write, folder_to_write, with_arguments, with_options
+from api.cli.options import JobArguments, file_to_write, folder_to_write, with_arguments, with_options
 from sgsst_core.errors import WeightsError
 from sgsst_core.files.formats import EXTRA_SUFFIXES
 from sgsst_core.progress import clock
@@ -48,10 +48,10 @@ DEMO_RESOLUTION, DEMO_STEPS, DEMO_SECONDS = 480, 100, 240
 
 @with_options(StylizeOptions)
 @with_options(RunOptions, "run")
-@with_arguments(JobInputs)
+@with_arguments(JobArguments)
 def stylize(
     context: typer.Context,
-    inputs: JobInputs,
+    inputs: JobArguments,
     out: Annotated[
         Path,
         typer.Option(
@@ -90,7 +90,7 @@ def demo(
     with spinner("Building the scene"):
         files = build_demo(out)
     chosen = {"preset": "preview", "resolution": DEMO_RESOLUTION, "steps_sos": DEMO_STEPS, "within": DEMO_SECONDS}
-    inputs = JobInputs(str(files.ply), [str(files.style)], str(files.cameras))
+    inputs = JobArguments(str(files.ply), [str(files.style)], str(files.cameras))
     request = inputs.request(StylizeOptions.model_validate(chosen), out / "stylized.ply")
     given = {"style": files.style, "cameras": files.cameras, "out": request.out, **chosen}
     options = [(f"--{name.replace('_', '-')}", str(value)) for name, value in given.items()]

@@ -246,7 +246,7 @@ _EVENT = {
 _EXAMPLES = {
     "status": {"status": "running", "attempt": 1},
     "progress": example_of(ProgressView),
-    "artifact": {"name": "previews/000100.jpg", "size": 41239, "sha256": SHA256},
+    "artifact": {"name": "previews/step_0000100.jpg", "size": 41239, "sha256": SHA256},
 }
 
 

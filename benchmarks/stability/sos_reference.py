@@ -150,13 +150,13 @@ def sos_reference(
     Args:
         network_weights: Weights of the feature network.
         image: [H, W, 3] in 0..1.
-        style: [H', W', 3], already resized (`pyramid.style_size`), or one reference per region.
+        style: [H', W', 3], already resized (`colors.style_size`), or one reference per region.
         content: [H, W, 3] in 0..1; None for no content term.
         content_weight: lambda_c.
         coverage: [H, W] position weights; None for equal weights.
         content_weights: [H, W] position weights of the content term relative to `content_weight`; None for `coverage`.
         style_loss: Style loss; see `terms`. If it matches features, the style may have at most
-            `nearest.MAX_VECTORS` positions.
+            `terms.MAX_VECTORS` positions.
         coarsest: Maximum shorter side of the coarsest scale in pixels.
         scales: Weight of each scale from full size downwards; empty for equal weights.
     """

@@ -1,5 +1,7 @@
 """Capacity of this machine, and pure functions that decide what the next job gets of it, or that it has to wait.
 
+The order of jobs and the turns of keys are in `service.store.queue`; this decides only how much a job gets.
+
 Jobs do not share GPUs. A job that does not specify `workers` gets a portion of the free GPUs: all of them if no other
 job waits, one if many do, but never more than its estimated duration justifies. A job also waits if the running jobs
 leave too little of the machine's memory for its scene. On a Ray cluster, Ray tracks the memory per machine.

@@ -355,7 +355,7 @@ class Leases:
                     move(session, job, Transition.FINISH, now)
 
     def report_progress(self, lease: Lease, progress: Progress, *, notify: bool = False) -> None:
-        """Replace the job's progress and add it to the loss history (`history`).
+        """Replace the job's progress and add it to the loss history.
 
         This is by far the most frequent write of dispatchers, so it uses as few statements as possible.
 
@@ -402,7 +402,7 @@ class Leases:
             return unused
 
     def fail(self, lease: Lease, error: dict[str, Any], *, permanent: bool) -> bool:
-        """End a failed attempt: the job is queued again after a delay, or fails (`retries`).
+        """End a failed attempt: the job is queued again after a delay, or fails.
 
         An error with the code of `InfrastructureError` is never permanent.
 

@@ -24,10 +24,8 @@ from sgsst_core.loss.terms import (
     POSITION_TERMS,
     TERMS,
     ContentFeatures,
-    ContentTerm,
     LayerTarget,
     LossTerms,
-    NearestTerm,
     StatisticsTerms,
     StyleTarget,
     StyleTargets,
@@ -318,7 +316,7 @@ class _ScalePass:
     view: ScaledView
     tiles: list[PartitionTile]
     statistics: StatisticsTerms
-    terms: list[ContentTerm | NearestTerm]
+    terms: list[PositionTerm]
     values: Tensor = field(init=False)
 
 

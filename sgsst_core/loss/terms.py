@@ -987,6 +987,7 @@ class NearestTerm:
 TERMS = STATISTICS_TERMS | {ContentTerm.name: "content", NearestTerm.name: "nearest neighbors"}
 #: Terms that are sums over the positions of a view. Every tile adds the positions that it owns.
 POSITION_TERMS = (ContentTerm, NearestTerm)
+PositionTerm = ContentTerm | NearestTerm
 
 
 def layers_of(style_loss: StyleLossName, weights: BackboneWeights, *, content: bool) -> tuple[str, ...]:
