@@ -26,6 +26,7 @@ from sgsst_core.loss.terms import (
     ContentFeatures,
     LayerTarget,
     LossTerms,
+    PositionTerm,
     StatisticsTerms,
     StyleTarget,
     StyleTargets,
