@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from sgsst_core.files.scene_file import read_scene
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.stored_harmonics import held
 
@@ -24,6 +25,11 @@ def run_script(modules: Path, name: str, *arguments: str | Path | int) -> None:
     command = ["node", "--input-type=module", "-e", script, *map(str, arguments)]
     done = subprocess.run(command, cwd=modules, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def read_raw(path: Path) -> Scene:
+    """Return a scene as its numbers stand in the file: other programs do not turn the axes of an SPZ."""
+    return read_scene(path, spz_axes="rdf").scene
 
 
 def matched(actual: Scene, expected: Scene) -> Scene:

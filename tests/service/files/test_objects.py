@@ -339,15 +339,15 @@ def test_api_and_dispatcher_share_a_bucket_and_no_folder(
         wait_for(ended, "the job's end", service.said)
         job = client.get(where).json()
         assert job["status"] == "succeeded", job["error"]
-        result = client.get(f"{where}/remote/stylized.ply")
+        result = client.get(f"{where}/artifacts/stylized.ply")
         assert result.content == expected
-        tail = client.get(f"{where}/remote/stylized.ply", headers={"Range": "bytes=-100"})
+        tail = client.get(f"{where}/artifacts/stylized.ply", headers={"Range": "bytes=-100"})
         assert (tail.status_code, tail.content) == (206, expected[-100:])
         for folder in (service.data, tmp_path / "dispatcher"):
             assert not (folder / "remote").exists()
             assert not (folder / "blobs").exists(), "inputs are in the bucket, too"
             assert len(list((folder / "cache" / "files").glob("*/*"))) == 3
         assert client.delete(where).status_code == 204
-        assert client.get(f"{where}/remote/stylized.ply").status_code == 404
+        assert client.get(f"{where}/artifacts/stylized.ply").status_code == 404
     listing = httpx2.get(f"{environment['AWS_ENDPOINT_URL']}/results", params={"prefix": "service/job_"})
     assert "<Key>" not in listing.text
