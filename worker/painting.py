@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,11 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
-from sgsst_core.errors import CameraError, ImageError
+from sgsst_core.errors import CameraError, ImageError, OutputError
 from sgsst_core.files.atomic import atomic_path
 from sgsst_core.files.images import load_image, to_image
+from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import SceneFile
-from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.painting.solver import Painted, PaintedView, paint
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Color, Rasterizer
@@ -25,6 +25,7 @@ from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from worker.inputs import read_scene_and_capture
 from worker.job import SceneRequest
+from worker.outputs import check_is_not_input, result_format
 
 #: Text chunk of a PNG with the view that it shows.
 _CHUNK = "sgsst-view"
@@ -41,20 +42,29 @@ class PaintRequest:
 
     Attributes:
         paintings: Painted pictures by the names of their views.
+        out: Scene to write, in any format for results; a report goes beside it.
         background: Color behind the scene in the pictures, in 0..1.
     """
 
     source: SceneRequest
     paintings: Mapping[str, Path]
+    out: Path
     background: Color = (0.0, 0.0, 0.0)
+
+    @property
+    def report(self) -> Path:
+        """Path of the report."""
+        return self.out.with_suffix(".report.json")
 
 
 def export_view(source: SceneRequest, name: str, background: Color, out: Path) -> Camera:
     """Render a view as a PNG to paint on, which states its view in a text chunk. Return the camera.
 
     Raises:
-        InvalidInputError: If scene or cameras cannot be used, or no view has this name.
+        InvalidInputError: If scene or cameras cannot be used, no view has this name, or `out` is not a PNG's name.
     """
+    if out.suffix.lower() != ".png":  # a mistyped path must not overwrite a scene
+        raise OutputError(f"{out}: not the name of a PNG image. Give one, such as {name}.png.")
     file, capture = read_scene_and_capture(source)
     camera = _camera(capture.cameras, name)
     image = _render(make_rasterizer("cpu", file.scene, background=background, near=source.near), file, camera)
@@ -71,8 +81,15 @@ def paint_scene(
     """Return a scene's file, and the colors with which it follows its painted views.
 
     Raises:
-        InvalidInputError: If scene, cameras or a picture cannot be used.
+        InvalidInputError: If scene, cameras or a picture cannot be used, or the output would overwrite one of them.
     """
+    result_format(request.out)
+    inputs = {request.source.scene: "scene itself"} | dict.fromkeys(request.paintings.values(), "painted picture")
+    if request.source.cameras is not None:
+        inputs[request.source.cameras] = "camera file"
+    for path, description in inputs.items():
+        for out in (request.out, request.report):
+            check_is_not_input(out, path, description)
     file, capture = read_scene_and_capture(request.source)
     named = [(_camera(capture.cameras, name), path) for name, path in request.paintings.items()]
     paintings = [(camera, path, *load_painting(path, camera)) for camera, path in named]
@@ -172,15 +189,13 @@ def _check_view(
         raise ImageError(f"{path}: does not look like the view {camera.name}, but like {best.name}. Name that view.")
 
 
-def write_painted(out: Path, file: SceneFile, painted: Painted) -> Path:
-    """Write a painted scene as a PLY, and beside it a report, whose path is returned.
+def write_painted(request: PaintRequest, file: SceneFile, painted: Painted) -> None:
+    """Write a painted scene, and beside it a report.
 
     Raises:
         OutputError: If a file cannot be written.
     """
-    write_stylized(file, out, painted.sh_dc)
-    report = out.with_suffix(".report.json")
+    save(request.out, replace(file, scene=replace(file.scene, sh_dc=painted.sh_dc)))
     figures = {name: value for name, value in vars(painted).items() if name != "sh_dc"}
-    with atomic_path(report) as temporary:
+    with atomic_path(request.report) as temporary:
         temporary.write_text(json.dumps({"gaussians": len(file.scene), **figures}, indent=2) + "\n", "utf-8")
-    return report

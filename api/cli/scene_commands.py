@@ -311,7 +311,7 @@ def paint(
     out: Annotated[
         Path,
         typer.Option(
-            help="Painted PLY to write; with --export, the PNG to paint on.",
+            help=f"Scene to write: {RESULT_SUFFIXES}; with --export, the PNG to paint on.",
             callback=file_to_write,
             show_default=False,
             rich_help_panel=ESSENTIALS,
@@ -345,15 +345,15 @@ def paint(
         camera = export_view(source, export, background, out)
         print_field("picture", f"{out}, {camera.width}x{camera.height}: paint on it, then use --view {export}={out}")
         return
-    request = PaintRequest(source, _paintings(view or []), background)
+    request = PaintRequest(source, _paintings(view or []), out, background)
     with live_bar(error_console) as bar:
         task = bar.add_task("painting", total=None)
         file, painted = paint_scene(request, lambda done, total: bar.update(task, completed=done, total=total))
-    report = write_painted(out, file, painted)
+    write_painted(request, file, painted)
     print_field("painted pixels", f"{painted.psnr_before:.1f} dB before, {painted.psnr_after:.1f} dB after")
     print_field("Gaussians", f"{painted.determined:,} of {len(file.scene):,} are determined; the others follow them")
     print_field("scene", out)
-    out_console.print(f"report: {report}")
+    print_field("report", request.report)
 
 
 def _paintings(views: list[str]) -> dict[str, Path]:

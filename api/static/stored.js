@@ -1,5 +1,5 @@
 // @ts-check
-/** What a new job may take up: inputs of earlier jobs, the draft of the form, and an interrupted upload. */
+/** Content that a new job can reuse: inputs of earlier jobs, the draft of the form, and an interrupted upload. */
 import { ask, get } from "./api.js";
 import { h, put } from "./dom.js";
 import { paintingsOf } from "./names.js";

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +71,27 @@ def test_unusable_pictures_are_refused(
     assert paint(folder, name) == BAD_INPUT
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (folder / "painted.ply").exists()
+
+
+@pytest.mark.parametrize("name", ["kept.png", "scene.ply", "painted.txt"])
+def test_inputs_are_not_overwritten(folder: Path, name: str) -> None:
+    shutil.copy(folder / "view.png", folder / "kept.png")
+    files = {path: path.read_bytes() for path in folder.iterdir()}
+    view = f"orbit_0000={folder / 'kept.png'}"
+    assert (
+        main(["paint", str(folder / "scene.ply"), *OPTIONS, "--view", view, "--out", str(folder / name)]) == BAD_INPUT
+    )
+    if name != "kept.png":
+        exported = [*OPTIONS, "--export", "orbit_0000", "--out", str(folder / name)]
+        assert main(["paint", str(folder / "scene.ply"), *exported]) == BAD_INPUT
+    assert {path: path.read_bytes() for path in folder.iterdir()} == files
+
+
+def test_result_has_the_format_of_its_name(folder: Path) -> None:
+    out = folder / "painted.spz"
+    view = f"orbit_0000={folder / 'view.png'}"
+    assert main(["paint", str(folder / "scene.ply"), *OPTIONS, "--view", view, "--out", str(out)]) == 0
+    assert read_scene(out).format == "spz"
 
 
 def test_picture_of_another_view_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
