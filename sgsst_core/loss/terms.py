@@ -255,6 +255,9 @@ class TermWeights(NamedTuple):
 PAPERS_WEIGHTS = TermWeights()
 
 
+# --- statistics of layers --------------------------------------------------------------------------------------------
+
+
 def has_statistics(style_loss: StyleLossName) -> bool:
     """Return whether a loss compares Gram matrices, means and standard deviations."""
     return style_loss != "nnfm"
@@ -566,6 +569,9 @@ def fused_add_style_gradient(
         )  # fmt: skip
 
 
+# --- content ---------------------------------------------------------------------------------------------------------
+
+
 #: Positions per program of the GPU kernels: 4,096 values of the content layer's 512 channels.
 CONTENT_POSITIONS = 8
 
@@ -743,6 +749,9 @@ def _launch(
 
 def _can_be_fused(*tensors: Tensor) -> bool:
     return all(can_be_fused(each) and each.dtype == tensors[0].dtype for each in tensors)
+
+
+# --- nearest features ------------------------------------------------------------------------------------------------
 
 
 #: Maximum number of style vectors to search. Style images larger than 360 x 360 pixels have more vectors, and are
@@ -980,6 +989,9 @@ class NearestTerm:
                 matches.add_gradient(*owned, layer, vectors, factor, weights)
                 added = False
         return added
+
+
+# --- all terms -------------------------------------------------------------------------------------------------------
 
 
 #: Terms whose sum is the loss of a scale: name in files and reports, and display name. Summation, display and chart
