@@ -30,7 +30,10 @@ def service(whole_service: Service) -> Service:
 
 @pytest.fixture
 def visit(browser: Any, service: Service) -> Iterator[Callable[..., Watched]]:
-    """Yield a function that opens pages of the service, each in a separate browser context."""
+    """Yield a function that opens pages of the service, each in a separate browser context.
+
+    Jobs that the test has left unfinished are canceled, or those of later tests would wait for them.
+    """
     opened: list[Watched] = []
 
     def visit(path: str = "/", **context: Any) -> Watched:
@@ -42,6 +45,10 @@ def visit(browser: Any, service: Service) -> Iterator[Callable[..., Watched]]:
     yield visit
     for watched in opened:
         watched.context.close()
+    with service.client() as client:
+        for job in client.get("/v1/jobs", params={"limit": 200}).json()["jobs"]:
+            if job["status"] in ("queued", "running"):
+                client.post(f"{job['links']['self']}/cancel")
 
 
 @pytest.fixture
