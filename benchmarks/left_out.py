@@ -1,12 +1,13 @@
 """Savings from each component that a plan leaves out because the scene does not need it, and from our own mechanisms.
 
-python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 320] [--views 4] [--rounds 3]
+python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 640] [--views 4] [--rounds 3]
 
 CAMERAS is a camera file, or orbit:N. The first configuration leaves out all components that the scene does not need;
 each of the next ones keeps one of them, and one keeps all; the others do without one of the mechanisms by which we want
-to gain time or quality. Every configuration runs in a process of its own, so
-that it has its own memory peak, and all of them run once in each round, so that a change of the machine's speed meets
-all alike. Medians over the rounds are stored with their range.
+to gain time or quality. Every job runs in a process of its own, so that it has its own memory peak, and all of them run
+once in each round. Other work on a machine only makes steps slower, so each step, and what comes before and after the
+steps, counts with its least seconds over the rounds; the range is that of the rounds, each compared with the lean job
+of its round. Results are stored after each scene, beside those of others.
 """
 
 from __future__ import annotations
@@ -18,14 +19,15 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.common import read_views, write_result
+from benchmarks.common import add_pair, read_views
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import Cache, peak_memory
 from sgsst_core.features import layers
@@ -50,7 +52,6 @@ EVERYTHING = ("unseen", "uncovered", "activations", "content")
 WITHOUT: dict[str, dict[str, Any]] = {
     "no Winograd": {"precision": "float32"},
     "no warm start": {"warm_start": False},
-    "no sampling of scales": {"scale_sampling": 1},
 }
 #: Functions that replace compiled ones by PyTorch's operations, with their modules and names.
 REPLACED: dict[str, tuple[Any, str, Callable[..., Any]]] = {
@@ -61,32 +62,30 @@ REPLACED: dict[str, tuple[Any, str, Callable[..., Any]]] = {
         lambda rest, means, camera, degree: reference_rest_colors(rest, means, camera, degree),
     ),
 }
-#: Steps of a whole job.
-STEPS = 24
 
 
 def main() -> None:
-    """Measure, print and store all configurations; with --keep, measure one and print it as JSON."""
+    """Measure, print and store all configurations; with --keep, run one job and print its figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE.ply:CAMERAS")
     parser.add_argument("--style", type=Path, required=True)
-    parser.add_argument("--resolution", type=int, default=320)
+    parser.add_argument("--resolution", type=int, default=640)
     parser.add_argument("--views", type=int, default=4)
-    parser.add_argument("--rounds", type=int, default=3, help="processes of each configuration")
+    parser.add_argument("--steps", type=int, default=12)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--keep", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.keep is not None:
         print(json.dumps(_measure(arguments)))
         return
-    results = {}
+    labels = ["lean", *EVERYTHING, "everything", *WITHOUT, *REPLACED]
     for text in arguments.scenes:
         name = text.partition("=")[0]
-        rounds: list[dict[str, dict[str, float]]] = [
-            {label: _in_a_process(text, added) for label, added in _configurations()} for _ in range(arguments.rounds)
-        ]
-        results[name] = {label: _summary(label, rounds) for label, _ in _configurations()}
-        _print(name, results[name])
-    write_result("left_out", {"style": arguments.style.name, "resolution": arguments.resolution, "scenes": results})
+        rounds = [{label: _in_a_process(text, label) for label in labels} for _ in range(arguments.rounds)]
+        rows = {label: _summary(label, rounds, arguments.views) for label in labels}
+        _print(name, rows)
+        job = {"style": arguments.style.name, "resolution": arguments.resolution, "views": arguments.views}
+        add_pair("left_out", name, job | {"steps": arguments.steps, "rounds": arguments.rounds}, rows)
 
 
 def with_components(
@@ -132,60 +131,63 @@ class _Whole(Divider):
         return super().divide(sizes)
 
 
-def _configurations() -> list[tuple[str, Sequence[str]]]:
-    parts = [("lean", ()), *((item, (item,)) for item in EVERYTHING), ("everything", EVERYTHING)]
-    return [*parts, *((label, (label,)) for label in (*WITHOUT, *REPLACED))]
-
-
-def _in_a_process(scene: str, added: Sequence[str]) -> dict[str, float]:
+def _in_a_process(scene: str, label: str) -> dict[str, Any]:
     options = [argument for argument in sys.argv[1:] if "=" not in argument or argument.startswith("--")]
-    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", ",".join(added)]
+    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", label]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    return dict[str, float](json.loads(done.stdout.splitlines()[-1]))
+    return dict[str, Any](json.loads(done.stdout.splitlines()[-1]))
 
 
-def _measure(arguments: argparse.Namespace) -> dict[str, float]:
-    """Return the seconds of a step and of a whole job, and the peak memory, with the components of `--keep`."""
+def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Run a job of the configuration of `--keep`; return the seconds of its parts, its memory peak and its loss."""
     ply, _, cameras = arguments.scenes[0].partition("=")[2].partition(":")
     scene = read_scene(Path(ply)).scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)
-    added = tuple(item for item in EVERYTHING if item in arguments.keep.split(","))
-    if arguments.keep in REPLACED:
-        setattr(*REPLACED[arguments.keep])
-    changed = WITHOUT.get(arguments.keep, {})
-    settings = make_settings("standard", **{"steps_sos": STEPS, "early_stop": False, **changed})
-    style, started = Style.of(load_image(arguments.style)), time.perf_counter()
+    label: str = arguments.keep
+    added = EVERYTHING if label == "everything" else tuple({label} & {*EVERYTHING})
+    if label in REPLACED:
+        setattr(*REPLACED[label])
+    changed = {"steps_sos": arguments.steps, "early_stop": False, **WITHOUT.get(label, {})}
+    style, settings = Style.of(load_image(arguments.style)), make_settings("standard", **changed)
+    times = [time.perf_counter()]
     stylizer = with_components(added, scene, views, style, settings)
-    while stylizer.step < STEPS:
+    times.append(time.perf_counter())
+    while stylizer.step < arguments.steps:
         stylizer.run_step()
+        times.append(time.perf_counter())
     stylizer.stylized()
-    figures = {"job_seconds": time.perf_counter() - started, "peak_bytes": peak_memory()}
-    later, weights = stylizer.history[len(stylizer.job.views.covered) :], stylizer.job.loss.weights
+    times.append(time.perf_counter())
+    peak, weights = peak_memory(), stylizer.job.loss.weights
     before, after = (
         mean_loss(stylizer.evaluate(stylizer.job.views.covered, colors), weights)
         for colors in (stylizer.job.views.scene.sh_dc, None)
     )
-    return {"step_seconds": mean(sum(record.parts.values()) for record in later), **figures, "loss": after / before}
+    return {"seconds": [end - start for start, end in pairwise(times)], "peak_bytes": peak, "loss": after / before}
 
 
-def _summary(label: str, rounds: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """Return median and range of each figure, and those of its difference from the lean configuration's."""
-    result = {}
-    for name in rounds[0][label]:
-        own = [each[label][name] for each in rounds]
-        more = [each[label][name] - each["lean"][name] for each in rounds]
-        result[name] = {"median": median(own), "least": min(own), "most": max(own)}
-        result[name] |= {"more": median(more), "more_least": min(more), "more_most": max(more)}
-    return result
+def _summary(label: str, rounds: Sequence[Mapping[str, Mapping[str, Any]]], views: int) -> dict[str, Any]:
+    """Return the figures of a configuration, and how much more seconds it takes than the lean one, relatively."""
+    own, lean = ([[*each[name]["seconds"]] for each in rounds] for name in (label, "lean"))
+    row = {"peak_bytes": min(each[label]["peak_bytes"] for each in rounds), "loss": rounds[0][label]["loss"]}
+    for name, part in (("step", slice(1 + views, -1)), ("job", slice(None))):
+        least, least_lean = (
+            [min(column) for column in zip(*(seconds[part] for seconds in each), strict=True)] for each in (own, lean)
+        )
+        more = [sum(a[part]) / sum(b[part]) - 1 for a, b in zip(own, lean, strict=True)]
+        seconds = mean(least) if name == "step" else sum(least)
+        row[name] = {"seconds": seconds, "more": sum(least) / sum(least_lean) - 1, "range": [min(more), max(more)]}
+    return row
 
 
-def _print(name: str, rows: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
+def _print(name: str, rows: Mapping[str, Mapping[str, Any]]) -> None:
     print(name)
     for label, row in rows.items():
-        texts = [f"{row[key]['median']:.3g} s ({row[key]['more']:+.2g})" for key in ("step_seconds", "job_seconds")]
-        texts.append(f"{row['peak_bytes']['median'] / 1e9:.2f} GB ({row['peak_bytes']['more'] / 1e9:+.2f})")
-        texts.append(f"loss {row['loss']['more']:+.1e}")
-        print(f"  {label:<22}" + "".join(f"{text:<22}" for text in texts), flush=True)
+        texts = []
+        for part in (row["step"], row["job"]):
+            least, most = part["range"]
+            texts.append(f"{part['seconds']:.3g} s ({part['more']:+.1%}, {least:+.1%} to {most:+.1%})")
+        texts += [f"{row['peak_bytes'] / 1e9:.2f} GB", f"loss {row['loss']:.5f}"]
+        print(f"  {label:<22}" + "".join(f"{text:<36}" for text in texts), flush=True)
 
 
 if __name__ == "__main__":
