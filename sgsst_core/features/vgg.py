@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -80,10 +81,18 @@ class _Convolution:
     weight: Tensor  # [out, in, 3, 3]
     bias: Tensor  # [out]
     backward_weight: Tensor  # [in, out, 3, 3], transposed and flipped
-    transformed: Tensor | None = None  # weight and backward weight of Winograd's algorithm
-    backward_transformed: Tensor | None = None
+    winograd: bool = False  # large enough images are convolved by Winograd's algorithm
     fused: bool = False  # cuDNN runs convolution, bias and ReLU in one launch
     tried: int = 0  # most pixels at which the fused convolution was compared with separate operations
+
+    # Transforming all weights takes about as long as a step, and a plan makes none.
+    @cached_property
+    def transformed(self) -> Tensor | None:
+        return transform_weight(self.weight) if self.winograd else None
+
+    @cached_property
+    def backward_transformed(self) -> Tensor | None:
+        return transform_weight(self.backward_weight) if self.winograd else None
 
 
 class _Pool:
@@ -251,10 +260,8 @@ class FeatureNetwork:
                     weight.contiguous(memory_format=torch.channels_last),
                     (bias / self.feature_unit).to(self.device, self.dtype),
                     backward_weight.contiguous(memory_format=torch.channels_last),
+                    self.winograd,
                 )
-                if self.winograd:
-                    step.transformed = transform_weight(weight)
-                    step.backward_transformed = transform_weight(backward_weight)
                 steps.append(step)
                 left.discard(f"relu{block}_{index}")
                 if not left:
@@ -372,13 +379,13 @@ class FeatureNetwork:
             if result is not None:
                 return result
             step.fused = False
-        if step.transformed is not None and winograd_pays_off(*x.shape[2:]):
+        if winograd_pays_off(*x.shape[2:]) and step.transformed is not None:
             return convolve_winograd(x, step.transformed, step.bias)
         return F.conv2d(x, step.weight, step.bias, padding=1).relu_()
 
     def _convolve_back(self, gradient: Tensor, step: _Convolution) -> Tensor:
         """Return the gradient [1, in, h, w] of a convolution's input, given the gradient of its output before ReLU."""
-        if step.backward_transformed is not None and winograd_pays_off(*gradient.shape[2:]):
+        if winograd_pays_off(*gradient.shape[2:]) and step.backward_transformed is not None:
             return convolve_winograd(gradient, step.backward_transformed)
         return F.conv2d(gradient, step.backward_weight, padding=1)
 
