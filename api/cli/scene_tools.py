@@ -355,23 +355,25 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 
 def quality_table(quality: Quality) -> Table:
     """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
-    figures = ("style", "interior_style", "sliced_features", "color_distance", "content", "features")
-    columns = (*figures, "background_sensitivity", "saturated", "short RMSE", "long RMSE", "remaining loss", "steps")
+    figures = ("style", "interior_style", "sliced_features", "color_distance", "content", "SSIM", "features")
+    ranges = [f"{reach}-range {measure}" for reach in ("short", "long") for measure in ("RMSE", "LPIPS")]
+    columns = (*figures, "background_sensitivity", "saturated", *ranges, "remaining loss", "steps")
     table = Table(
         Column("", no_wrap=True),
         *columns,
-        title="distances after the same time, lower is better; * = on the Pareto front of style and content",
+        title="distances after the same time, lower is better (SSIM: higher); * = Pareto front of style and content",
     )
     front = quality.front()
     for outcome in quality.outcomes:
         one = outcome.judgment
+        drifts = [getattr(pairs, name, None) for pairs in (outcome.short, outcome.long) for name in ("rmse", "lpips")]
         table.add_row(
             outcome.name + (" *" if outcome in front else ""),
             *(_number(value) for value in (one.style, one.interior_style, one.sliced_features)),
             f"{one.color_distance:.0f}",
-            *(_number(value) for value in (one.content, one.features, one.background_sensitivity)),
+            *(_number(value) for value in (one.content, one.ssim, one.features, one.background_sensitivity)),
             f"{one.saturated:.1%}",
-            *(_number(drift.rmse if drift else None) for drift in (outcome.short, outcome.long)),
+            *(_number(value) for value in drifts),
             _number(outcome.loss),
             str(outcome.steps or "-"),
         )

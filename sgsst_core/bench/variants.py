@@ -26,7 +26,7 @@ from sgsst_core.budget import default_memory_limit
 from sgsst_core.errors import SettingsError, WeightsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.plan import LOSS_VIEWS
-from sgsst_core.quality.judge import MIN_SIDE, Judge, Judgment, load_lpips_or_none
+from sgsst_core.quality.judge import MIN_SIDE, Judge, Judgment, VggLpips, load_lpips_or_none, load_vgg_lpips_or_none
 from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.quality.novel_views import Consistency, NovelViewMoment
 from sgsst_core.report.charts import (
@@ -340,7 +340,7 @@ class VariantResult:
     Attributes:
         name: Name of the variant, or `UNSTYLIZED`, or `TRANSFER`.
         sh_dc: Colors [N, 3].
-        short, long: Consistency of views 1 and 7 apart; None if there is no such pair.
+        short, long: Short- and long-range consistency, whose LPIPS is that of VGG16; None if there is no such pair.
         loss: Remaining loss, relative to the unstylized scene; None if it was not measured.
     """
 
@@ -396,6 +396,7 @@ class Quality:
         """Return the comparison as JSON-serializable values."""
         return {
             "views": [camera.name for camera in self.judge.cameras],
+            "lpips": VggLpips.network,
             "outcomes": [outcome.as_dict() for outcome in self.outcomes],
             "front": [outcome.name for outcome in self.front()],
             "error_time": as_dict(self.curves),
@@ -425,14 +426,13 @@ def compare_quality(
     if lpips is None:
         raise WeightsError("results are judged by AlexNet, which is not installed: run `sgsst weights fetch vgg16`.")
     stylizer = Stylizer.planned(scene, cameras, style, make_settings("standard", **settings), weights=weights)
-    novel_views = make_novel_views(stylizer)
+    novel_views = make_novel_views(stylizer, lpips=load_vgg_lpips_or_none())
     judge = make_judge(stylizer, novel_views, lpips)
     if not judge.cameras:
         raise SettingsError(
             "no view between the cameras can be judged: neighboring cameras are too far apart, or views are smaller "
             f"than {MIN_SIDE} pixels. Give more cameras, or larger views."
         )
-    novel_views.lpips = lpips
 
     def outcome(name: str, what: str, sh_dc: Tensor) -> VariantResult:
         moment: NovelViewMoment = novel_views.measure(sh_dc)

@@ -12,27 +12,34 @@ a Perceptual Metric", CVPR 2018, equation 1). Features of five layers are scaled
 
     d(x, y) = sum over layers l of the mean over positions of sum over channels c of w_lc (x_lc - y_lc)^2
 
-with learned weights w >= 0 (version 0.1 of the published weights, which papers report).
+with learned weights w >= 0 (version 0.1 of the published weights, which papers report). SSIM (Wang, Bovik, Sheikh,
+Simoncelli, "Image Quality Assessment: From Error Visibility to Structural Similarity", 2004) is reported beside it.
 """
 
 from __future__ import annotations
 
 import operator
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 from statistics import fmean
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
+from safetensors.torch import load_file
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
-from sgsst_core.features.network_weights import list_network_weights, load_perceptual
+from sgsst_core.features.network_weights import list_network_weights, load_network_weights, load_perceptual
+from sgsst_core.features.vgg import FeatureNetwork
+from sgsst_core.features.weight_files import PACKAGE_SOURCE
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.scene.camera import Camera, resized
-from sgsst_core.scene.colors import resize_area, style_size
+from sgsst_core.scene.colors import luminance, resize_area, style_size
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors, view_colors
 from sgsst_core.style import Moments, Style, color_moments, square_root, style_moments
@@ -42,7 +49,7 @@ from sgsst_core.stylizing.job import JobStyles
 #: bounds the cost of large views.
 JUDGED_SIDE = 1024
 #: Measures of each image.
-_MEASURES = ("style", "color_distance", "content", "features", "interior_style", "sliced_features")
+_MEASURES = ("style", "color_distance", "content", "ssim", "features", "interior_style", "sliced_features")
 #: Gray values of the backgrounds that each view is judged on: black and white.
 _BACKGROUNDS = (0.0, 1.0)
 #: Minimum coverage of judged views.
@@ -67,6 +74,7 @@ class Judgment:
         color_distance: Frechet distance of the RGB colors in 8-bit levels: sqrt(|m - m_style|^2 + tr(C + C_style - 2 (C
             C_style)^1/2)); 0 if mean and covariance equal the style's.
         content: LPIPS (AlexNet) against the unstylized scene; 0 for identical images.
+        ssim: SSIM of the luminance against the unstylized scene; 1 for identical images.
         features: 1 - cosine between AlexNet's features of the stylized and the unstylized scene, averaged over layers.
         background_sensitivity: Absolute difference in `style` between black and white background, averaged over views.
         saturated: Fraction of the Gaussians with a color channel outside [0, 1].
@@ -80,6 +88,7 @@ class Judgment:
     style: float
     color_distance: float
     content: float
+    ssim: float
     features: float
     background_sensitivity: float
     saturated: float
@@ -166,6 +175,7 @@ class Judge:
                         fraction * judge.color_distance(stylized, part) for judge, part, fraction in parts
                     ),
                     "content": _weighted_mean(distance, weights),
+                    "ssim": _weighted_mean(ssim(stylized, original).to(weights.device), weights),
                     "features": fmean(_change_of_direction(x, y, weights) for x, y in zip(own, theirs, strict=True)),
                     **_interior(own, parts),
                 }
@@ -349,8 +359,28 @@ def _weighted_mean(values: Tensor, weights: Tensor) -> float:
     return float((values.double() * weights.double()).sum() / weights.sum(dtype=torch.float64))
 
 
-#: Name of the network in reports.
-LPIPS_NETWORK = "alex"
+#: Standard deviation in pixels of SSIM's window, and radius in deviations: 11 x 11 pixels, as published.
+_SSIM_WINDOW = (1.5, 3.5)
+#: Constants of SSIM for values from 0 to 1, as published.
+_SSIM_CONSTANTS = (0.01**2, 0.03**2)
+
+
+def ssim(first: Tensor, second: Tensor) -> Tensor:
+    """Return the SSIM of the luminance of two images [H, W, 3] from 0 to 1 at every pixel, [H, W] float64 on the CPU.
+
+    Windows continue beyond the border by reflection.
+    """
+    x, y = (luminance(image.double()).cpu().numpy() for image in (first, second))
+    deviation, radius = _SSIM_WINDOW
+    mean_x, mean_y, xx, yy, xy = (
+        gaussian_filter(values, deviation, truncate=radius) for values in (x, y, x * x, y * y, x * y)
+    )
+    a, b = _SSIM_CONSTANTS
+    of_means = (2 * mean_x * mean_y + a) / (mean_x**2 + mean_y**2 + a)
+    of_deviations = (2 * (xy - mean_x * mean_y) + b) / ((xx - mean_x**2) + (yy - mean_y**2) + b)
+    return torch.from_numpy(of_means * of_deviations)
+
+
 #: (stride, padding) of AlexNet's convolutions (Krizhevsky 2014, the one-tower version of torchvision).
 _ALEX_CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
 #: Kernel sizes of these convolutions.
@@ -378,28 +408,28 @@ class PerceptualDistance:
     map: Tensor
 
 
-class Lpips:
-    """LPIPS with AlexNet, which the authors recommend as a metric.
+class PerceptualMetric(ABC):
+    """LPIPS with one of the networks that its authors calibrated.
 
     Args:
-        dtype: torch.float32, or torch.float64 for the reference.
-        folder: Folder of the weights; None for the cache folder.
+        heads: Weights [c] of the channels of each of the five layers.
 
-    Raises:
-        WeightsError: If the weights are missing or corrupt.
+    Attributes:
+        network: Name of the network in reports: "alex" or "vgg".
     """
 
-    def __init__(
-        self,
-        *,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str = "cpu",
-        folder: Path | None = None,
-    ) -> None:
-        self.dtype = dtype
-        self.device = torch.device(device)
-        self._tensors = {name: tensor.to(self.device, dtype) for name, tensor in load_perceptual(folder).items()}
-        self._heads = [self._tensors[f"linear{layer}.weight"] for layer in range(1, 6)]
+    network: ClassVar[str]
+
+    def __init__(self, heads: list[Tensor]) -> None:
+        self._heads = heads
+        self.dtype, self.device = heads[0].dtype, heads[0].device
+
+    @abstractmethod
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Return the features [h, w, c] of the five layers for an image [H, W, 3] with values 0 to 1.
+
+        The sides of the image must be at least `MIN_SIDE`.
+        """
 
     @torch.no_grad()
     def distance(self, first: Tensor, second: Tensor) -> PerceptualDistance:
@@ -416,11 +446,42 @@ class Lpips:
         return self.between(self.features(first), self.features(second), size)
 
     @torch.no_grad()
-    def features(self, image: Tensor) -> list[Tensor]:
-        """Return the features [h, w, c] of the five layers for an image [H, W, 3] with values 0 to 1.
+    def between(self, first: list[Tensor], second: list[Tensor], size: tuple[int, int]) -> PerceptualDistance:
+        """Compute the distance between two images of size (height, width) from their `features`."""
+        mean, spatial = 0.0, torch.zeros(size, dtype=self.dtype, device=self.device)
+        for x, y, head in zip(first, second, self._heads, strict=True):
+            distances = ((_unit_features(x) - _unit_features(y)).square_() @ head)[None, None]
+            mean += float(distances.mean(dtype=torch.float64))
+            spatial += F.interpolate(distances, size=size, mode="bilinear", align_corners=False)[0, 0]
+        return PerceptualDistance(mean, spatial)
 
-        The sides of the image must be at least `MIN_SIDE`.
-        """
+
+class Lpips(PerceptualMetric):
+    """LPIPS with AlexNet, which the authors recommend as a metric.
+
+    Args:
+        dtype: torch.float32, or torch.float64 for the reference.
+        folder: Folder of the weights; None for the cache folder.
+
+    Raises:
+        WeightsError: If the weights are missing or corrupt.
+    """
+
+    network = "alex"
+
+    def __init__(
+        self,
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+        folder: Path | None = None,
+    ) -> None:
+        self._tensors = {name: tensor.to(device, dtype) for name, tensor in load_perceptual(folder).items()}
+        super().__init__([self._tensors[f"linear{layer}.weight"] for layer in range(1, 6)])
+
+    @torch.no_grad()
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Return the features of the five layers; see `PerceptualMetric.features`."""
         tensors, outputs = self._tensors, []
         rgb = image.to(self.device, self.dtype)
         x = (rgb * tensors["input_scale"] + tensors["input_shift"]).permute(2, 0, 1).unsqueeze(0)
@@ -449,14 +510,35 @@ class Lpips:
             minima.append(-hidden[0, 0])
         return minima
 
-    def between(self, first: list[Tensor], second: list[Tensor], size: tuple[int, int]) -> PerceptualDistance:
-        """Compute the distance between two images of size (height, width) from their `features`."""
-        mean, spatial = 0.0, torch.zeros(size, dtype=self.dtype, device=self.device)
-        for x, y, head in zip(first, second, self._heads, strict=True):
-            distances = ((_unit_features(x) - _unit_features(y)).square_() @ head)[None, None]
-            mean += float(distances.mean(dtype=torch.float64))
-            spatial += F.interpolate(distances, size=size, mode="bilinear", align_corners=False)[0, 0]
-        return PerceptualDistance(mean, spatial)
+
+#: Layers of VGG16 that LPIPS compares, and the file of their weights.
+_VGG_LAYERS = ("relu1_2", "relu2_2", "relu3_3", "relu4_3", "relu5_3")
+_VGG_HEADS = Path(__file__).with_name("lpips") / "vgg.safetensors"
+
+
+class VggLpips(PerceptualMetric):
+    """LPIPS with VGG16; arguments and errors are those of `Lpips`.
+
+    Features are in other units than torchvision's, which makes no difference, since they are scaled to unit length.
+    """
+
+    network = "vgg"
+
+    def __init__(
+        self,
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+        folder: Path | None = None,
+    ) -> None:
+        heads = load_file(_VGG_HEADS)
+        super().__init__([heads[f"linear{layer}.weight"].to(device, dtype) for layer in range(1, 6)])
+        self._vgg = FeatureNetwork(load_network_weights("vgg16", folder), _VGG_LAYERS, dtype, device)
+
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Return the features of the five layers; see `PerceptualMetric.features`."""
+        features = self._vgg.forward(image.to(self.device), cache=False).features
+        return [features[layer] for layer in _VGG_LAYERS]
 
 
 def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> Lpips | None:
@@ -467,6 +549,18 @@ def load_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None =
     """
     installed = any(entry.name == "lpips_alex" and entry.path for entry in list_network_weights(folder))
     return Lpips(device=device, folder=folder) if installed else None
+
+
+def load_vgg_lpips_or_none(device: torch.device | str = "cpu", folder: Path | None = None) -> VggLpips | None:
+    """Load LPIPS with VGG16 in float32, or return None if VGG16 is missing or not the downloaded one.
+
+    The heads of LPIPS are not calibrated for another VGG16, such as Caffe's or a pruned one.
+
+    Raises:
+        WeightsError: If the weights are installed but corrupt.
+    """
+    entries = [entry for entry in list_network_weights(folder) if entry.name == "vgg16" and entry.path]
+    return VggLpips(device=device, folder=folder) if any(entry.source == PACKAGE_SOURCE for entry in entries) else None
 
 
 def _unit_features(features: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from sgsst_core.files.scene_file import losses, read_scene
 from sgsst_core.loss.sos import make_loss
 from sgsst_core.loss.terms import has_statistics, layers_of
 from sgsst_core.planning.survey import psnr
-from sgsst_core.quality.judge import LPIPS_NETWORK, Judge, Lpips, load_lpips_or_none
+from sgsst_core.quality.judge import Judge, Lpips, load_lpips_or_none
 from sgsst_core.quality.novel_views import NovelViews
 from sgsst_core.rasterizer import Rasterizer, make_rasterizer
 from sgsst_core.scene.camera import Camera, resized, spread
@@ -84,7 +84,7 @@ class Measurements:
         The judgment is added to the last entry as "judged".
         """
         stylizer, novel_views = self._stylizer, self._novel_views
-        if novel_views.lpips is None or stylizer.job.collectives.rank:
+        if not isinstance(novel_views.lpips, Lpips) or stylizer.job.collectives.rank:
             return
         judge = make_judge(stylizer, novel_views, novel_views.lpips)
         colors = {"before": stylizer.job.scene.sh_dc, "after": stylizer.stylized()}
@@ -97,7 +97,7 @@ class Measurements:
         colors = (stylizer.job.scene.sh_dc if start else stylizer.stylized()).to(novel_views.rasterizer.device)
         if start:
             own["novel_view_names"] = [novel_views.cameras[index].name for index in novel_views.views]
-            own["lpips"] = LPIPS_NETWORK if novel_views.lpips else None
+            own["lpips"] = novel_views.lpips.network if novel_views.lpips else None
             own["approximated"] = self.approximated
         approximation = asdict(self.exact.gradient_error(start=start)) if self.approximated else None
         step, seconds, moment = (0, 0.0, None) if start else (stylizer.step, stylizer.seconds, None)

@@ -2,8 +2,8 @@
 
 Consistency is how much the images of two cameras differ where both see the same surface. View j is warped into view i
 using rendered depth. The images are then compared over the pixels where both views see the same surface, by RMSE and by
-LPIPS averaged over these pixels. Short range compares adjacent views; long range compares views 7 apart (the two ranges
-of Huang et al., "Learning to Stylize Novel Views", ICCV 2021).
+LPIPS averaged over these pixels. Short-range consistency compares adjacent views, long-range consistency views 7 apart
+(Huang et al., "Learning to Stylize Novel Views", ICCV 2021).
 
 Even the views of an unstylized scene differ, for three reasons: colors depend on the view, interpolation smooths the
 warped view a little, and depth is a mean over translucent Gaussians. Compare the values before and after stylization.
@@ -25,7 +25,7 @@ from sgsst_core.budget import Cache, tensor_bytes
 from sgsst_core.loss.sos import SosLoss
 from sgsst_core.loss.terms import StyleTargets
 from sgsst_core.planning.survey import sees_something
-from sgsst_core.quality.judge import MIN_SIDE, Lpips, shown
+from sgsst_core.quality.judge import MIN_SIDE, PerceptualMetric, shown
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.base import CameraKey, camera_key
 from sgsst_core.regions import RegionMaps
@@ -102,7 +102,7 @@ class NovelViews:
         style_targets: Callable[[Camera], StyleTargets],
         *,
         weighted: bool,
-        lpips: Lpips | None = None,
+        lpips: PerceptualMetric | None = None,
         most: int = MAX_VIEWS,
         memory: int = 1 << 29,
         rasterizer_of: Callable[[Scene], Rasterizer] | None = None,
@@ -278,7 +278,7 @@ def consistency(
     pairs: Sequence[tuple[int, int]],
     image: Callable[[int], Tensor],
     warp: Callable[[int, int], Warp],
-    lpips: Lpips | None = None,
+    lpips: PerceptualMetric | None = None,
 ) -> Consistency:
     """Compute the consistency of pairs of views `gap` apart.
 
@@ -443,7 +443,7 @@ def _around(
 
 
 def compare(
-    first: int, second: int, image: Tensor, warped: Tensor, valid: Tensor, lpips: Lpips | None
+    first: int, second: int, image: Tensor, warped: Tensor, valid: Tensor, lpips: PerceptualMetric | None
 ) -> PairConsistency:
     """Compare a view's image [H, W, 3] with another view's warped image, where the mask `valid` [H, W] is true."""
     count = int(valid.sum())

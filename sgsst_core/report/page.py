@@ -220,6 +220,7 @@ _JUDGED: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "sliced_features": ("distance of feature distributions", number),
     "color_distance": ("distance to its colors, in 8-bit levels", number),
     "content": ("content loss (LPIPS)", number),
+    "ssim": ("SSIM against the unstylized scene", number),
     "features": ("feature distance (1 - cosine)", number),
     "background_sensitivity": ("background sensitivity: style on black against white", number),
     "saturated": ("colors outside the displayable range", percent),
@@ -232,7 +233,7 @@ def _judged_table(report: dict[str, Any]) -> Table | None:
     if not judged:
         return None
     before, after = judged["before"], judged["after"]
-    rows = [[title, text(before[name]), text(after[name])] for name, (title, text) in _JUDGED.items()]
+    rows = [[title, text(before.get(name)), text(after.get(name))] for name, (title, text) in _JUDGED.items()]
     return Table(["", "unstylized", "stylized"], rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
+from rich.console import Console
 from torch import Tensor
 
-from api.cli.scene_tools import error_time_table, point_line
+from api.cli.scene_tools import error_time_table, point_line, quality_table
 from sgsst_core.bench.variants import (
     TRANSFER,
     UNSTYLIZED,
@@ -31,7 +33,7 @@ from sgsst_core.bench.variants import (
 )
 from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
-from sgsst_core.quality.judge import Lpips
+from sgsst_core.quality.judge import Lpips, VggLpips
 from sgsst_core.quality.measure import Float32Reference, make_judge, make_novel_views
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.steps import Evaluation
@@ -145,11 +147,24 @@ def test_variants_are_compared_with_scene_and_color_transfer(quality: Quality) -
         assert outcome.steps > 0
         assert outcome.judgment.content > 0
         assert outcome.short is not None
+    Console(file=(table := io.StringIO()), width=180).print(quality_table(quality))
     values = json.loads(json.dumps(quality.as_dict()))
+    assert values["lpips"] == "vgg"
     assert values["outcomes"][2]["consistency"]["short"]["rmse"] > 0
+    assert f"{values['outcomes'][2]['consistency']['short']['lpips']:.3f}" in table.getvalue()
     assert values["views"]
     last = values["error_time"]["variants"]["standard"]["points"][-1]
     assert last["relative"] == variants[0].loss
+
+
+def test_consistency_is_measured_with_vgg(quality: Quality, tiny_weights: BackboneWeights) -> None:
+    settings = make_settings(coarsest_side=36)
+    stylizer = Stylizer.planned(wall(), cameras(3, 96, 72), style(), settings, weights=tiny_weights)
+    before, _, *variants = quality.outcomes
+    moments = {lpips.network: make_novel_views(stylizer, lpips=lpips) for lpips in (Lpips(), VggLpips())}
+    for outcome in (before, *variants):
+        short = {network: views.measure(outcome.sh_dc).short for network, views in moments.items()}
+        assert outcome.short == short["vgg"] != short["alex"]
 
 
 def test_pareto_front_contains_undominated_outcomes(quality: Quality) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,21 +12,26 @@ import torch
 import torch.nn.functional as F
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from safetensors.torch import load_file
 from skimage import data
+from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import WeightsError
-from sgsst_core.features.network_weights import load_perceptual
+from sgsst_core.features.network_weights import KAPPA, load_network_weights, load_perceptual
 from sgsst_core.quality.judge import (
     JUDGED_SIDE,
     MIN_SIDE,
     Judge,
     Judgment,
     Lpips,
+    VggLpips,
     frechet_distance,
     load_lpips_or_none,
+    load_vgg_lpips_or_none,
     saturated,
+    ssim,
 )
 from sgsst_core.rasterizer.cpu import CpuRasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
@@ -41,6 +47,8 @@ from tests.sgsst_core.synthetic_images import synthetic_image
 from tests.small_scenes import ball, blind_camera, cameras, style, wall
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+#: Folder of the weights of LPIPS that belong to the library.
+WEIGHTS = Path(__file__).parents[3] / "sgsst_core" / "quality" / "lpips"
 
 
 @pytest.fixture(scope="module")
@@ -59,13 +67,13 @@ def judged(judge: Judge, sh_dc: Tensor) -> Judgment:
     return judgment
 
 
-def plain(scene: Scene, sh_dc: Tensor, camera: Camera, style_image: Tensor) -> tuple[list[float], float, float, float]:
-    """Compute a view's style distances on black and on white, color, content and feature distance, in plain loops."""
+def plain(scene: Scene, sh_dc: Tensor, camera: Camera, style_image: Tensor) -> tuple[list[float], dict[str, float]]:
+    """Compute a view's style distances on black and on white, and its other measures, in plain loops."""
     lpips = Lpips(dtype=torch.float64)
     rasterizer = ReferenceRasterizer(scene)
     rest = reference_rest_colors(held(scene.sh_rest), scene.means, camera, scene.sh_degree).double()
     coverage = rasterizer.coverage(camera).double()
-    styles, palettes, contents, turns = [], [], [], []
+    styles, palettes, contents, similarities, turns = [], [], [], [], []
     for behind in (0.0, 1.0):
         shown = []
         for dc in (sh_dc, scene.sh_dc):
@@ -85,13 +93,22 @@ def plain(scene: Scene, sh_dc: Tensor, camera: Camera, style_image: Tensor) -> t
         styles.append(float(np.mean(distances)))
         turns.append(float(np.mean(angles)))
         contents.append(float((lpips.distance(*shown).map * coverage).sum() / coverage.sum()))
+        similarities.append(np.average(published_ssim(*shown), weights=coverage.numpy()))
         mass = coverage.reshape(-1).numpy()
         pixels, others = shown[0].reshape(-1, 3).numpy(), style_image.double().reshape(-1, 3).numpy()
         mean, other = np.average(pixels, axis=0, weights=mass), others.mean(axis=0)
         spread, other_spread = np.cov(pixels.T, aweights=mass, bias=True), np.cov(others.T, bias=True)
         shared = scipy.linalg.sqrtm(spread @ other_spread).real
         palettes.append(255 * np.sqrt(((mean - other) ** 2).sum() + np.trace(spread + other_spread - 2 * shared)))
-    return styles, float(np.mean(palettes)), float(np.mean(contents)), float(np.mean(turns))
+    measures = {"color_distance": palettes, "content": contents, "ssim": similarities, "features": turns}
+    return styles, {name: float(np.mean(values)) for name, values in measures.items()}
+
+
+def published_ssim(first: Tensor, second: Tensor) -> NDArray[np.float64]:
+    """Return the map of SSIM with the published window and constants by scikit-image."""
+    x, y = (image.double().numpy() @ [0.299, 0.587, 0.114] for image in (first, second))
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return structural_similarity(x, y, data_range=1.0, full=True, **options)[1]
 
 
 @pytest.mark.parametrize("scene", [wall(sh_degree=1), ball()], ids=["wall", "ball"])
@@ -99,18 +116,17 @@ def test_agrees_with_plain_formulas_in_float64(alex: Lpips, scene: Scene) -> Non
     view = cameras(1)[0]
     other = torch.randn(len(scene), 3, generator=torch.Generator().manual_seed(3))
     judgment = judged(judge_of(alex, scene, [view]), other)
-    styles, palette, content, features = plain(scene, other, view, style())
+    styles, others = plain(scene, other, view, style())
     assert judgment.style == pytest.approx(sum(styles) / 2, rel=1e-4)
     assert judgment.background_sensitivity == pytest.approx(abs(styles[0] - styles[1]), abs=1e-4)
-    assert judgment.color_distance == pytest.approx(palette, rel=1e-4)
-    assert judgment.content == pytest.approx(content, rel=1e-3)
-    assert judgment.features == pytest.approx(features, rel=1e-3)
+    assert {name: getattr(judgment, name) for name in others} == pytest.approx(others, rel=1e-3)
 
 
 def test_unstylized_scene_has_no_content_difference(alex: Lpips) -> None:
     scene = ball()
     judgment = judged(judge_of(alex, scene, cameras(2)), scene.sh_dc)
     assert judgment.content == 0
+    assert judgment.ssim == 1
     assert judgment.features == 0
     assert judgment.background_sensitivity > 0  # an object has a background
 
@@ -258,10 +274,18 @@ def test_frozen_gaussians_are_not_judged_by_a_style(alex: Lpips) -> None:
 Array = NDArray[np.float64]
 
 
-@pytest.fixture(scope="module")
-def exact(vgg16_weights: object) -> Lpips:
-    """Load LPIPS with AlexNet in float64."""
-    return Lpips(dtype=torch.float64)
+def test_ssim_agrees_with_scikit_image() -> None:
+    first, second = synthetic_image(37, 50, seed=1), synthetic_image(37, 50, seed=2)
+    values = ssim(first, second)
+    np.testing.assert_allclose(values.numpy(), published_ssim(first, second), rtol=1e-9)
+    assert float(values.mean()) < 0.9
+    assert bool((ssim(first, first) == 1).all())
+
+
+@pytest.fixture(scope="module", params=[Lpips, VggLpips], ids=["alex", "vgg"])
+def exact(request: pytest.FixtureRequest, vgg16_weights: object) -> Lpips | VggLpips:
+    """Load LPIPS in float64, with AlexNet and with VGG16."""
+    return request.param(dtype=torch.float64)
 
 
 def photo(name: str) -> Tensor:
@@ -276,8 +300,9 @@ def box_blurred(image: Tensor, side: int) -> Tensor:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_zero_for_equal_images_and_symmetric(vgg16_weights, dtype):
-    lpips = Lpips(dtype=dtype)
+@pytest.mark.parametrize("network", [Lpips, VggLpips])
+def test_zero_for_equal_images_and_symmetric(vgg16_weights, network, dtype):
+    lpips = network(dtype=dtype)
     first, second = synthetic_image(37, 50, seed=1), synthetic_image(37, 50, seed=2)
     same = lpips.distance(first, first)
     assert same.mean == 0.0
@@ -289,46 +314,48 @@ def test_zero_for_equal_images_and_symmetric(vgg16_weights, dtype):
     assert torch.equal(forth.map, back.map)
 
 
-def test_float32_agrees_with_float64(exact: Lpips):
+def test_float32_agrees_with_float64(exact: Lpips | VggLpips):
     first, second = synthetic_image(45, 61, seed=3), synthetic_image(45, 61, seed=4)
-    reference, result = exact.distance(first, second), Lpips().distance(first, second)
+    reference, result = exact.distance(first, second), type(exact)().distance(first, second)
     assert result.map.dtype == torch.float32
     assert result.mean == pytest.approx(reference.mean, rel=1e-5)
     torch.testing.assert_close(result.map.double(), reference.map, rtol=1e-4, atol=1e-6)
 
 
-#: Photo that 150 x 120 pixels are taken from, image it is compared with, and value of the published PyTorch package
-#: (`lpips` 0.1.4 with these weights, in float64).
+#: Photo that 150 x 120 pixels are taken from, image it is compared with, and values of the published PyTorch package
+#: (`lpips` 0.1.4 with these weights, in float64) for each network.
 PUBLISHED = [
-    ("astronaut", lambda image: image**0.7, 0.034148751276),
-    ("astronaut", lambda image: box_blurred(image, 5), 0.286169259936),
-    ("coffee", lambda image: image**0.7, 0.021160692171),
-    ("coffee", lambda image: box_blurred(image, 5), 0.166752439171),
+    ("astronaut", lambda image: image**0.7, {"alex": 0.034148751276, "vgg": 0.034614063853}),
+    ("astronaut", lambda image: box_blurred(image, 5), {"alex": 0.286169259936, "vgg": 0.231598830021}),
+    ("coffee", lambda image: image**0.7, {"alex": 0.021160692171, "vgg": 0.016917227824}),
+    ("coffee", lambda image: box_blurred(image, 5), {"alex": 0.166752439171, "vgg": 0.217724184752}),
 ]
 
 
 @pytest.mark.parametrize(("name", "changed", "expected"), PUBLISHED, ids=["curve", "blur"] * 2)
-def test_agrees_with_the_published_code(exact: Lpips, name, changed, expected):
-    image = photo(name)[100:220, 150:300]
+def test_agrees_with_the_published_code(exact: Lpips | VggLpips, name, changed, expected):
+    image, value = photo(name)[100:220, 150:300], expected[exact.network]
     result = exact.distance(image, changed(image))
-    assert result.mean == pytest.approx(expected, rel=1e-6)  # the published code rounds its input scaling to float32
-    assert float(result.map.mean()) == pytest.approx(expected, rel=2e-3)  # upsampling weighs the border differently
+    assert result.mean == pytest.approx(value, rel=1e-6)  # the published code rounds its input scaling to float32
+    assert float(result.map.mean()) == pytest.approx(value, rel=2e-3)  # upsampling weighs the border differently
 
 
-def test_agrees_with_a_direct_formulation_in_numpy(exact: Lpips):
+def test_agrees_with_a_direct_formulation_in_numpy(exact: Lpips | VggLpips):
     first, second = synthetic_image(47, 63, seed=5), synthetic_image(47, 63, seed=6)
-    expected_mean, expected_map = lpips_directly(first.numpy(), second.numpy())
+    expected_mean, expected_map = lpips_directly(exact.network, first.numpy(), second.numpy())
     result = exact.distance(first, second)
     assert result.mean == pytest.approx(expected_mean, rel=1e-6)
     np.testing.assert_allclose(result.map.numpy(), expected_map, rtol=1e-5, atol=1e-9)
 
 
-def lpips_directly(first: Array, second: Array) -> tuple[float, Array]:
-    """Compute LPIPS with AlexNet by equation 1 of the paper, with input from -1 to 1 as in the published code."""
-    tensors = {name: tensor.double().numpy() for name, tensor in load_perceptual().items()}
+def lpips_directly(network: str, first: Array, second: Array) -> tuple[float, Array]:
+    """Compute LPIPS by equation 1 of the paper, with input from -1 to 1 as in the published code."""
+    heads = load_perceptual() if network == "alex" else load_file(WEIGHTS / "vgg.safetensors")
+    tensors = {name: tensor.double().numpy() for name, tensor in heads.items()}
     total, spatial = 0.0, np.zeros(first.shape[:2])
-    pairs = zip(alexnet_directly(first, tensors), alexnet_directly(second, tensors), strict=True)
-    for layer, (x, y) in enumerate(pairs, start=1):
+    scaled = [(2 * rgb - 1 - [-0.030, -0.088, -0.188]) / [0.458, 0.448, 0.450] for rgb in (first, second)]
+    features = [alexnet_directly(x, tensors) if network == "alex" else vgg16_directly(x) for x in scaled]
+    for layer, (x, y) in enumerate(zip(*features, strict=True), start=1):
         x, y = (f / (np.sqrt((f * f).sum(axis=2, keepdims=True)) + 1e-10) for f in (x, y))
         distances = ((x - y) ** 2 * tensors[f"linear{layer}.weight"]).sum(axis=2)
         total += distances.mean()
@@ -336,18 +363,34 @@ def lpips_directly(first: Array, second: Array) -> tuple[float, Array]:
     return total, spatial
 
 
-def alexnet_directly(rgb: Array, tensors: dict[str, Array]) -> list[Array]:
-    x = (2 * rgb - 1 - np.array([-0.030, -0.088, -0.188])) / np.array([0.458, 0.448, 0.450])
+def alexnet_directly(x: Array, tensors: dict[str, Array]) -> list[Array]:
     outputs = []
-    for layer, (side, stride, padding) in enumerate([(11, 4, 2), (5, 1, 2), (3, 1, 1), (3, 1, 1), (3, 1, 1)], start=1):
+    for layer, (stride, padding) in enumerate([(4, 2), (1, 2), (1, 1), (1, 1), (1, 1)], start=1):
         if layer in (2, 3):
             x = sliding_window_view(x, (3, 3), axis=(0, 1))[::2, ::2].max(axis=(3, 4))
-        x = np.pad(x, ((padding, padding), (padding, padding), (0, 0)))
-        windows = sliding_window_view(x, (side, side), axis=(0, 1))[::stride, ::stride]
-        x = np.tensordot(windows, tensors[f"conv{layer}.weight"], axes=([2, 3, 4], [1, 2, 3]))
-        x = np.maximum(x + tensors[f"conv{layer}.bias"], 0)
+        x = convolved(x, tensors[f"conv{layer}.weight"], tensors[f"conv{layer}.bias"], stride, padding)
         outputs.append(x)
     return outputs
+
+
+def vgg16_directly(x: Array) -> list[Array]:
+    """Return the last layer of each block. The installed biases are in units of a 0-255 input."""
+    convolutions, outputs = load_network_weights("vgg16").convolutions, []
+    for block, count in enumerate((2, 2, 3, 3, 3), start=1):
+        if block > 1:
+            x = sliding_window_view(x, (2, 2), axis=(0, 1))[::2, ::2].max(axis=(3, 4))
+        for index in range(1, count + 1):
+            weight, bias = (each.double().numpy() for each in convolutions[f"conv{block}_{index}"])
+            x = convolved(x, weight, bias / KAPPA, 1, 1)
+        outputs.append(x)
+    return outputs
+
+
+def convolved(x: Array, weight: Array, bias: Array, stride: int, padding: int) -> Array:
+    """Apply a convolution [out, in, k, k] and its ReLU to x [h, w, in]."""
+    x = np.pad(x, ((padding, padding), (padding, padding), (0, 0)))
+    windows = sliding_window_view(x, weight.shape[2:], axis=(0, 1))[::stride, ::stride]
+    return np.maximum(np.tensordot(windows, weight, axes=([2, 3, 4], [1, 2, 3])) + bias, 0)
 
 
 def upsampled(values: Array, size: tuple[int, ...]) -> Array:
@@ -360,7 +403,7 @@ def upsampled(values: Array, size: tuple[int, ...]) -> Array:
     return matrix(values.shape[0], size[0]) @ values @ matrix(values.shape[1], size[1]).T
 
 
-def test_constant_images_are_finite(exact: Lpips):
+def test_constant_images_are_finite(exact: Lpips | VggLpips):
     black, white = torch.zeros(40, 40, 3), torch.ones(40, 40, 3)
     for first, second in ((black, white), (black, black), (white, 0.5 * white)):
         result = exact.distance(first, second)
@@ -368,7 +411,7 @@ def test_constant_images_are_finite(exact: Lpips):
         assert result.map.isfinite().all()
 
 
-def test_minimum_image_size_is_enforced(exact: Lpips):
+def test_minimum_image_size_is_enforced(exact: Lpips | VggLpips):
     side = MIN_SIDE
     first, second = synthetic_image(side, 64, seed=7), synthetic_image(side, 64, seed=8)
     assert exact.distance(first, second).mean > 0
@@ -376,11 +419,11 @@ def test_minimum_image_size_is_enforced(exact: Lpips):
         exact.distance(first[1:], second[1:])
 
 
-def test_wrong_arguments_are_named(exact: Lpips, tmp_path):
+def test_wrong_arguments_are_named(exact: Lpips | VggLpips, tmp_path):
     with pytest.raises(ValueError, match=r"two images \[H, W, 3\]"):
         exact.distance(torch.zeros(40, 40, 3), torch.zeros(40, 41, 3))
     with pytest.raises(WeightsError, match="sgsst weights fetch vgg16"):
-        Lpips(folder=tmp_path)
+        type(exact)(folder=tmp_path)
 
 
 def test_lpips_is_skipped_without_installed_weights(vgg16_weights, tmp_path):
@@ -389,3 +432,9 @@ def test_lpips_is_skipped_without_installed_weights(vgg16_weights, tmp_path):
     (tmp_path / "lpips_alex.safetensors").write_bytes(b"no weights")
     with pytest.raises(WeightsError, match="damaged"):
         load_lpips_or_none(folder=tmp_path)
+
+
+def test_vgg_lpips_needs_the_network_that_its_heads_were_calibrated_for(vgg16_weights, tiny_cache, tmp_path):
+    assert load_vgg_lpips_or_none() is not None
+    assert load_vgg_lpips_or_none(folder=tmp_path) is None
+    assert load_vgg_lpips_or_none(folder=tiny_cache) is None

@@ -131,5 +131,6 @@ def _moment(step: int, history: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _judged(style: float, content: float) -> dict[str, float]:
     judged = {"style": style, "color_distance": 40 * style, "content": content, "features": content / 2}
+    judged["ssim"] = 1 - content
     interior = {"interior_style": style / 2, "sliced_features": style / 4}
     return {**judged, **interior, "background_sensitivity": 0.25, "saturated": 0.02}
