@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from rich.table import Column, Table
@@ -18,18 +18,6 @@ from torch import Tensor
 
 from api.cli.options import local_path
 from api.static_files import FOLDER
-from sgsst_core.bench.variants import (
-    Curve,
-    Quality,
-    Variant,
-    as_dict,
-    choose_variants,
-    compare_quality,
-    error_time,
-    write_plot,
-    write_quality_plot,
-    write_sheet,
-)
 from sgsst_core.devices import seconds_left
 from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.features.network_weights import BackboneWeights, load_network_weights
@@ -53,6 +41,9 @@ from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import ViewOptions, split_weight
 from worker.outputs import check_is_not_input
 from worker.prepare import dry_run
+
+if TYPE_CHECKING:  # it imports matplotlib, for which the other commands need not wait
+    from sgsst_core.bench.variants import Curve, Quality, Variant
 
 T = TypeVar("T")
 
@@ -277,6 +268,8 @@ class _Inputs:
     @staticmethod
     def of(request: VariantsRequest) -> _Inputs:
         """Check and read the files of a request; the quick checks come first."""
+        from sgsst_core.bench.variants import choose_variants
+
         check_choice(request.source)
         variants = choose_variants(request.variants)
         weights = load_network_weights(request.backbone)
@@ -316,6 +309,8 @@ def run_error_time(request: VariantsRequest, progress: Any) -> list[Curve]:
     Raises:
         InvalidInputError: If an input cannot be used; the first one is reported.
     """
+    from sgsst_core.bench.variants import as_dict, error_time, write_plot
+
     inputs = _Inputs.of(request)
     described = inputs.as_dict(request)
     measured: dict[str, Curve] = {}
@@ -342,6 +337,8 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 
     Arguments and errors are those of `run_error_time`.
     """
+    from sgsst_core.bench.variants import compare_quality, write_plot, write_quality_plot, write_sheet
+
     inputs = _Inputs.of(request)
     quality = inputs.run(compare_quality, request, progress)
     write_json(request.out / "quality.json", {**inputs.as_dict(request), **quality.as_dict()})

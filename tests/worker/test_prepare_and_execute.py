@@ -76,7 +76,7 @@ def test_transparent_parts_of_photos_get_the_background_of_the_job(
 @pytest.mark.slow
 def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
     """Matplotlib scans all fonts when it is first imported on a machine."""
-    code = "import sys, worker.prepare, worker.execute; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, api.cli.scene_tools, worker.prepare, worker.execute; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
