@@ -16,7 +16,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 \
 
 SPELLED := api benchmarks deploy docs service sgsst_core tests worker *.md Makefile mkdocs.yml pyproject.toml
 
-.PHONY: demo test test-all test-slow test-ptx stability coverage lint lint-page docs clean
+.PHONY: demo test test-all test-slow stability coverage lint lint-page docs clean
 
 # Stylize the built-in scene and print where the results are.
 demo: $(VENV)/installed
@@ -37,10 +37,6 @@ endif
 test-slow: $(VENV)/installed-dev
 	$(BIN)/sgsst weights fetch vgg16
 	$(PYTEST) -m slow
-
-# Run the compiled GPU kernels in an interpreter of PTX, against their references. `test-slow` includes this.
-test-ptx: $(VENV)/installed-dev
-	$(BIN)/pytest tests/ptx
 
 # Measure the hard cases against their float64 references at full size, and store them in benchmarks/results.
 stability: $(VENV)/installed

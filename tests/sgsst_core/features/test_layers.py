@@ -13,6 +13,8 @@ from sgsst_core.bench.device_checks import texture
 from sgsst_core.features import layers as winograd
 from sgsst_core.features.layers import (
     convolve_pixels,
+    fused_max_pool,
+    fused_max_pool_backward,
     max_pool,
     max_pool_backward,
     max_pool_backward_reference,
@@ -230,6 +232,19 @@ SCALE, SHIFT = torch.tensor([1.0, 2.0, -3.0]), torch.tensor([-0.5, 0.4, 0.3])
 
 def random(*shape: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(len(shape))).bfloat16()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("size", [(12, 10), (13, 11), (1, 5)])
+def test_pooling_kernels_match_the_reference(size: tuple[int, int], dtype: torch.dtype) -> None:
+    source = relu_output(*size, dtype, levels=1).to(DEVICE)
+    pooled = fused_max_pool(source)
+    assert torch.equal(pooled, max_pool(source.cpu()).to(DEVICE))
+    assert pooled.is_contiguous(memory_format=torch.channels_last)
+    gradient = torch.randn(pooled.shape, generator=torch.Generator().manual_seed(4)).to(DEVICE, dtype)
+    actual = fused_max_pool_backward(gradient.contiguous(memory_format=torch.channels_last), source)
+    assert actual.is_contiguous(memory_format=torch.channels_last)
+    assert torch.equal(actual.cpu(), max_pool_backward(gradient.cpu(), source.cpu()))
 
 
 @pytest.mark.parametrize(("height", "width", "channels"), [(3, 131, 64), (5, 7, 8), (1, 1, 16)])

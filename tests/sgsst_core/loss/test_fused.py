@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mmap
+
 import pytest
 import torch
 from torch import Tensor
@@ -176,6 +178,26 @@ def test_products_of_16_bit_features_are_not_rounded(
     cpu_target = LayerTarget(target.gram.cpu(), target.mean.cpu(), target.std.cpu())
     expected = style_loss(exact, cpu_target)[1].apply(x.cpu().double(), None if a is None else a.cpu())
     assert relative_error(gradient.double(), expected) < torch.finfo(dtype).eps / 2
+
+
+def sparse(shape: tuple[int, ...], strides: tuple[int, ...]) -> Tensor:
+    """Return float32 zeros with large strides; only accessed pages take memory."""
+    count = sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True)) + 1
+    mapping = mmap.mmap(-1, 4 * count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | 0x4000)  # NORESERVE
+    return torch.frombuffer(mapping, dtype=torch.float32, count=count).as_strided(shape, strides)
+
+
+@pytest.mark.skipif(DEVICE == "cuda", reason="a GPU has no memory that is not accessed")
+def test_offsets_beyond_32_bits_are_correct() -> None:
+    """The last row starts after 2.5e9 values."""
+    values = features(6, 9, 16, seed=4, mean=2.0)
+    x, gradient = (sparse((6, 9, 16), (500_000_000, 16, 1)) for _ in range(2))
+    x.copy_(values)
+    target = target_of(16)
+    style = fused_style_loss(fused_statistics(values), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)[1]
+    assert torch.equal(fused_statistics(x).centered, fused_statistics(values).centered)
+    fused_add_style_gradient(gradient, x, style)
+    assert torch.equal(gradient, style.apply(values))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, *HALVES])
