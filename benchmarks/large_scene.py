@@ -34,7 +34,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.orbit import orbit
 from sgsst_core.rasterizer import Rasterizer
 from sgsst_core.rasterizer.cpu import CpuRasterizer
-from sgsst_core.rasterizer.projection import build_tile_intersections, intersections_of_subset
+from sgsst_core.rasterizer.projection import build_tile_intersections
 from sgsst_core.scene.camera import Camera, spread
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.spherical_harmonics import reference_rest_colors, rest_colors
@@ -100,16 +100,9 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     torch.set_num_threads(threads)
     isects = middle(lambda camera: build_tile_intersections(scene, camera), cameras)
     rasterizer = CpuRasterizer(scene, max_intersection_bytes=0)  # caches the last view only
-    places = torch.arange(len(scene), dtype=torch.int32)
-    places[::8] = -1  # about the fraction that views do not see
-    places[places >= 0] = torch.arange(int((places >= 0).sum()), dtype=torch.int32)
-    one = build_tile_intersections(scene.subset(torch.arange(1)), cameras[0])
-    intersections_of_subset(one, places[1:2].numpy())  # compiles
-    by_part: dict[str, list[float]] = {"handed": [], "render": [], "gradient": [], "plain": [], "survey": []}
+    by_part: dict[str, list[float]] = {"render": [], "gradient": [], "plain": [], "survey": []}
     colors = torch.rand(len(scene), 3, generator=torch.Generator().manual_seed(2))
     for camera in cameras:
-        whole = rasterizer.intersections(camera)
-        by_part["handed"].append(timed(lambda whole=whole: intersections_of_subset(whole, places.numpy())))  # type: ignore[misc]
         image = rasterizer.render(colors, camera)
         by_part["render"].append(timed(lambda camera=camera: rasterizer.render(colors, camera)))  # type: ignore[misc]
         gradient = timed(lambda image=image, camera=camera: rasterizer.color_gradient(image, camera))  # type: ignore[misc]
@@ -120,7 +113,6 @@ def measure_views(scene: Scene, cameras: list[Camera]) -> dict[str, float]:
     return {
         "lists_seconds": isects,
         "ratio_lists_one_thread_to_all": alone / isects,
-        "ratio_lists_to_handed": isects / seconds["handed_seconds"],
         **seconds,
         "ratio_plain_to_survey": seconds["plain_seconds"] / seconds["survey_seconds"],
         "ratio_plain_view_to_surveyed": (alone + seconds["plain_seconds"]) / (isects + seconds["survey_seconds"]),

@@ -6,9 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Hashable
-from functools import partial
-from typing import Any, Generic, Literal, TypeVar
-from weakref import WeakSet
+from typing import Generic, Literal, TypeVar
 
 import psutil
 import torch
@@ -103,49 +101,26 @@ class Cache(Generic[K, V]):
         capacity: Memory budget in bytes; None for no limit.
         size: Function that returns the size of a value in bytes; None if every call passes the size.
         holds_latest: Whether to store the latest value in addition, if it does not fit.
-        previous: Earlier cache. At the first use of a key, its value is moved from there instead of being computed.
-            Values that remain there count toward the budget.
-        adapt: Function applied to values from `previous`; must not make them larger.
-        host: Cache whose budget is shared, instead of `capacity`. The host has priority: it removes values from this
-            cache if it needs the space.
 
     Attributes:
         values: Cached values by key, oldest first.
+        used: Size in bytes of the values within the budget.
         costs: Size in bytes and seconds of each value that has been computed, by key. The seconds are those of the
             latest time, without the time for values of other caches.
     """
 
     def __init__(
-        self,
-        capacity: int | None,
-        size: Callable[[V], int] | None = None,
-        *,
-        holds_latest: bool = False,
-        previous: Cache[K, V] | None = None,
-        adapt: Callable[[V], V] = lambda value: value,
-        host: Cache[Any, Any] | None = None,
+        self, capacity: int | None, size: Callable[[V], int] | None = None, *, holds_latest: bool = False
     ) -> None:
         self.capacity = capacity
         self.values: dict[K, V] = {}
+        self.used = 0
         self.costs: dict[K, tuple[int, float]] = {}
         self._size = size
-        self._sizes: dict[K, int] = {}
-        self._own = 0
         self._holds_latest = holds_latest
         self._latest: tuple[K, V] | None = None
-        self._previous = previous
-        self._adapt = adapt
-        self._host = host
-        self._guests: WeakSet[Cache[Any, Any]] = WeakSet()
-        if host is not None:
-            host._guests.add(self)
         self._decided: set[K] = set()
         self._lock = threading.RLock()
-
-    @property
-    def used(self) -> int:
-        """Size in bytes of the values within the budget, including those in `previous`."""
-        return self._own + (self._previous.used if self._previous else 0)
 
     def get(self, key: K, make: Callable[[], V], size: int | None = None) -> V:
         """Return the value of a key, from the cache or computed, and cache it if it fits.
@@ -160,8 +135,7 @@ class Cache(Generic[K, V]):
             if self._latest is not None and self._latest[0] == key:
                 return self._latest[1]
             self._latest = None  # free its memory before the next one is computed
-            moved = self._previous.take(key) if self._previous else None
-            value, seconds = _timed(make if moved is None else partial(self._adapt, moved))
+            value, seconds = _timed(make)
             if size is None:
                 assert self._size is not None
                 size = self._size(value)
@@ -183,76 +157,44 @@ class Cache(Generic[K, V]):
                 (size, make), counting = _timed(count)
                 if self.has_space(size):
                     value, seconds = _timed(make)
-                    self._store(key, value, size)
                     self.costs[key] = size, counting + seconds
+                    self._store(key, value, size)
                 self._decided.add(key)
 
     def __contains__(self, key: K) -> bool:
         """Return whether the value of a key is cached, so it need not be computed."""
-        return key in self.values or (self._previous is not None and key in self._previous)
+        return key in self.values
 
     def has_space(self, size: int) -> bool:
         """Return whether a value of `size` bytes would still fit."""
-        budget = self._budget()
-        return budget is None or self.used + size <= budget
+        return self.capacity is None or self.used + size <= self.capacity
 
-    def take(self, key: K) -> V | None:
-        """Remove the value of a key and return it; None if it is not cached.
-
-        The latest value that is stored beyond the budget is dropped, even if it is that of another key.
-        """
+    def drop(self, key: K) -> None:
+        """Remove the value of a key, and the latest value that is stored beyond the budget."""
         with self._lock:
-            latest, self._latest = self._latest, None
-            if latest is not None and latest[0] == key:
-                return latest[1]
-            if key in self.values:
-                self._own -= self._sizes.pop(key)
-                return self.values.pop(key)
-            return self._previous.take(key) if self._previous else None
+            self._latest = None
+            if self.values.pop(key, None) is not None:
+                self.used -= self.costs[key][0]
 
     def clear(self) -> None:
-        """Remove all values, including those in `previous`."""
+        """Remove all values."""
         with self._lock:
-            self._previous = self._latest = None
-            for record in (self.values, self.costs, self._sizes, self._decided):
+            self._latest = None
+            for record in (self.values, self.costs, self._decided):
                 record.clear()
-            self._own = 0
+            self.used = 0
 
     def limit(self, capacity: int) -> None:
         """Set the memory budget, and remove the most recent values until the rest fits."""
         with self._lock:
             self.capacity = capacity
-            self._evict(capacity)
-            self._evict_guests()
+            while self.used > capacity:
+                key, _ = self.values.popitem()
+                self.used -= self.costs[key][0]
 
     def _store(self, key: K, value: V, size: int) -> None:
         self.values[key] = value
-        self._sizes[key] = size
-        self._own += size
-        self._evict_guests()
-
-    def _evict(self, capacity: int) -> None:
-        if self._previous is not None:
-            self._previous.limit(max(capacity - self._own, 0))
-        while self._own > capacity:
-            key, _ = self.values.popitem()
-            self._own -= self._sizes.pop(key)
-
-    def _budget(self) -> int | None:
-        """Return the current budget in bytes; None for no limit.
-
-        If there is a host, return the host's budget minus the values of the host and of other caches that share it.
-        """
-        if self._host is None or self._host.capacity is None:
-            return self.capacity
-        others = sum(guest.used for guest in self._host._guests if guest is not self)
-        return self._host.capacity - self._host.used - others
-
-    def _evict_guests(self) -> None:
-        """Remove values of caches that share this cache's budget until they fit in the rest of it."""
-        for guest in list(self._guests):
-            with guest._lock:
-                guest._evict(max(guest._budget() or 0, 0))
+        self.used += size
 
 
 #: Seconds that the present thread has spent on values inside of the one that it computes.

@@ -177,11 +177,9 @@ def approximations(stylizer: Stylizer) -> list[str]:
 
 
 def _rasterizer_beside(stylizer: Stylizer, scene: Scene) -> Rasterizer:
-    """Create a rasterizer of another scene with the job's settings.
-
-    It shares the job's memory budget for tile intersections, with lower priority.
-    """
-    return stylizer.job.views.rasterizer.uncached.beside(scene)
+    """Create a rasterizer of another scene with the job's settings, which caches the latest tile intersections only."""
+    own = stylizer.job.views.rasterizer.uncached
+    return own.for_scene(scene, **own.options(0))
 
 
 @dataclass(frozen=True)

@@ -181,20 +181,6 @@ class Rasterizer(ABC):
         """Return a rasterizer of another scene with the same options, apart from those given."""
         return type(self)(scene, **(self._options | options))
 
-    def for_subset(self, scene: Scene, rows: Tensor, memory: int) -> Self:
-        """Return a rasterizer of a subset of the Gaussians, which may take over data prepared for views.
-
-        Args:
-            scene: Scene of the subset, with unchanged geometry.
-            rows: [N] bool, mask of the subset.
-            memory: Memory budget of the new rasterizer in bytes, as in `make_rasterizer`.
-        """
-        return self.for_scene(scene, **self.options(memory))
-
-    def beside(self, scene: Scene) -> Self:
-        """Return a rasterizer of another scene that shares this one's memory budget, with lower priority."""
-        return self.for_scene(scene)
-
     # --- cached blend weights ---
 
     @property
@@ -250,13 +236,8 @@ class Sized(Protocol):
 L = TypeVar("L", bound=Sized)
 
 
-def cache_of_intersections(capacity: int, **options: Any) -> Cache[CameraKey, Any]:
-    """Return a cache of tile intersections, which also stores those of the latest view; `options` as in `Cache`."""
-    return Cache(capacity, lambda isects: isects.nbytes, holds_latest=True, **options)
-
-
 class TiledRasterizer(Rasterizer, Generic[L]):
-    """Rasterizer whose tile intersections are cached within a budget.
+    """Rasterizer whose tile intersections are cached within a budget, besides those of the latest view.
 
     Args:
         scene, background, near, device: As in `Rasterizer`.
@@ -268,18 +249,12 @@ class TiledRasterizer(Rasterizer, Generic[L]):
     def __init__(self, scene: Scene, *, max_intersection_bytes: int | None = None, **common: Any) -> None:
         super().__init__(scene, max_intersection_bytes=max_intersection_bytes, **common)
         budget = self.default_intersection_bytes if max_intersection_bytes is None else max_intersection_bytes
-        self._intersections: Cache[CameraKey, L] = cache_of_intersections(budget)
+        self._intersections: Cache[CameraKey, L] = Cache(budget, lambda isects: isects.nbytes, holds_latest=True)
 
     @classmethod
     def options(cls, memory: int) -> dict[str, Any]:
         """Return constructor options for a memory budget in bytes, which cached weights share."""
         return {"max_intersection_bytes": memory}
-
-    def beside(self, scene: Scene) -> Self:
-        """Return a rasterizer of another scene that shares the budget for tile intersections, with lower priority."""
-        other = self.for_scene(scene)
-        other._intersections = cache_of_intersections(0, host=self._intersections)
-        return other
 
     def intersections(self, camera: Camera) -> L:
         """Return the tile intersections of a view, cached or newly built.
@@ -291,7 +266,7 @@ class TiledRasterizer(Rasterizer, Generic[L]):
 
     def release_view(self, camera: Camera, budget: int) -> None:
         """Drop the view's tile intersections, and set the budget for those of all other views to `budget` bytes."""
-        self._intersections.take(camera_key(camera))
+        self._intersections.drop(camera_key(camera))
         self._intersections.limit(budget)
 
     @property

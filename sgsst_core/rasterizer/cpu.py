@@ -16,12 +16,11 @@ from torch import Tensor
 from sgsst_core.compiled import kernel_threads
 from sgsst_core.constants import ALPHA_MAX
 from sgsst_core.rasterizer import kernels
-from sgsst_core.rasterizer.base import TiledRasterizer, cache_of_intersections
+from sgsst_core.rasterizer.base import TiledRasterizer
 from sgsst_core.rasterizer.projection import (
     Shapes,
     TileIntersections,
     build_tile_intersections,
-    intersections_of_subset,
 )
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
@@ -40,22 +39,6 @@ class CpuRasterizer(TiledRasterizer[TileIntersections]):
     def __init__(self, scene: Scene, **options: Any) -> None:
         super().__init__(scene, **options)
         self._shapes: Shapes | None = None
-
-    def for_subset(self, scene: Scene, rows: Tensor, memory: int) -> CpuRasterizer:
-        """Return a rasterizer of a subset of the Gaussians, see `Rasterizer.for_subset`.
-
-        The new rasterizer takes over the cached tile intersections. Those of a view are restricted to the subset when
-        the view is first used.
-        """
-        if len(scene) != int(rows.sum()) or len(rows) != len(self.scene):
-            raise ValueError(f"{len(scene)} Gaussians are not the {int(rows.sum())} chosen ones of {len(self.scene)}")
-        subset = self.for_scene(scene, **self.options(memory))
-        indices = torch.where(rows, rows.cumsum(0, dtype=torch.int32) - 1, -1).to(torch.int32).numpy()
-        subset._intersections = cache_of_intersections(
-            memory, previous=self._intersections, adapt=lambda isects: intersections_of_subset(isects, indices)
-        )
-        self._shapes = None
-        return subset
 
     def _build(self, camera: Camera) -> TileIntersections:
         if self._shapes is None:

@@ -164,10 +164,7 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
         )
         visible = [np.arange(start, start + own) for start, own in zip(chunks[:-1], counts, strict=True)]
         order = depth_order(depths, np.concatenate(visible))
-        projection = Projection(np.empty(len(order), dtype=np.int32), np.empty((len(order), len(Column))))
-        take_elements(gaussians, order, projection.gaussians)
-        take_rows(values, order, projection.values)
-    return projection
+    return Projection(gaussians[order], values[order])
 
 
 @compiled()
@@ -314,14 +311,6 @@ def _project_chunks(
         counts[chunk] = position - chunks[chunk]
 
 
-@compiled(parallel=True)
-def take_rows(values, indices, out) -> None:
-    """Write values[indices] to `out` for values [N, C], on all cores."""
-    for i in numba.prange(indices.size):
-        for column in range(values.shape[1]):
-            out[i, column] = values[indices[i], column]
-
-
 #: Gaussians per bucket if depths are spread evenly.
 _BUCKET = 16
 _MAX_BUCKETS = 1 << 17
@@ -344,8 +333,7 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
         return np.empty(0, dtype=np.int32)
     with kernel_threads():
         threads = numba.get_num_threads()
-        bits = np.empty(count, dtype=np.int64)
-        take_elements(depths.view(np.int64), visible, bits)
+        bits = depths.view(np.int64)[visible]
         lowest, highest = int(bits.min()), int(bits.max())
         target = min(max(count // _BUCKET, 1), _MAX_BUCKETS)
         shift = max((highest - lowest).bit_length() - target.bit_length(), 0)
@@ -362,13 +350,6 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
         bounds = np.searchsorted(starts, chunks).astype(np.int64)
         _sort_buckets(starts, bounds, keys, order)
     return order
-
-
-@compiled(parallel=True)
-def take_elements(values, indices, out) -> None:
-    """Write values[indices] to `out` for values [N], on all cores."""
-    for i in numba.prange(indices.size):
-        out[i] = values[indices[i]]
 
 
 @compiled(parallel=True)
@@ -485,37 +466,7 @@ def build_tile_intersections(
     return TileIntersections(projection, starts, ranks, slots, first_slots)
 
 
-def intersections_of_subset(isects: TileIntersections, indices: NDArray[np.int32]) -> TileIntersections:
-    """Restrict tile intersections to a subset of the Gaussians.
-
-    The arrays are the same as those of `build_tile_intersections` for the subset.
-
-    Args:
-        indices: [N] int32, each Gaussian's index in the subset, in unchanged order; -1 if it is not in the subset.
-    """
-    projection = isects.projection
-    with kernel_threads():
-        gaussians = np.empty(len(projection.gaussians), dtype=np.int32)
-        take_elements(indices, projection.gaussians, gaussians)
-        remains = gaussians >= 0
-        # For each Gaussian in depth order: its new rank (-1 if removed), and by how much its slots move down.
-        ranks = np.where(remains, np.cumsum(remains, dtype=np.int32) - np.int32(1), np.int32(-1))
-        first_slots = run_starts(np.where(remains, np.diff(isects.first_slots), 0))
-        shifts = (isects.first_slots - first_slots)[:-1]
-        counts = np.empty(len(isects.starts) - 1, dtype=np.int64)
-        _count_remaining(isects.ranks, isects.starts, ranks, counts)
-        starts = run_starts(counts)
-        values = np.empty((int(remains.sum()), projection.values.shape[1]))
-        take_rows(projection.values, np.flatnonzero(remains), values)
-        subset_ranks, subset_slots = np.empty(starts[-1], dtype=np.int32), np.empty(starts[-1], dtype=np.int32)
-        _copy_remaining(isects.ranks, isects.slots, isects.starts, ranks, shifts, starts, subset_ranks, subset_slots)
-    subset = Projection(gaussians[remains], values)
-    return TileIntersections(
-        subset, starts, subset_ranks, subset_slots, np.append(first_slots[:-1][remains], first_slots[-1])
-    )
-
-
-def run_starts(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
+def run_starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the start offsets of consecutive runs with these lengths, and the end of the last one."""
     return np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts, dtype=np.int64)])
 
@@ -618,25 +569,3 @@ def _fill_tiles(values, width, height, chunks, threads, first_slots, positions, 
                     ranks[position], slots[position] = rank, slot
                     positions[chunk, tile] = position + 1
                     slot += 1
-
-
-@compiled(parallel=True)
-def _count_remaining(ranks, starts, new_ranks, counts):
-    """Count the remaining entries of each tile."""
-    for tile in numba.prange(starts.size - 1):
-        total = 0
-        for position in range(starts[tile], starts[tile + 1]):
-            total += new_ranks[ranks[position]] >= 0
-        counts[tile] = total
-
-
-@compiled(parallel=True)
-def _copy_remaining(ranks, slots, starts, new_ranks, shifts, new_starts, out_ranks, out_slots):
-    """Copy the remaining entries of each tile with their new ranks and slots."""
-    for tile in numba.prange(starts.size - 1):
-        target = new_starts[tile]
-        for position in range(starts[tile], starts[tile + 1]):
-            rank = ranks[position]
-            if new_ranks[rank] >= 0:
-                out_ranks[target], out_slots[target] = new_ranks[rank], slots[position] - shifts[rank]
-                target += 1

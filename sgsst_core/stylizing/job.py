@@ -515,15 +515,12 @@ def _make_rasterizer(
 ) -> Rasterizer:
     """Return the plan's rasterizer of the rendered Gaussians."""
     budget = memory_for("rasterizer", memory)
-    whole = planning_context.rasterizer if planning_context else None
-    if whole is None:
+    if planning_context and plan.seen.all():
+        uncached = planning_context.rasterizer
+    else:
         uncached = make_rasterizer(
             plan.uncached, rendered, background=settings.background, near=settings.near, memory=budget
         )
-    elif plan.seen.all():
-        uncached = whole
-    else:
-        uncached = whole.for_subset(rendered, plan.seen, budget)
     if plan.cached_weights == "none":
         return uncached
     return CachedRasterizer(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,7 +19,6 @@ from sgsst_core.rasterizer.projection import (
     TileIntersections,
     build_tile_intersections,
     depth_order,
-    intersections_of_subset,
     project,
 )
 from sgsst_core.rasterizer.reference import splat
@@ -207,47 +205,6 @@ def test_tile_intersections_equal_a_loop_over_gaussians(count: int, threads: Non
     check_slots(isects)
 
 
-def check_same(actual: TileIntersections, expected: TileIntersections) -> None:
-    """Check that all arrays are bit-identical."""
-    for name in ("starts", "ranks", "slots", "first_slots"):
-        own, other = getattr(actual, name), getattr(expected, name)
-        assert own.dtype == other.dtype
-        assert np.array_equal(own, other), name
-    assert np.array_equal(actual.projection.gaussians, expected.projection.gaussians)
-    assert np.array_equal(actual.projection.values, expected.projection.values)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.03, 0.6, 1.0])
-def test_tile_intersections_of_a_subset_equal_rebuilt_ones(share: float, threads: None) -> None:
-    scene, view = cloud(900, seed=33), camera(97, 61)
-    scene.scales[:10] += 4
-    chosen = torch.rand(900, generator=torch.Generator().manual_seed(1)) < share
-    places = torch.where(chosen, chosen.cumsum(0) - 1, -1).to(torch.int32).numpy()
-    subset = intersections_of_subset(build_tile_intersections(scene, view), places)
-    check_same(subset, build_tile_intersections(scene.subset(chosen), view))
-
-
-def test_subset_takes_over_tile_intersections_within_the_budget() -> None:
-    scene = cloud(600, seed=34)
-    views = [camera(97, 61, pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2, 0.3)]
-    chosen = torch.arange(600) % 4 > 0
-    sizes = [build_tile_intersections(scene, view).nbytes for view in views]
-    whole = CpuRasterizer(scene, max_intersection_bytes=sum(sizes[:3]))
-    for view in views:
-        whole.intersections(view)
-    budget = sum(sizes[:3])
-    part = whole.for_subset(scene.subset(chosen), chosen, budget)
-    assert [has_intersections(part, view) for view in views] == [True, True, True, False]
-    for done, view in enumerate(views):
-        check_same(part.intersections(view), build_tile_intersections(scene.subset(chosen), view))
-        assert part._intersections.used <= budget
-        assert not has_intersections(whole, view)
-        assert [has_intersections(whole, other) for other in views[done + 1 : 3]] == [True] * len(views[done + 1 : 3])
-    assert part.intersections(views[1]) is part.intersections(views[1])
-    with pytest.raises(ValueError, match="450 Gaussians are not the 600 chosen ones of 600"):
-        whole.for_subset(scene.subset(chosen), torch.ones(600, dtype=torch.bool), budget)
-
-
 def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
     scene = cloud(300, seed=35)
     views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
@@ -255,32 +212,3 @@ def test_tile_intersections_beyond_a_new_limit_are_evicted_last_first() -> None:
     sizes = [cpu.intersections(view).nbytes for view in views]
     cpu.release_view(views[0], sizes[1])
     assert [has_intersections(cpu, view) for view in views] == [False, True, False]
-
-
-def test_guests_use_the_rest_of_the_budget_for_tile_intersections() -> None:
-    scene = cloud(300, seed=36)
-    views = [camera(pose=rotated_pose(angle)) for angle in (0.0, 0.1, 0.2)]
-    sizes = [build_tile_intersections(scene, view).nbytes for view in views]
-    host = CpuRasterizer(scene, max_intersection_bytes=sum(sizes))
-    guests = [host.beside(scene) for _ in range(2)]
-
-    def cached_by_view() -> list[list[bool]]:
-        return [[has_intersections(one, view) for view in views] for one in (host, *guests)]
-
-    host.intersections(views[0])
-    guests[0].intersections(views[1])
-    guests[1].intersections(views[2])
-    guests[1].intersections(views[0])  # uses up all bytes
-    assert cached_by_view() == [[True, False, False], [False, True, False], [False, False, True]]
-    check_same(guests[1].intersections(views[0]), host.intersections(views[0]))
-    host.intersections(views[1])
-    host.intersections(views[2])
-    assert cached_by_view() == [[True] * 3, [False] * 3, [False] * 3]
-    host.release_view(views[0], sum(sizes))
-    guests[0].intersections(views[0])
-    assert cached_by_view()[1] == [True, False, False]
-    host.release_view(views[1], sizes[2])
-    assert cached_by_view()[:2] == [[False, False, True], [False] * 3]
-    del guests[1]
-    gc.collect()
-    assert len(host._intersections._guests) == 1
