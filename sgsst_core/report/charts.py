@@ -95,8 +95,6 @@ class History:
         terms: Loss terms by scale and name.
         relative: Loss by scale, relative to the unstylized scene.
         mean_relative: Mean over scales, relative to the unstylized scene; NaN for steps on a single scale.
-        memory: Memory of the process in bytes.
-        device_memory: Peak memory of the process's tensors on the GPU so far, in bytes.
         round_length: Number of steps in which every view occurs once.
     """
 
@@ -106,8 +104,6 @@ class History:
     terms: dict[int, dict[str, Floats]]
     relative: dict[int, Floats]
     mean_relative: Floats
-    memory: Floats
-    device_memory: Floats
     round_length: int
 
     def bin_width(self, against: Against) -> float:
@@ -148,8 +144,6 @@ def history_of(report: dict[str, Any]) -> History:
         terms={scale: {term: of_scale(scale, term) for term in terms} for scale in scales},
         relative=relative,
         mean_relative=np.where(several, column([record["relative"] for record in records]), math.nan),
-        memory=column([record.get("memory_bytes") for record in records]),
-        device_memory=column([record.get("device_memory_bytes") for record in records]),
         round_length=round_length(report),
     )
 
@@ -372,7 +366,7 @@ class PageFigure:
 
 
 def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
-    """Draw the charts that a report has values for; return an empty list if no step was made."""
+    """Draw the charts of a report; return an empty list if no step was made."""
     if not report["history"]:
         return []
     history = history_of(report)
@@ -382,16 +376,9 @@ def draw_figures(report: dict[str, Any]) -> list[PageFigure]:
     if undrawn:  # a logarithmic axis cannot show them
         caption += f" Not shown: {undrawn:,} of {len(losses):,} values, which are zero or not finite."
     draw: Callable[[Figure, Against], None] = partial(_draw_loss, history=history, moments=moments)
-    figures = [_figure("loss", "Loss, relative to the start", caption, draw)]
+    loss = _figure("loss", "Loss, relative to the start", caption, draw)
     caption, draw = "The loss of a scale is the sum of these terms.", partial(_draw_split, history=history)
-    figures.append(_figure("split", "Terms of the loss", caption, draw, rows=math.ceil(len(history.terms) / 2)))
-    if np.isfinite(history.memory).any():
-        predicted = (report.get("plan") or {}).get("prediction") or {}
-        draw = partial(_draw_memory, history=history, predicted=predicted)
-        caption = "Memory of the process"
-        caption += "; on the GPU, the peak so far." if np.isfinite(history.device_memory).any() else "."
-        figures.append(_figure("memory", "Memory", caption, draw))
-    return figures
+    return [loss, _figure("split", "Terms of the loss", caption, draw, rows=math.ceil(len(history.terms) / 2))]
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[Figure, Against], None], rows: int = 1) -> PageFigure:
@@ -427,27 +414,6 @@ def _draw_split(figure: Figure, against: Against, history: History) -> None:
     for axes in grid[count:]:
         axes.set_visible(False)
     draw_legend(figure, in_row=4)
-
-
-def _draw_memory(figure: Figure, against: Against, history: History, predicted: dict[str, Any]) -> None:
-    axes = figure.subplots()
-    on_device = bool(np.isfinite(history.device_memory).any())
-    shown = [(history.memory, predicted.get("peak_bytes"), "", color_of(0), INK)]
-    if on_device:
-        shown.append((history.device_memory, predicted.get("device_bytes"), " on the GPU", color_of(1), color_of(1)))
-    for memory, peak, where, color, dashed in shown:
-        # Memory is not averaged over a round: what matters is the maximum in each bin.
-        line = thinned(history.x[against], memory / 1e9, 1, history.bin_width(against))
-        marker = "o" if len(line.x) == 1 else None
-        axes.plot(line.x, line.high, color=color, marker=marker, label=f"measured{where}")
-        if peak is not None and math.isfinite(peak):
-            label = f"peak{where}, predicted by the plan"
-            axes.axhline(peak / 1e9, color=dashed, linestyle="--", linewidth=1, label=label)
-    axes.set_ylim(bottom=0)
-    axes.set_ylabel("memory in GB")
-    _mark_phases(axes, history, against)
-    set_log_x(axes, history.limits[against], against)
-    draw_legend(figure)
 
 
 # --- SVG that can share a page with other figures ------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -17,8 +17,6 @@ from sgsst_core.progress import NOTHING, byte_count, duration, number, percent
 from sgsst_core.report.charts import AGAINST, BINS, draw_figures, novel_view_moments, round_length
 from sgsst_core.report.images import ON_DARK, PAGE
 
-#: Maximum number of list members shown in the collapsed section, followed by their total number.
-_LIST = 40
 #: Fields of a report that have a section of their own on the page.
 _SECTIONS = ("history", "novel_views", "approximations", "loss_over_time", "findings", "plan", "seconds_by_part")
 _STOPPED = {
@@ -126,38 +124,14 @@ def _time_split(report: dict[str, Any]) -> list[tuple[str, float, float]]:
     return [(_PARTS.get(name, name), seconds, 100 * seconds / total) for name, seconds in ordered] if total else []
 
 
-def _everything(report: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return all fields without a section of their own, as (field, [(name, value)])."""
+def _everything(report: dict[str, Any]) -> str:
+    """Return all fields without a section of their own as JSON."""
     fields = {field: value for field, value in report.items() if field not in _SECTIONS}
     if report.get("novel_views"):
         fields["novel_views"] = {
             name: value for name, value in report["novel_views"].items() if name not in ("moments", "judged")
         }
-    return [(field, [(name or field, text) for name, text in _flat("", value)]) for field, value in fields.items()]
-
-
-def _flat(name: str, value: Any) -> Iterable[tuple[str, str]]:
-    """Yield the values of nested objects as (name, value), with dotted names such as `after.scales.0.gram`."""
-    if isinstance(value, dict) and value:
-        for key, inner in value.items():
-            yield from _flat(f"{name}.{key}" if name else str(key), inner)
-    else:
-        yield name, _text(name, value)
-
-
-def _text(name: str, value: Any) -> str:
-    if value is None or value == [] or value == {}:
-        return NOTHING
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int) and name.endswith("bytes"):
-        return f"{byte_count(value)} ({value:,} bytes)"
-    if isinstance(value, float):
-        return number(value, 6)
-    if isinstance(value, list):
-        shown = ", ".join(_text(name, member) for member in value[:_LIST])
-        return shown if len(value) <= _LIST else f"{shown} … ({len(value):,} in total)"
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return json.dumps(fields, indent=2, ensure_ascii=False)
 
 
 @dataclass(frozen=True)
