@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import partial
 from typing import Any
 
 import torch
@@ -29,19 +28,15 @@ class Timer:
     program queues the work. The device is not synchronized before `read`.
 
     Args:
-        device: Device whose time is measured.
-        event: Function that creates an event in the device's stream, as `torch.cuda.Event`; None for these events on a
-            GPU and the clock on a CPU.
+        device: Device whose time is measured: on a GPU by events of its stream, on a CPU by the clock.
 
     Attributes:
         seconds: Accumulated seconds by name; on a GPU, only for blocks that ended before the last call of `read`.
     """
 
-    def __init__(self, device: torch.device | str = "cpu", event: Callable[[], Any] | None = None) -> None:
+    def __init__(self, device: torch.device | str = "cpu") -> None:
         self.seconds: dict[str, float] = {}
-        if event is None and torch.device(device).type == "cuda":
-            event = partial(torch.cuda.Event, enable_timing=True)
-        self._event = event
+        self._device = torch.device(device)
         self._open: list[str] = []
         self._whole: str | None = None
         self._since: Any = None
@@ -73,7 +68,7 @@ class Timer:
 
     def lap(self) -> Timer:
         """Return a timer that has all measurements so far, to be read later, and continue with none."""
-        earlier = Timer(event=self._event)
+        earlier = Timer(self._device)
         earlier.seconds, earlier._marked = self.seconds, self._marked
         self.seconds, self._marked = {}, []
         return earlier
@@ -99,11 +94,11 @@ class Timer:
             self._marked.append((self._open[-1], start, self._since))
 
     def _start(self) -> None:
-        if self._event is None:
-            self._since_clock = time.perf_counter()
-        else:
-            self._since = self._event()
+        if self._device.type == "cuda":
+            self._since = torch.cuda.Event(enable_timing=True)
             self._since.record()
+        else:
+            self._since_clock = time.perf_counter()
 
     def _add(self, name: str, seconds: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds

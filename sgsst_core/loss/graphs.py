@@ -103,12 +103,11 @@ class LossGraphs:
         problem: Reason why capturing failed; None if it has not failed.
     """
 
-    def __init__(self, loss: SosLoss, most: int = MAX_GRAPHS) -> None:
+    def __init__(self, loss: SosLoss) -> None:
         if loss.collectives.size > 1:
             raise ValueError("a graph cannot contain communication between ranks")
         self.loss = loss
         self.problem: str | None = None
-        self._most = most
         #: Style targets by key. A key contains their `id`, which Python could reuse if they were not referenced here.
         self._visited: dict[_Key, StyleTargets] = {}
         self._graphs: dict[_Key, _Graph] = {}
@@ -136,7 +135,7 @@ class LossGraphs:
         """
         key = self._key(image, style, view, scales)
         graph = self._graphs.get(key) if key else None
-        if graph is None and key in self._visited and self.problem is None and len(self._graphs) < self._most:
+        if graph is None and key in self._visited and self.problem is None and len(self._graphs) < MAX_GRAPHS:
             assert key is not None
             try:
                 graph = self._graphs[key] = self._capture(key, image, style, view)
@@ -145,7 +144,7 @@ class LossGraphs:
                 self._graphs.clear()
                 self._static.clear()
         if graph is None:
-            if key and len(self._visited) < self._most:
+            if key and len(self._visited) < MAX_GRAPHS:
                 self._visited[key] = style
             return self.loss.evaluate(image, style, view, scales)
         with self.loss.timer("network"):
@@ -159,8 +158,6 @@ class LossGraphs:
         if division is None or division.tiles.keys() != set(scales):
             return None
         if any(len(own) != 1 for own in division.tiles.values()):
-            return None
-        if self.loss.content_weight and any(scale not in view.content for scale in scales):
             return None
         tiles = tuple((scale, division.tiles[scale][0]) for scale in scales)
         if not can_be_captured(self.loss.tiling, [tile.outer.pixels for _, tile in tiles]):
@@ -216,7 +213,7 @@ class LossGraphs:
             self._static_tensor(("content weights", k), level) for k, level in enumerate(view.content_weights)
         ]
         division = Division({}, {scale: [tile] for scale, tile in key.tiles})
-        static_view = ViewTarget(None, content, coverage, division, regions, content_weights)
+        static_view = ViewTarget(content, coverage, division, regions, content_weights)
         return self._static_tensor("image", image), static_view
 
     def _static_tensor(self, name: object, like: Tensor) -> Tensor:

@@ -210,7 +210,7 @@ class SosLoss:
             self._style_loss,
             self.content_weight,
             _styled_regions(style, view),
-            self._content(view, scaled.scale, tiles),
+            self._content(view, scaled.scale),
             view.coverage,
             view.content_weights,
             self.timer,
@@ -219,14 +219,12 @@ class SosLoss:
         statistics = StatisticsTerms(inputs, self._compared)
         return _ScalePass(scaled, tiles, statistics, [term for term in terms if term is not None])
 
-    def _content(self, view: ViewTarget, scale: int, tiles: Sequence[PartitionTile]) -> ContentFeatures | None:
+    def _content(self, view: ViewTarget, scale: int) -> ContentFeatures | None:
         if not self.content_weight:
             return None
-        if scale in view.content:
-            return view.content[scale]
-        if view.content_image is None:
+        if scale not in view.content:
             raise ValueError("the view was prepared without content, but content_weight is not 0")
-        return self.targets.content_features(self.targets.scaled(view.content_image, scale), tiles)
+        return view.content[scale]
 
     def _collect(self, passes: Sequence[_ScalePass], *, cache: bool) -> list[dict[PartitionTile, Activations]]:
         """Run the first pass of some scales, and set the values of their terms.
@@ -503,25 +501,23 @@ class TargetBuilder:
                 values[inside] = features[layer][in_tile.slices].cpu()[row, column]
         return vectors
 
-    def of_view(self, content: Tensor, coverage: Tensor | None = None, *, cache_content: bool = True) -> ViewTarget:
+    def of_view(self, content: Tensor, coverage: Tensor | None = None) -> ViewTarget:
         """Compute the targets of a view.
 
         Args:
             content: Content image [H, W, 3] in 0..1.
             coverage: [H, W] in 0..1; None for equal weights.
-            cache_content: Whether to compute and cache the content features now, instead of in every evaluation.
         """
         height, width = _size(content)
         weights = None if coverage is None else self.position_weights(coverage)
         scales = self._divider.tiling.scales((height, width))
         division = self._divider.divide({scale: (height >> scale, width >> scale) for scale in scales}, weights)
-        target = ViewTarget(content_image=content, coverage=weights, division=division)
-        if self._has_content and cache_content:
+        target, device = ViewTarget(coverage=weights, division=division), self.network.device
+        if self._has_content:
             target.content = {
-                scale: self.content_features(self.scaled(content, scale), tiles)
+                scale: self.content_features(ScaledView.of(downscale(content.to(device), scale), scale), tiles)
                 for scale, tiles in division.tiles.items()
             }
-            target.content_image = None
         return target
 
     def position_weights(self, coverage: Tensor) -> list[Tensor]:
@@ -531,10 +527,6 @@ class TargetBuilder:
         dtype = torch.promote_types(self.network.dtype, torch.float32)
         finest = coverage.to(self.network.device, dtype)
         return [downscale(finest, level) for level in range(levels)]
-
-    def scaled(self, content: Tensor, scale: int) -> ScaledView:
-        """Return a scale of a content image [H, W, 3]."""
-        return ScaledView.of(downscale(content.to(self.network.device), scale), scale)
 
     def content_features(self, content: ScaledView, tiles: Sequence[PartitionTile]) -> ContentFeatures:
         """Compute the content features of a scale of a content image, on the cells owned by some tiles."""

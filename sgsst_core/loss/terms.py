@@ -142,8 +142,7 @@ class ViewTarget:
     """Targets of a view, apart from the style.
 
     Attributes:
-        content_image: Content image [H, W, 3] from which uncached content features are computed; None if they are not
-            needed.
+        content: Content features of each scale; empty without a content term.
         coverage: Position weights [H >> k, W >> k] for each power of two 2^k; None for equal weights.
         division: Division of work for which the content was prepared; None to divide the work in every evaluation.
         regions: Position weights of each region (its fraction of the blend weights), in the format of `coverage` and
@@ -153,7 +152,6 @@ class ViewTarget:
         background: Color of the pixels that no rank renders, because no Gaussian covers them.
     """
 
-    content_image: Tensor | None = None
     content: dict[int, ContentFeatures] = field(default_factory=dict)
     coverage: list[Tensor] | None = None
     division: Division | None = None

@@ -59,25 +59,19 @@ def rest_colors(
     sh_rest: Tensor | StoredHarmonics,  # [N, K, 3], K = 0, 3, 8 or 15
     means: Tensor,  # [N, 3]
     camera: Camera,
-    *,
-    degree: int | None = None,
 ) -> Tensor:
     """Return the frozen part of a view's colors, the sum over l >= 1, [N, 3].
 
     The result has the dtype and device of `sh_rest`. The sum is computed in float64 and rounded once, except for
-    float32 on a GPU, which is summed in float32 (`kernel_rest_colors`). Bands above `degree` are skipped, for instance
-    because a plan found them to be zero; for degree 0, the result is zero.
+    float32 on a GPU, which is summed in float32 (`kernel_rest_colors`).
 
     Raises:
-        ValueError: If K does not match a degree of 0 to 3, or `degree` exceeds that of the coefficients.
+        ValueError: If K does not match a degree of 0 to 3.
         SceneError: If the coefficients are in a file that was changed after it was first read.
     """
-    stored = SH_DEGREES.get(int(sh_rest.shape[1]))
-    if stored is None:
+    degree = SH_DEGREES.get(int(sh_rest.shape[1]))
+    if degree is None:
         raise ValueError(f"sh_rest must have 0, 3, 8 or 15 coefficients per Gaussian, not {sh_rest.shape[1]}")
-    degree = stored if degree is None else degree
-    if not 0 <= degree <= stored:
-        raise ValueError(f"degree must be between 0 and {stored}, not {degree}")
     if degree == 0:
         return torch.zeros(sh_rest.shape[0], 3, dtype=sh_rest.dtype, device=sh_rest.device)
     if isinstance(sh_rest, StoredHarmonics):

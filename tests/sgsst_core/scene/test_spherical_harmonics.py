@@ -107,33 +107,15 @@ def test_basis_has_signs_and_order_of_3dgs_files() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_rest_colors_of_a_degree_use_only_its_coefficients(degree: int) -> None:
+def test_rest_colors_are_sums_over_the_basis(degree: int) -> None:
     scene, view = cloud(50, degree=3), camera(pose=rotated_pose())
     count = (degree + 1) ** 2 - 1
     alone = rest_colors(held(scene.sh_rest)[:, :count], scene.means, view)
-    assert torch.equal(rest_colors(scene.sh_rest, scene.means, view, degree=degree), alone)
     values = basis(view_directions(scene.means, view.center), degree)
     expected = (values[:, :, None] * held(scene.sh_rest)[:, :count].double()).sum(1)
     assert alone.dtype == torch.float32
     assert torch.allclose(alone.double(), expected, atol=1e-6)
     assert degree > 0 or not alone.any()
-
-
-def test_scene_far_from_origin_keeps_its_colors() -> None:
-    scene, view = cloud(50, degree=3), camera(pose=rotated_pose())
-    scene = replace(scene, means=(scene.means * 16).round() / 16)  # so that a translation by 1e6 is exact
-    offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
-    moved_pose = view.world_to_camera.clone()
-    moved_pose[:3, 3] -= moved_pose[:3, :3] @ offset
-    moved = rest_colors(scene.sh_rest, scene.means + offset.float(), replace(view, world_to_camera=moved_pose))
-    assert torch.allclose(moved, rest_colors(scene.sh_rest, scene.means, view), atol=1e-5)
-
-
-def test_directions_of_extreme_length_are_unit_or_zero() -> None:
-    means = torch.tensor([[0.0, 0, 0], [1e-38, 0, 0], [1e38, 1e38, 0], [0, 0, -2.0]])
-    directions = view_directions(means, torch.zeros(3, dtype=torch.float64))
-    assert directions[0].tolist() == [0, 0, 0]
-    assert torch.allclose(directions[1:].norm(dim=-1), torch.ones(3, dtype=torch.float64), atol=1e-12)
 
 
 def far_from_the_origin() -> tuple[Scene, Camera]:
@@ -192,10 +174,9 @@ def test_cpu_sums_are_float64_rounded_once(name: str, degree: int) -> None:
     count = (degree + 1) ** 2 - 1
     exact = reference_rest_colors(whole.double(), scene.means, view, degree)
     sizes = whole[:, :count].abs().double().sum(1)
-    for sh_rest in (whole, whole[:, :count]):
-        actual = rest_colors(sh_rest, scene.means, view, degree=degree)
-        assert actual.dtype == torch.float32
-        assert bool(((actual.double() - exact).abs() <= 2**-24 * exact.abs() + 1e-14 * sizes).all())
+    actual = rest_colors(whole[:, :count], scene.means, view)
+    assert actual.dtype == torch.float32
+    assert bool(((actual.double() - exact).abs() <= 2**-24 * exact.abs() + 1e-14 * sizes).all())
 
 
 @pytest.mark.gpu
@@ -206,7 +187,6 @@ def test_gpu_colors_come_from_the_kernel() -> None:
     colors_on_gpu = rest_colors(sh_rest, means, view)
     assert torch.equal(colors_on_gpu, kernel_rest_colors(sh_rest, means, view, 3))
     assert torch.allclose(colors_on_gpu.cpu(), rest_colors(scene.sh_rest, scene.means, view), atol=1e-5)
-    assert not rest_colors(sh_rest, means, view, degree=0).any()
 
 
 def test_colors_are_clamped_and_gradient_is_zero_below_the_clamp() -> None:
@@ -231,24 +211,9 @@ def test_clamp_aware_gradient_only_raises_clamped_colors() -> None:
     torch.testing.assert_close(result, SH_C0 * torch.tensor([[-1.0, 0.0, 2.0], [0.0, -3.0, -4.0]]))
 
 
-def test_clamp_aware_gradient_recovers_clamped_colors() -> None:
-    """Descent on |c - 0.6|^2 from far below 0 is stuck without the clamp-aware gradient, and converges with it."""
-    ends = []
-    for clamp_aware_gradient in (False, True):
-        sh_dc = torch.full((1, 3), -4.0)
-        for _ in range(400):
-            colors = view_colors(sh_dc, torch.zeros(1, 3))
-            sh_dc -= view_colors_gradient(2 * (colors - 0.6), colors, clamp_aware_gradient=clamp_aware_gradient)
-        ends.append(view_colors(sh_dc, torch.zeros(1, 3)))
-    assert bool((ends[0] == 0).all())
-    torch.testing.assert_close(ends[1], torch.full((1, 3), 0.6), rtol=1e-4, atol=0)
-
-
 def test_wrong_number_of_coefficients_is_refused() -> None:
     scene, view = cloud(5, degree=1), camera()
     with pytest.raises(ValueError, match="coefficients per Gaussian, not 4"):
         rest_colors(torch.zeros(5, 4, 3), scene.means, view)
-    with pytest.raises(ValueError, match="degree must be between 0 and 1, not 2"):
-        rest_colors(scene.sh_rest, scene.means, view, degree=2)
     with pytest.raises(ValueError, match="degree 4"):
         basis(torch.zeros(1, 3), 4)
