@@ -16,10 +16,8 @@ with covariance J V J^T, where J is the Jacobian of the perspective at its cente
   t sqrt(r) with t = sqrt(2 ln(opacity / ALPHA_MIN)). There is no other cutoff, so a renderer that evaluates alpha at
   every pixel gives the same image.
 
-The depth sort is a stable sort of positive float64 numbers on all cores. Positive floats have the same order as their
-bits interpreted as integers. A parallel counting sort by the upper bits distributes the Gaussians over many buckets;
-then each bucket is sorted separately. Gaussians of equal depth keep the order of the file, so the result is that of any
-stable sort, for any number of threads.
+The depth sort is PyTorch's stable sort, on all cores, of positive float64 numbers by their bits: these have the same
+order as integers. Gaussians of equal depth keep the order of the file.
 
 Tile intersections are the depth-sorted Gaussians of each raster tile. They are built once per camera, because geometry
 is frozen.
@@ -37,6 +35,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sgsst_core import container
@@ -164,7 +163,7 @@ def project(scene: Scene, camera: Camera, *, near: float = NEAR, shapes: Shapes 
         )
         visible = [np.arange(start, start + own) for start, own in zip(chunks[:-1], counts, strict=True)]
         order = depth_order(depths, np.concatenate(visible))
-    return Projection(gaussians[order], values[order])
+    return Projection(gaussians[order], torch.from_numpy(values).index_select(0, torch.from_numpy(order)).numpy())
 
 
 @compiled()
@@ -311,14 +310,7 @@ def _project_chunks(
         counts[chunk] = position - chunks[chunk]
 
 
-#: Gaussians per bucket if depths are spread evenly.
-_BUCKET = 16
-_MAX_BUCKETS = 1 << 17
-#: Buckets of up to this size are sorted by insertion, larger ones by merging.
-_INSERTED = 48
-
-
-def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> NDArray[np.int32]:
+def depth_order(depths: NDArray[np.float64], visible: NDArray[np.int64]) -> NDArray[np.int64]:
     """Sort the indices of visible Gaussians by depth; equal depths stay in index order.
 
     Args:
@@ -326,68 +318,11 @@ def depth_order(depths: NDArray[np.float64], visible: NDArray[np.integer]) -> ND
         visible: [V], ascending indices into `depths`.
 
     Returns:
-        `visible` sorted by depth, int32.
+        `visible` sorted by depth.
     """
-    count = len(visible)
-    if not count:
-        return np.empty(0, dtype=np.int32)
-    with kernel_threads():
-        threads = numba.get_num_threads()
-        bits = depths.view(np.int64)[visible]
-        lowest, highest = int(bits.min()), int(bits.max())
-        target = min(max(count // _BUCKET, 1), _MAX_BUCKETS)
-        shift = max((highest - lowest).bit_length() - target.bit_length(), 0)
-        buckets = ((highest - lowest) >> shift) + 1
-        chunks = np.linspace(0, count, threads + 1).astype(np.int64)
-        counts = np.zeros((threads, buckets), dtype=np.int64)
-        _count(bits, lowest, shift, chunks, counts)
-        starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(counts.sum(axis=0))])
-        # First position that each chunk writes to in each bucket: after all lower buckets, and after the entries of all
-        # preceding chunks in the same bucket.
-        offsets = starts[:-1] + np.cumsum(counts, axis=0) - counts
-        order, keys = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int64)
-        _scatter(bits, visible, lowest, shift, chunks, offsets, order, keys)
-        bounds = np.searchsorted(starts, chunks).astype(np.int64)
-        _sort_buckets(starts, bounds, keys, order)
+    bits = torch.from_numpy(depths.view(np.int64)[visible])
+    order: NDArray[np.int64] = visible[torch.sort(bits, stable=True).indices.numpy()]
     return order
-
-
-@compiled(parallel=True)
-def _count(bits, lowest, shift, chunks, counts):
-    """Count the Gaussians of each chunk that fall into each bucket."""
-    for chunk in numba.prange(chunks.size - 1):
-        for i in range(chunks[chunk], chunks[chunk + 1]):
-            counts[chunk, (bits[i] - lowest) >> shift] += 1
-
-
-@compiled(parallel=True)
-def _scatter(bits, visible, lowest, shift, chunks, positions, order, keys):
-    """Copy every chunk's Gaussians into their buckets, in input order."""
-    for chunk in numba.prange(chunks.size - 1):
-        for i in range(chunks[chunk], chunks[chunk + 1]):
-            bucket = (bits[i] - lowest) >> shift
-            position = positions[chunk, bucket]
-            order[position], keys[position] = visible[i], bits[i]
-            positions[chunk, bucket] = position + 1
-
-
-@compiled(parallel=True)
-def _sort_buckets(starts, bounds, keys, order):
-    """Sort each bucket by its keys, stably."""
-    for thread in numba.prange(bounds.size - 1):
-        for bucket in range(bounds[thread], bounds[thread + 1]):
-            start, end = starts[bucket], starts[bucket + 1]
-            if end - start > _INSERTED:
-                sorted_ = np.argsort(keys[start:end], kind="mergesort")
-                order[start:end] = order[start:end][sorted_]
-                continue
-            for i in range(start + 1, end):
-                key, gaussian = keys[i], order[i]
-                j = i
-                while j > start and keys[j - 1] > key:
-                    keys[j], order[j] = keys[j - 1], order[j - 1]
-                    j -= 1
-                keys[j], order[j] = key, gaussian
 
 
 #: Maximum number of pairs of Gaussian and raster tile, since their positions are 32-bit integers.
