@@ -59,17 +59,6 @@ def test_votes_are_blend_weights_in_white_mask_pixels():
         torch.testing.assert_close(float(total[index]), float(sum(own.sum() for own in shown)), rtol=1e-4, atol=1e-5)
 
 
-def test_mask_of_one_half_selects_half_of_the_wall():
-    scene, views = wall(), cameras(1)
-    mask = torch.zeros(views[0].height, views[0].width)
-    mask[:, views[0].width // 2 :] = 1
-    inside, total = count_votes(make_rasterizer("cpu", scene), views, [lambda: mask], len(scene))
-    decided = decide_by_votes(scene.means, inside, total)
-    x = scene.means[:, 0]
-    assert bool(decided[x > 0.2].all())  # those outside the view follow their neighbors
-    assert not bool(decided[x < -0.2].any())
-
-
 def test_undecided_and_unseen_gaussians_follow_their_neighbors():
     places = torch.arange(12.0)[:, None] * torch.tensor([1.0, 0, 0])
     total = torch.ones(12, dtype=torch.float64)
@@ -215,15 +204,6 @@ def test_maps_are_blended_weights(weights: tuple[float, ...]) -> None:
     background = black.coverage(view) == 0
     assert bool(background.any())
     assert bool((maps[background] == 0).all())
-
-
-def test_small_weights_are_not_lost_beside_large_ones() -> None:
-    scene, view = wall(), cameras()[0]
-    weights = torch.where(scene.means[:, 0] > 0.5, 1e12, 1.0)
-    maps = ContentMaps(weights, CpuRasterizer(scene, background=(0.2, 0.4, 0.6))).render(view)
-    left = maps[:, : view.width // 4, 0]
-    coverage = CpuRasterizer(scene).coverage(view)[:, : view.width // 4]
-    torch.testing.assert_close(left.double() * 1e12, coverage.double(), atol=1e-4, rtol=1e-4)
 
 
 # --- regions -------------------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ import signal
 import struct
 import subprocess
 import sys
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
 from sgsst_core.scene.gaussians import TENSORS
 from sgsst_core.scene.stored_harmonics import held
+from tests.pngs import png
 from tests.sgsst_core.files.formats.samples import files_of, streamed, unpacked
 from tests.small_scenes import ball, blind_camera, cameras, wall, write_files
 
@@ -428,17 +428,6 @@ def _with_one_photo(files: Files) -> None:
     Image.new("RGB", (64, 48)).save(files.ply.parent / "photos" / "view_1.png")
 
 
-def _with_a_bomb(files: Files) -> None:
-    """Write a PNG of a few hundred bytes whose header declares 90000 x 90000 pixels."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    header = struct.pack(">IIBBBBB", 90000, 90000, 8, 2, 0, 0, 0)
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
-    files.style.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
-
-
 @pytest.mark.parametrize(
     ("spoil", "options", "expected"),
     [
@@ -483,7 +472,7 @@ def _with_a_bomb(files: Files) -> None:
         ),
         (lambda files: files.style.write_text("not an image"), [], ["style.png", "not an image"]),
         (lambda files: files.style.unlink(), [], ["style.png", "No such file"]),
-        (_with_a_bomb, [], ["style.png", "megapixels"]),
+        (lambda files: files.style.write_bytes(png(90000, 90000)), [], ["style.png", "megapixels"]),
         (
             lambda files: Image.new("RGB", (5000, 1)).save(files.style),
             ["--style-scale", "4"],

@@ -8,7 +8,6 @@ import io
 import json
 import re
 import socket
-import struct
 import time
 import unicodedata
 import zlib
@@ -36,6 +35,7 @@ from sgsst_core.settings import Declared, declared
 from tests.api.conftest import KEYED, Services
 from tests.api.http.sending import MB, OFFSET_STREAM, TUS, form, refused, send
 from tests.api.service import Service, wait_for
+from tests.pngs import chunk, png
 from tests.small_scenes import ball, write_files
 
 
@@ -60,16 +60,6 @@ def jobs_of(client: httpx2.Client) -> list[str]:
 
 
 # --- inputs that cannot be used ------------------------------------------------------------------------------------
-
-
-def png(width: int, height: int, rows: bytes) -> bytes:
-    """Return a PNG whose header declares this size, with `rows` as its compressed pixel data."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 def moved(cameras: bytes) -> bytes:
@@ -189,9 +179,21 @@ def test_photos_and_masks_keep_the_names_of_cameras(client: httpx2.Client, files
         ("masks=m.bin", "m.bin", WHOLE, "invalid-request", "no file 'mask' has that folder"),
         ("sphere=0,0,0,1", "m.bin", WHOLE, "invalid-request", "'m.bin' belongs to no region"),
         ("masks=m", "m/view_0.png", b"no image", "invalid-image", "m/view_0.png: is not an image"),
-        ("masks=m", "m/view_0.png", png(2**31 - 1, 2**31 - 1, b""), "invalid-image", "m/view_0.png"),
-        ("masks=m", "m/nowhere.png", png(4, 3, zlib.compress(bytes(3 * 13))), "invalid-image", "none of 3 cameras"),
-        ("masks=m", "m/view_0.png", png(4, 9, zlib.compress(bytes(9 * 13))), "invalid-image", "another aspect ratio"),
+        ("masks=m", "m/view_0.png", png(2**31 - 1, 2**31 - 1), "invalid-image", "m/view_0.png"),
+        (
+            "masks=m",
+            "m/nowhere.png",
+            png(4, 3, chunk(b"IDAT", zlib.compress(bytes(3 * 13)))),
+            "invalid-image",
+            "none of 3 cameras",
+        ),
+        (
+            "masks=m",
+            "m/view_0.png",
+            png(4, 9, chunk(b"IDAT", zlib.compress(bytes(9 * 13)))),
+            "invalid-image",
+            "another aspect ratio",
+        ),
         ("mask=m.bin", "m.bin", WHOLE, "invalid-settings", "Every Gaussian is frozen (a)"),
     ],
 )

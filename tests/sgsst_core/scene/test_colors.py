@@ -59,11 +59,6 @@ def test_downscale_is_box_average_and_upscale_its_adjoint(scale):
     assert float((adjoint * image).sum()) == pytest.approx(0.5 * float((gradient * small).sum()), rel=1e-13)
 
 
-def test_downscaling_twice_equals_downscaling_once():
-    image = torch.rand((64, 48, 3), dtype=torch.float64)
-    torch.testing.assert_close(downscale(downscale(image, 1), 2), downscale(image, 3), rtol=1e-14, atol=0)
-
-
 def test_style_is_downscaled_but_never_upscaled():
     assert style_size((1520, 1920), (500, 700)) == (500, 632)
     assert style_size((540, 900), (500, 700)) == (540, 900)
@@ -173,8 +168,6 @@ def test_colors_are_free_where_the_settings_say_so() -> None:
 COEFFICIENT = st.floats(-1e6, 1e6, width=32)
 COLOR = st.tuples(COEFFICIENT, COEFFICIENT, COEFFICIENT)
 HIGHEST = 0.5 / SH_C0
-#: Rounding error of float32 coefficients below 2 in magnitude, twice.
-ROUNDING = 2.0**-22
 
 
 def colors_of(sh_dc: torch.Tensor) -> torch.Tensor:
@@ -217,15 +210,3 @@ def test_gray_shift_is_as_small_as_possible(rows: list[tuple[float, float, float
             assert float((after - before).abs().max()) <= outside + 1e-5
         else:  # as far beyond white as beyond black
             assert float(after.min() + after.max()) == pytest.approx(0, abs=1e-9 * float(before.abs().max()))
-
-
-def test_gray_shift_preserves_chroma_in_float32() -> None:
-    generator = torch.Generator().manual_seed(1)
-    original = torch.rand((1000, 3), generator=generator) * 2 - 1
-    moved = original + 6 * torch.randn((1000, 1), generator=generator)
-    result = with_chroma_of(on_screen_by_luminance(moved), original)
-    shown = colors_of(result)
-    assert float(shown.min()) >= 0
-    assert float(shown.max()) <= 1
-    change = (result - original).double()
-    assert float((change - change.mean(dim=1, keepdim=True)).abs().max()) < ROUNDING

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.errors import SettingsError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.regions import Region, RegionMaps, Regions
@@ -97,15 +96,6 @@ def test_frozen_gaussians_stay_bit_identical(
     assert bool(changed[stylizer.job.plan.optimized].all())
     assert bool(changed[~regions.frozen].all()) == (values.get("unseen") != "freeze")
     assert not bool((stylizer.job.plan.optimized & regions.frozen).any())
-
-
-def test_freezing_everything_in_view_is_refused(tiny_weights: BackboneWeights) -> None:
-    scene = wall(60, 40)
-    near = (scene.means[:, 0].abs() < 2.35) & (scene.means[:, 1].abs() < 1.8)
-    regions = Regions((Region("rest"), Region("middle", freeze=True)), near.to(torch.uint8))
-    assert bool((~near).any())
-    with pytest.raises(SettingsError, match="Every Gaussian that a view sees is frozen"):
-        make(tiny_weights, scene, regions)
 
 
 # --- styles of regions ---------------------------------------------------------------------------------------------

@@ -11,7 +11,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from sgsst_core.errors import CameraError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.progress import Progress
 from sgsst_core.scales import smoothed
@@ -260,13 +259,6 @@ def test_blind_views_are_skipped(tiny_weights: BackboneWeights, scene: Scene) ->
     run(stylizer)
     assert stylizer.job.views.covered == [1, 2]
     assert {record.view for record in stylizer.history} == {1, 2}
-
-
-def test_cameras_that_see_nothing_are_refused(tiny_weights: BackboneWeights, scene: Scene) -> None:
-    with pytest.raises(CameraError, match="None of the 1 cameras sees a Gaussian"):
-        Stylizer.planned(scene, [blind_camera()], style(), make_settings(), weights=tiny_weights)
-    with pytest.raises(CameraError, match="no cameras"):
-        Stylizer.planned(scene, [], style(), make_settings(), weights=tiny_weights)
 
 
 def test_given_photos_are_the_content(tiny_weights: BackboneWeights, scene: Scene) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -105,6 +106,19 @@ def gradient(
     return views.gradient(0, result.image_gradient, colors), result.loss, cached
 
 
+def assert_ranks_agree(
+    ranks: int, computed: Callable[..., tuple[Tensor, float, list[bool]]], *arguments: Any, bound: float = 1e-9
+) -> list[tuple[Tensor, float, list[bool]]]:
+    """Assert that all ranks compute the same gradient, and gradient and loss of one rank; return their results."""
+    expected, loss, _ = computed(ALONE, *arguments)
+    results = on_ranks(ranks, computed, *arguments)
+    for actual, actual_loss, _ in results:
+        assert relative_error(actual, expected) < bound
+        assert actual_loss == pytest.approx(loss, rel=bound)
+        assert torch.equal(actual, results[0][0])
+    return results
+
+
 @pytest.mark.parametrize(
     ("dtype", "ranks", "width", "height", "tile_size", "scene"),
     [
@@ -120,12 +134,7 @@ def test_gradient_matches_one_rank(
     dtype: torch.dtype, ranks: int, width: int, height: int, tile_size: int | None, scene: Scene
 ) -> None:
     camera = cameras(1, width, height)[0]
-    expected, loss, _ = gradient(ALONE, scene, camera, dtype, tile_size)
-    results = on_ranks(ranks, gradient, scene, camera, dtype, tile_size)
-    for actual, actual_loss, _ in results:
-        assert relative_error(actual, expected) < BOUNDS[dtype]
-        assert actual_loss == pytest.approx(loss, rel=BOUNDS[dtype])
-        assert torch.equal(actual, results[0][0])
+    assert_ranks_agree(ranks, gradient, scene, camera, dtype, tile_size, bound=BOUNDS[dtype])
 
 
 @pytest.mark.parametrize("style_loss", ["sos", "mixed"])
@@ -137,10 +146,7 @@ def test_gradient_with_regions_matches_one_rank(style_loss: StyleLossName) -> No
     labels = (scene.means[:, 1] > 0.8).to(torch.uint8) + 2 * (scene.means[:, 0] > 1).to(torch.uint8)
     regions = Regions(every, labels.clamp(max=2))
     arguments = scene, camera, torch.float64, 48, 1 << 34, style_loss, regions
-    expected, loss, _ = gradient(ALONE, *arguments)
-    for actual, actual_loss, _ in on_ranks(3, gradient, *arguments):
-        assert relative_error(actual, expected) < 1e-9
-        assert actual_loss == pytest.approx(loss, rel=1e-9)
+    assert_ranks_agree(3, gradient, *arguments)
 
 
 @pytest.mark.parametrize(
@@ -158,21 +164,14 @@ def test_gradient_of_some_scales_matches_one_rank(
 ) -> None:
     arguments = scene, cameras(1, 157, 131)[0], torch.float64, None, 1 << 34
     some = functools.partial(gradient, scales=scales, coarsest=coarsest, scale_weights=scale_weights)
-    expected, loss, _ = some(ALONE, *arguments)
-    for actual, actual_loss, _ in on_ranks(3, some, *arguments):
-        assert relative_error(actual, expected) < 1e-9
-        assert actual_loss == pytest.approx(loss, rel=1e-9)
+    assert_ranks_agree(3, some, *arguments)
 
 
 def test_partly_cached_activations_preserve_the_gradient() -> None:
     scene, camera = wall(), cameras(1, 128, 96)[0]
-    expected, loss, _ = gradient(ALONE, scene, camera, torch.float64, 48)
     memory = int(20_000 * FeatureNetwork(tiny_weights(), dtype=torch.float64).held_bytes_per_pixel())
-    results = on_ranks(2, gradient, scene, camera, torch.float64, 48, memory)
+    results = assert_ranks_agree(2, gradient, scene, camera, torch.float64, 48, memory)
     assert {flag for result in results for flag in result[2]} == {True, False}
-    for actual, actual_loss, _ in results:
-        assert relative_error(actual, expected) < 1e-9
-        assert actual_loss == pytest.approx(loss, rel=1e-9)
 
 
 @pytest.mark.parametrize("style_loss", ["nnfm", "mixed"])
@@ -180,10 +179,7 @@ def test_gradient_of_matched_features_matches_one_rank(style_loss: StyleLossName
     """One of the three ranks has almost no features to match."""
     scene, camera = ball(), cameras(1, 128, 96)[0]
     arguments = scene, camera, torch.float64, 48, 1 << 34, style_loss
-    expected, loss, _ = gradient(ALONE, *arguments)
-    for actual, actual_loss, _ in on_ranks(3, gradient, *arguments):
-        assert relative_error(actual, expected) < 1e-9
-        assert actual_loss == pytest.approx(loss, rel=1e-9)
+    assert_ranks_agree(3, gradient, *arguments)
 
 
 def stylize(

@@ -40,6 +40,7 @@ from tests.api.http.sending import (
 )
 from tests.api.service import Service
 from tests.icc_profiles import with_float_steps
+from tests.pngs import chunk, png
 
 
 def header(scene: bytes, old: str, new: str | bytes) -> bytes:
@@ -232,16 +233,6 @@ def test_compressed_scenes_are_detected_from_their_content(
     assert answer.status_code == 202, answer.text
     inputs = client.get(answer.headers["location"]).json()["inputs"]
     assert [entry["size"] for entry in inputs if entry["role"] == "scene"] == [len(packed[what])]
-
-
-def chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def png(width: int, height: int, *chunks: bytes) -> bytes:
-    """Return an RGB PNG whose header declares this size, with these chunks."""
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + head + b"".join(chunks) + chunk(b"IEND", b"")
 
 
 def zeros(size: int) -> bytes:

@@ -233,14 +233,6 @@ def test_unknown_flags_are_noted_and_levels_of_detail_refused(tmp_path: Path, fo
             assert "the flags 0x40 of the SPZ header are unknown and ignored" in read_scene(tmp_path / "scene").notes
 
 
-def test_both_versions_store_the_same_values(tmp_path: Path) -> None:
-    paths = [tmp_path / format.name for format in (SPZ, SPZ_3)]
-    for path, format in zip(paths, (SPZ, SPZ_3), strict=True):
-        write_scene(path, cloud(700, degree=3), format)
-    first, second = (read_scene(path).scene for path in paths)
-    assert_close(first, second, opacities=0, others=0)
-
-
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_files_without_their_gzip_layer_are_read(tmp_path: Path, version: int) -> None:
     raw = gzip.decompress(encoded(tmp_path, SPZ_3))
@@ -355,14 +347,6 @@ def test_wrong_checksum_or_damaged_data_is_refused(tmp_path: Path) -> None:
     data = encoded(tmp_path, SPZ_3)
     refused(tmp_path, data[:-5] + bytes([data[-5] ^ 1]) + data[-4:], "damaged: .*incorrect data check")
     refused(tmp_path, data[:200] + bytes(50) + data[250:], "the compressed data")
-
-
-def test_extensions_after_the_data_are_skipped(tmp_path: Path) -> None:
-    raw = bytearray(gzip.decompress(encoded(tmp_path, SPZ_3)))
-    raw[14] = 2
-    (tmp_path / "more").write_bytes(gzip.compress(bytes(raw) + bytes(1000)))
-    first, second = (read_scene(tmp_path / name).scene for name in ("good", "more"))
-    assert torch.equal(first.means, second.means)
 
 
 def test_false_streams_of_version_4_are_refused(tmp_path: Path) -> None:
