@@ -179,7 +179,7 @@ def test_photos_and_masks_keep_the_names_of_cameras(client: httpx2.Client, files
         ("masks=m.bin", "m.bin", WHOLE, "invalid-request", "no file 'mask' has that folder"),
         ("sphere=0,0,0,1", "m.bin", WHOLE, "invalid-request", "'m.bin' belongs to no region"),
         ("masks=m", "m/view_0.png", b"no image", "invalid-image", "m/view_0.png: is not an image"),
-        ("masks=m", "m/view_0.png", png(2**31 - 1, 2**31 - 1), "invalid-image", "m/view_0.png"),
+        ("masks=m", "m/view_0.png", png(2**31 - 1, 2**31 - 1, chunk(b"IDAT", b"")), "invalid-image", "m/view_0.png"),
         (
             "masks=m",
             "m/nowhere.png",
