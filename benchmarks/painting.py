@@ -91,7 +91,7 @@ def _measure(scene: Scene, views: list[Camera], change: Callable[[Scene, Tensor]
     target = image(wanted, painted).float()
     view = PaintedView(painted, target, torch.ones(target.shape[:2]))
     started = time.perf_counter()
-    result = paint(scene, [view], rasterizer, others=spread(views, 12))
+    result = paint(scene, [view], rasterizer, others=spread(views, 8))
     seconds = time.perf_counter() - started
     alone = PaintedColors(scene, [view], rasterizer)
     seen, solved = alone.weights > 0.05, alone.solve(original).colors

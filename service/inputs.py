@@ -24,13 +24,17 @@ from sgsst_core.settings import Option, checked
 from worker.job import JobSpec, SceneRequest
 from worker.options import (
     GROUPS,
+    MOST_PAINTED,
     MOST_REGIONS,
     MOST_STYLE_IMAGES,
     NO_CONTROLS,
+    PaintedFile,
+    PaintedOptions,
     RegionOptions,
     RegionRequest,
     StyleFile,
     StylizeOptions,
+    ViewOptions,
     region_requests,
 )
 
@@ -67,6 +71,11 @@ class JobParameters(StylizeOptions):
         description="Regions of the scene, each with its own style or frozen. Where regions overlap, the later one "
         "wins.",
     )
+    painted: Annotated[list[PaintedOptions] | None, Option(instead="--view NAME=FILE")] = Field(
+        None,
+        max_length=MOST_PAINTED,
+        description="Views of the painted files, in upload order. Without views, the files state them.",
+    )
 
     @property
     def region_requests(self) -> tuple[RegionRequest, ...]:
@@ -78,9 +87,28 @@ class JobParameters(StylizeOptions):
         return region_requests(self.regions or (), exists=lambda path: False)
 
     @property
-    def selects_by_images(self) -> bool:
-        """Whether a region is selected by masks of views, for which these views are rendered."""
-        return any(region.selection and region.selection.kind == "masks" for region in self.region_requests)
+    def renders_views(self) -> bool:
+        """Whether checking the files renders views: to select a region by their masks, or to find a painted one."""
+        masks = [region.selection and region.selection.kind == "masks" for region in self.region_requests]
+        return self.painted is not None or any(masks)
+
+    def check_painted(self, count: int) -> None:
+        """Check that the parameters are those of a job with `count` painted files.
+
+        Raises:
+            SettingsError: If one does not apply, or there are more views than files.
+        """
+        if (views := len(self.painted or ())) > count:
+            raise SettingsError(
+                f"painted has {views} views, but there are {count} painted files. Send a file for each."
+            )
+        given = {name for name in self.model_fields_set if getattr(self, name) is not None}
+        if count and (unused := sorted(given - _WITH_PAINTED)):
+            raise SettingsError(f"{unused[0]} does not apply to a job with painted files. Omit it.")
+
+
+#: Parameters that apply to jobs with painted files.
+_WITH_PAINTED = {"name", "painted", "background", "pad_sh", *ViewOptions.model_fields}
 
 
 def stored_parameters(values: Mapping[str, Any]) -> JobParameters:
@@ -103,7 +131,7 @@ RESULT = "stylized.ply"
 CHECKPOINT = ".checkpoint"
 #: Name of the plan of a dry run in an attempt's folder.
 PLAN = "plan.safetensors"
-ROLES = ("scene", "style", "cameras", "photos", "mask")
+ROLES = ("scene", "style", "cameras", "photos", "mask", "painted")
 #: Roles whose files keep their folders: cameras and regions refer to them by relative paths.
 _FOLDER_ROLES = ("photos", "mask")
 #: Maximum number of style images: those that belong to no region, plus one for each region.
@@ -129,6 +157,7 @@ class Staged(BaseModel):
     styles: tuple[Path, ...]
     cameras: Path | None
     photos: Path | None
+    painted: tuple[Path, ...] = ()
 
 
 def staged_name(role: str, name: str, number: int = 0) -> str:
@@ -170,7 +199,8 @@ def default_job_name(inputs: Sequence[Mapping[str, Any]], regions: Sequence[Regi
     """Return the name of a job whose request has none: "scene · painting", without the paintings of regions."""
     scene = next(entry["name"] for entry in inputs if entry["role"] == "scene")
     taken = region_styles(regions)
-    names = [entry["name"] for entry in inputs if entry["role"] == "style" and entry["name"] not in taken]
+    shown = ("style", "painted")
+    names = [entry["name"] for entry in inputs if entry["role"] in shown and entry["name"] not in taken]
     styles = [PurePosixPath(name).stem for name in names]
     format = format_of_name(scene)
     plain = scene[: -len(format.suffix)] if format else PurePosixPath(scene).stem
@@ -206,12 +236,15 @@ def check_roles(
         INVALID_INPUT: If a file is missing, superfluous or inconsistent with the parameters.
     """
     by_role = {role: [entry for entry in inputs if entry["role"] == role] for role in ROLES}
-    for role, most in (("scene", 1), ("style", MOST_STYLES)):
+    painted = bool(by_role["painted"])
+    for role, most in (("scene", 1), ("painted", MOST_PAINTED) if painted else ("style", MOST_STYLES)):
         if not 1 <= len(by_role[role]) <= most:
             what = "is missing" if not by_role[role] else f"was sent {len(by_role[role])} times"
             times = "once" if most == 1 else f"once, or up to {most} of them"
             raise problems.INVALID_REQUEST(f"The file {role!r} {what}. Send it {times}.", input=role)
-    own = _check_region_styles([entry["name"] for entry in by_role["style"]], region_styles(regions))
+    if painted and (other := next((role for role in ("style", "photos", "mask") if by_role[role]), None)):
+        raise problems.INVALID_REQUEST(f"A job with painted files has no file {other!r}. Omit it.", input=other)
+    own = 0 if painted else _check_region_styles([entry["name"] for entry in by_role["style"]], region_styles(regions))
     _check_region_masks([entry["name"] for entry in by_role["mask"]], regions)
     if weights is not None and len(weights) != own:
         raise problems.INVALID_REQUEST(
@@ -312,7 +345,8 @@ def layout(inputs: Sequence[Mapping[str, Any]]) -> tuple[Staged, list[tuple[Path
     by_role = {role: [path for path, _ in files if path.parts[0] == role] for role in ROLES}
     (scene,), photos = by_role["scene"], Path("photos") if by_role["photos"] else None
     cameras = _camera_path(by_role["cameras"])
-    return Staged(scene=scene, styles=tuple(by_role["style"]), cameras=cameras, photos=photos), files
+    styles, painted = tuple(by_role["style"]), tuple(by_role["painted"])
+    return Staged(scene=scene, styles=styles, cameras=cameras, photos=photos, painted=painted), files
 
 
 def stage(folder: Path, inputs: Sequence[Mapping[str, Any]], blobs: Mapping[str, Path]) -> Staged:
@@ -357,6 +391,7 @@ def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
     taken = region_styles(parameters.region_requests)
     own = [path for path in staged.styles if path.name not in taken]
     weights = parameters.style_weights or [1.0] * len(own)
+    views = [*(parameters.painted or ()), *[PaintedOptions()] * len(staged.painted)]
     return JobSpec(
         source=SceneRequest.of(staged.scene, staged.cameras, parameters),
         styles=tuple(StyleFile(path, weight) for path, weight in zip(own, weights, strict=True)),
@@ -368,6 +403,7 @@ def job_spec(staged: Staged, parameters: JobParameters) -> JobSpec:
         colors=True,
         style_background=parameters.style_background,
         pad_sh=parameters.pad_sh,
+        paintings=tuple(map(PaintedFile, staged.painted, views)),
     )
 
 

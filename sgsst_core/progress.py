@@ -49,7 +49,7 @@ class Progress(BaseModel):
     stage: str = Field(
         description="`reading`, `planning` (surveying the views), `refining` (choosing Gaussians to split), "
         "`starting`, `coarse` (coarsest scale), `sos` (all scales), `measuring` "
-        "(checking the quality of some views) or `video` (frames of the video)."
+        "(checking the quality of some views), `painting` (following painted views) or `video` (frames of the video)."
     )
     step: int = Field(0, description="Completed steps; views while `planning` or `refining`; frames while `video`.")
     total: int = Field(0, description="Maximum number of steps or views; 0 while unknown.")

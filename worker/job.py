@@ -15,7 +15,7 @@ from sgsst_core.errors import CameraError, SettingsError
 from sgsst_core.files.camera_folder import cameras_beside
 from sgsst_core.files.formats import format_of_name
 from sgsst_core.settings import Color, Settings
-from worker.options import Backbone, RegionRequest, StyleFile, ViewOptions
+from worker.options import Backbone, PaintedFile, RegionRequest, StyleFile, ViewOptions
 
 #: Reasons of an early end after which a job can be continued: it keeps its checkpoint.
 CONTINUABLE = ("within", "on-request")
@@ -46,10 +46,10 @@ class SceneRequest(ViewOptions):
 
 
 class JobSpec(BaseModel):
-    """Specification of one stylization job.
+    """Specification of one job, which stylizes a scene or lets it follow painted views.
 
     Attributes:
-        styles: Style images and their weights.
+        styles: Style images and their weights; empty with `paintings`.
         images: Folder of photos for the content term; None for unstylized renders.
         out: PLY to write, or compressed file to write beside a PLY; see `Outputs.of`.
         resume: Whether to resume from the checkpoint beside `out`.
@@ -57,6 +57,8 @@ class JobSpec(BaseModel):
         colors: Whether to also write a file of the stylized colors alone, if nothing else of the scene changes.
         style_background: sRGB color behind transparent parts of style images, in 0..1.
         pad_sh: Whether the PLY has spherical harmonics of degree 3 in any case; see `write_stylized`.
+        paintings: Painted views, which the scene follows. Then nothing is stylized, and of `settings` only the
+            background counts.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -72,6 +74,7 @@ class JobSpec(BaseModel):
     colors: bool = False
     style_background: Color = (1.0, 1.0, 1.0)
     pad_sh: bool = False
+    paintings: tuple[PaintedFile, ...] = ()
 
 
 class Result(BaseModel):
@@ -83,6 +86,7 @@ class Result(BaseModel):
         steps, total: Number of completed steps, and number of all steps.
         loss_before: Mean loss of the unstylized scene on the evaluation views; None if the job was interrupted.
         loss_after: Mean loss of the last round of views, over the same scales; None if the job was interrupted.
+        psnr_before, psnr_after: Peak signal-to-noise ratio in dB on the painted pixels; None without painted views.
         report_error: Reason why the report, contact sheet or loss curves are missing; None if they were written.
         compressed: Text about the quality of the compressed file; None if no compressed file was requested.
         loss_views: Number of evaluation views, which are spread over all.
@@ -96,6 +100,8 @@ class Result(BaseModel):
     total: int
     loss_before: float | None = None
     loss_after: float | None = None
+    psnr_before: float | None = None
+    psnr_after: float | None = None
     report_error: str | None = None
     compressed: str | None = Field(None, exclude=True)
     loss_views: int = Field(0, exclude=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,6 +22,7 @@ from sgsst_core.scene.rendering import MAX_EPS2D, RenderMode
 from sgsst_core.settings import (
     BY_PRESET,
     COLOR_SYNTAX,
+    MAX_RESOLUTION,
     OR_STRENGTH,
     Color,
     Near,
@@ -247,8 +248,9 @@ class StyleFile:
 
 
 def path_or_url(value: str | Path) -> Path | str:
-    """Return the path of a local file, or an http or https URL unchanged."""
-    return value if isinstance(value, str) and value.lower().startswith(("http://", "https://")) else Path(value)
+    """Return the path of a local file, or an http or https URL, or the path of a job's file in the API, unchanged."""
+    remote = ("http://", "https://", "/v1/jobs/")
+    return value if isinstance(value, str) and value.lower().startswith(remote) else Path(value)
 
 
 def split_weight(text: str, exists: Callable[[Path], bool] = Path.exists) -> tuple[str, float]:
@@ -285,6 +287,66 @@ def parse_styles(texts: Sequence[str]) -> tuple[StyleFile, ...]:
     return tuple(parse_style(text) for text in texts)
 
 
+#: Text without control characters: it is shown in terminals, and some databases cannot store zero bytes.
+NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
+#: Maximum number of painted views of a job.
+MOST_PAINTED = 16
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Row = Annotated[list[_Finite], Field(min_length=4, max_length=4)]
+
+
+class CameraParameters(BaseModel):
+    """Pinhole camera in JSON. Pixel centers are at +0.5; x points right, y down, z forward."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {"width": 960, "height": 600, "fx": 700.0, "fy": 700.0, "cx": 480.0, "cy": 300.0}
+                | {"world_to_camera": [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 3.0]]}
+            ]
+        },
+    )
+
+    width: int = Field(ge=1, le=MAX_RESOLUTION, description="Width in pixels.")
+    height: int = Field(ge=1, le=MAX_RESOLUTION, description="Height in pixels.")
+    fx: _Finite = Field(gt=0, description="Horizontal focal length in pixels.")
+    fy: _Finite = Field(gt=0, description="Vertical focal length in pixels.")
+    cx: _Finite = Field(description="Horizontal position of the principal point in pixels.")
+    cy: _Finite = Field(description="Vertical position of the principal point in pixels.")
+    world_to_camera: Annotated[list[_Row], Field(min_length=3, max_length=4)] = Field(
+        description="Rows of the rigid transform, 3x4 or 4x4."
+    )
+
+
+class PaintedOptions(BaseModel):
+    """View of a painted file in JSON. Without view and camera, a PNG states both in its text chunk `sgsst-view`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", json_schema_extra={"examples": [{"view": "orbit_0000"}]})
+
+    view: Annotated[str, Field(min_length=1, max_length=1000, pattern=NO_CONTROLS)] | None = Field(
+        None, description="Name of a camera of the job; of `camera`, if that is given."
+    )
+    camera: CameraParameters | None = Field(None, description="Camera of any viewpoint. Default: the one named `view`.")
+
+
+@dataclass(frozen=True)
+class PaintedFile:
+    """File with a painted view, and what is known about the view."""
+
+    path: Path
+    options: PaintedOptions = field(default_factory=PaintedOptions)
+
+    @staticmethod
+    def parse(text: str) -> PaintedFile:
+        """Parse FILE or NAME=FILE. If a file named like the whole text exists, the text is its path."""
+        name, equals, path = text.partition("=")
+        if not equals or Path(text).exists():
+            return PaintedFile(Path(text))
+        return PaintedFile(Path(path), checked(PaintedOptions, {"view": name}))
+
+
 #: Selections that need no file, for help texts. Those with a file are `mask=` and `masks=`.
 SHAPES = (
     "box=X0,Y0,Z0,X1,Y1,Z1, sphere=X,Y,Z,R, half-space=A,B,C,D (where A x + B y + C z >= D), "
@@ -296,8 +358,6 @@ REST = "rest"
 MOST_REGIONS = 16
 #: Maximum weight of a region. Larger ones can raise the gradient beyond `LARGEST_GRADIENT`.
 MOST_REGION_WEIGHT = 1e6
-#: Text without control characters: it is shown in terminals, and some databases cannot store zero bytes.
-NO_CONTROLS = r"^[^\x00-\x1f\x7f-\x9f]*$"
 #: Name of a region, which is a label: any text.
 RegionName = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=64, pattern=NO_CONTROLS)]
 _COMPARISON = re.compile(r"(?P<name>[^<>=!]+)(?P<sign>>=|<=|!=|>|<|=)(?P<value>.+)", re.DOTALL)

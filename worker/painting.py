@@ -1,12 +1,13 @@
-"""Painted views of a scene: a picture to paint on, and the scene that follows what was painted."""
+"""Painted views of a scene: an image to paint on, and the job by which the scene follows what was painted."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from PIL import Image
@@ -14,47 +15,97 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from sgsst_core.errors import CameraError, ImageError, OutputError
-from sgsst_core.files.atomic import atomic_path
-from sgsst_core.files.images import load_image, to_image
+from sgsst_core.files.atomic import atomic_path, write_json
+from sgsst_core.files.formats import read_scene_header
+from sgsst_core.files.images import image_size, load_image, to_image
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import SceneFile
-from sgsst_core.painting.solver import Painted, PaintedView, paint
+from sgsst_core.files.stylized_ply import write_colors, write_stylized
+from sgsst_core.painting.solver import PASSES, Painted, PaintedView, paint
+from sgsst_core.progress import Decision, Progress
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.rasterizer.base import Color, Rasterizer
+from sgsst_core.report.document import PLAN_VERSION, REPORT_VERSION
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.spherical_harmonics import scene_colors
-from worker.inputs import read_scene_and_capture
-from worker.job import SceneRequest
-from worker.outputs import check_is_not_input, result_format
+from worker.capture import Capture, read_capture
+from worker.inputs import (
+    STYLE_PIXELS,
+    InputLimits,
+    check_frames_have_sizes,
+    check_something_in_view,
+    errors_of,
+    read_requested,
+    read_scene_and_capture,
+)
+from worker.job import JobSpec, Result, SceneRequest, check_choice
+from worker.options import CameraParameters, PaintedFile, PaintedOptions
+from worker.outputs import Outputs, check_file, check_is_not_input, result_format
+from worker.prepare import Prepared, describe_scene, save_thumbnail
 
-#: Text chunk of a PNG with the view that it shows.
+if TYPE_CHECKING:
+    from worker.ranks.rank import WorkerOptions
+    from worker.run import Listener
+
+#: Text chunk of a PNG with the view that it shows, as `PaintedOptions`.
 _CHUNK = "sgsst-view"
 #: Number of other views that tell how well the painted ones show a Gaussian.
-_OTHERS = 12
-#: A picture that states no view is compared with so many, at this longer side. It is refused if another one than it is
-#: said to show fits better by so many dB. A picture less opaque than this on average shows paint, not the view.
+_OTHERS = 8
+#: An image that states no view is compared with so many, at this longer side. It is refused if another one than it is
+#: said to show fits better by so many dB. An image less opaque than this on average shows paint, not the view.
 _MOST_COMPARED, _COMPARED_SIDE, _CLEARLY, _OPAQUE = 100, 160, 3.0, 0.5
+#: Longer side of the thumbnail in pixels.
+_THUMBNAIL_SIDE = 480
+#: Predicted seconds on one core: of a pass for each Gaussian and pixel of a view, and of everything else for each
+#: Gaussian. Measured with 48,000 and a million Gaussians at 480 pixels.
+_SECONDS_PER_GAUSSIAN, _SECONDS_PER_PIXEL, _OTHER_SECONDS = 1.5e-7, 3.5e-7, 1.2e-5
+#: Predicted bytes for each Gaussian and pixel of a view, and besides.
+_BYTES_PER_GAUSSIAN, _BYTES_PER_PIXEL, _OTHER_BYTES = 2000, 2000, 600_000_000
 
 
 @dataclass(frozen=True)
-class PaintRequest:
-    """Request to paint a scene.
+class PaintInputs:
+    """All inputs of a job with painted views.
 
     Attributes:
-        paintings: Painted pictures by the names of their views.
-        out: Scene to write, in any format for results; a report goes beside it.
-        background: Color behind the scene in the pictures, in 0..1.
+        scene_file: Scene to paint.
+        capture: Cameras of the job, which need not be those of the painted views.
+        views: Painted views.
+        decisions: Decisions about scene, cameras and painted views for the plan.
     """
 
-    source: SceneRequest
-    paintings: Mapping[str, Path]
-    out: Path
-    background: Color = (0.0, 0.0, 0.0)
+    scene_file: SceneFile
+    capture: Capture
+    views: list[PaintedView]
+    decisions: tuple[Decision, ...]
 
     @property
-    def report(self) -> Path:
-        """Path of the report."""
-        return self.out.with_suffix(".report.json")
+    def cameras(self) -> list[Camera]:
+        """Cameras of the painted views."""
+        return [view.camera for view in self.views]
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the painted views."""
+        return sum(camera.width * camera.height for camera in self.cameras)
+
+    @property
+    def seconds(self) -> float:
+        """Predicted seconds of the solution on one core."""
+        gaussians = len(self.scene_file.scene)
+        passes = PASSES * (_SECONDS_PER_GAUSSIAN * gaussians * len(self.views) + _SECONDS_PER_PIXEL * self.pixels)
+        return passes + _OTHER_SECONDS * gaussians
+
+    @property
+    def peak_bytes(self) -> int:
+        """Predicted peak memory in bytes."""
+        gaussians = len(self.scene_file.scene)
+        return _OTHER_BYTES + _BYTES_PER_GAUSSIAN * gaussians + _BYTES_PER_PIXEL * self.pixels
+
+    @property
+    def plan(self) -> dict[str, Any]:
+        """Plan in the format of `plan.json`."""
+        return {"version": PLAN_VERSION, "decisions": [asdict(decision) for decision in self.decisions]}
 
 
 def export_view(source: SceneRequest, name: str, background: Color, out: Path) -> Camera:
@@ -66,68 +117,107 @@ def export_view(source: SceneRequest, name: str, background: Color, out: Path) -
     if out.suffix.lower() != ".png":  # a mistyped path must not overwrite a scene
         raise OutputError(f"{out}: not the name of a PNG image. Give one, such as {name}.png.")
     file, capture = read_scene_and_capture(source)
-    camera = _camera(capture.cameras, name)
+    camera = _named(capture.cameras, name)
     image = _render(make_rasterizer("cpu", file.scene, background=background, near=source.near), file, camera)
     metadata = PngInfo()
-    metadata.add_text(_CHUNK, json.dumps(_description(camera)))
+    metadata.add_text(_CHUNK, PaintedOptions(view=name, camera=_parameters(camera)).model_dump_json())
     with atomic_path(out) as temporary:
         to_image(image).save(temporary, format="PNG", pnginfo=metadata)
     return camera
 
 
-def paint_scene(
-    request: PaintRequest, show: Callable[[int, int], None] = lambda done, total: None
-) -> tuple[SceneFile, Painted]:
-    """Return a scene's file, and the colors with which it follows its painted views.
+def read_paintings(request: JobSpec, limits: InputLimits | None = None) -> PaintInputs:
+    """Read and check all inputs of a job with painted views.
+
+    Args:
+        limits: Limits of a service; None for none.
 
     Raises:
-        InvalidInputError: If scene, cameras or a picture cannot be used, or the output would overwrite one of them.
+        InvalidInputError: If an input cannot be used. Its attribute `role` is the input's role.
     """
-    result_format(request.out)
-    inputs = {request.source.scene: "scene itself"} | dict.fromkeys(request.paintings.values(), "painted picture")
-    if request.source.cameras is not None:
-        inputs[request.source.cameras] = "camera file"
-    for path, description in inputs.items():
-        for out in (request.out, request.report):
-            check_is_not_input(out, path, description)
-    file, capture = read_scene_and_capture(request.source)
-    named = [(_camera(capture.cameras, name), path) for name, path in request.paintings.items()]
-    paintings = [(camera, path, *load_painting(path, camera)) for camera, path in named]
-    rasterizer = make_rasterizer("cpu", file.scene, background=request.background, near=request.source.near)
-    for camera, path, image, alpha in paintings:
-        if _stated(path) != _description(camera) and float(alpha.mean()) >= _OPAQUE:
-            _check_view(path, image, alpha, camera, capture.cameras, lambda camera: _render(rasterizer, file, camera))
-    views = [PaintedView(camera, image, alpha) for camera, _, image, alpha in paintings]
-    painted = paint(file.scene, views, rasterizer, others=spread(capture.cameras, _OTHERS), show=show)
-    return file, painted
+    source, background = request.source, request.settings.background
+    with errors_of("scene"):
+        if limits:
+            limits.check_count(read_scene_header(source.scene).count, 1.0)
+        file, decisions = read_requested(source)
+    with errors_of("cameras"):
+        check_choice(source)
+        if limits and source.cameras is not None:
+            check_frames_have_sizes(source.cameras)
+        capture = read_capture(source, file.scene).checked(file.scene, source.near)
+        if limits:
+            limits.check_cameras(capture.cameras)
+    rasterizer = make_rasterizer("cpu", file.scene, background=background, near=source.near)
+    with errors_of("painted"):
+        cameras = [_camera_of(painted, capture.cameras, limits) for painted in request.paintings]
+        _check_together(request.paintings, cameras)
+        views = []
+        for painted, camera in zip(request.paintings, cameras, strict=True):
+            check_something_in_view(file.scene, [camera], source.near)
+            views.append(view := load_painting(painted.path, camera))
+            if _stated(painted.path) is None and painted.options.camera is None and float(view.alpha.mean()) >= _OPAQUE:
+                _check_view(painted.path, view, capture.cameras, lambda camera: _render(rasterizer, file, camera))
+    names = ", ".join(f"{camera.name} ({camera.width}x{camera.height})" for camera in cameras)
+    about = Decision("painted views", names, "the scene follows them; geometry and view-dependent colors stay")
+    return PaintInputs(file, capture, views, (*decisions, *capture.decisions, about))
 
 
-def load_painting(path: Path, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Read a painted picture of a view.
-
-    Returns:
-        Colors [h, w, 3] float32 in 0..1, and opacity [h, w] of the paint.
+def load_painting(path: Path, camera: Camera) -> PaintedView:
+    """Read a painted view.
 
     Raises:
-        ImageError: If the file is no image, is transparent everywhere, or has another size or view than the camera's.
+        ImageError: If the file is no image, is transparent everywhere, or has another size than the camera's.
     """
-    on_black, on_white = (load_image(path, background=(gray,) * 3) for gray in (0.0, 1.0))
-    height, width, _ = on_black.shape
-    expected = f"the view {camera.name} has {camera.width}x{camera.height}"
+    (width, height), wanted = image_size(path), f"the view {camera.name} has {camera.width}x{camera.height}"
     if (width, height) != (camera.width, camera.height):
         same = abs(width / height - camera.width / camera.height) < 1 / min(height, camera.height)
-        shape = "" if same else ", which is another aspect ratio: do not crop the picture"
-        raise ImageError(f"{path}: has {width}x{height} pixels, but {expected}{shape}. Export and paint in one size.")
-    stated = _stated(path)
-    if stated is not None and stated["name"] != camera.name:
-        raise ImageError(f"{path}: is a picture of the view {stated['name']}, not of {camera.name}. Name that view.")
+        shape = "" if same else ", which is another aspect ratio: do not crop the image"
+        raise ImageError(f"{path}: has {width}x{height} pixels, but {wanted}{shape}. Export and paint in one size.")
+    on_black, on_white = (load_image(path, background=(gray,) * 3) for gray in (0.0, 1.0))
     alpha = 1 - (on_white - on_black).mean(dim=2).clamp(0, 1)
     if not bool((alpha > 0).any()):
         raise ImageError(f"{path}: is transparent everywhere, so it says nothing. Paint on it.")
-    return (on_black / alpha.clamp_min(1 / 255)[:, :, None]).clamp(0, 1), alpha
+    return PaintedView(camera, (on_black / alpha.clamp_min(1 / 255)[:, :, None]).clamp(0, 1), alpha)
 
 
-def _camera(cameras: Sequence[Camera], name: str) -> Camera:
+def _camera_of(painted: PaintedFile, cameras: Sequence[Camera], limits: InputLimits | None) -> Camera:
+    """Return the camera of a painted view: the given one, the one that its file states, or the named one."""
+    path, given = painted.path, painted.options
+    image_size(path)
+    if limits:
+        limits.check_image(path)
+    stated = _stated(path)
+    if stated and stated.view and given.view and stated.view != given.view:
+        raise ImageError(f"{path}: is an image of the view {stated.view}, not of {given.view}. Name that view.")
+    known = given if given.camera or not stated else stated
+    if (camera := known.camera) is not None:
+        intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+        name = known.view or path.stem
+        return Camera.from_matrix(camera.world_to_camera, intrinsics, camera.width, camera.height, name)
+    if known.view is None:
+        raise CameraError(f"{path}: does not state its view. Name the view, or export the image again.")
+    return _named(cameras, known.view)
+
+
+def _check_together(paintings: Sequence[PaintedFile], cameras: Sequence[Camera]) -> None:
+    """Check that no two images are of one view, and the number of pixels of all.
+
+    Raises:
+        ImageError: If there are two of one view, or too many pixels.
+    """
+    for (first, one), (second, other) in combinations(zip(paintings, cameras, strict=True), 2):
+        if _parameters(one) == _parameters(other):
+            raise ImageError(
+                f"{second.path}: shows the view {one.name}, as {first.path.name} does. Merge the two into one image."
+            )
+    if (pixels := sum(camera.width * camera.height for camera in cameras)) > STYLE_PIXELS:
+        raise ImageError(
+            f"The painted images have {pixels:,} pixels together. At most {STYLE_PIXELS:,} are allowed: export them "
+            "at a lower resolution."
+        )
+
+
+def _named(cameras: Sequence[Camera], name: str) -> Camera:
     """Return the camera of a name."""
     for camera in cameras:
         if camera.name == name:
@@ -140,40 +230,33 @@ def _render(rasterizer: Rasterizer, file: SceneFile, camera: Camera) -> Tensor:
     return rasterizer.render(scene_colors(file.scene, camera), camera)
 
 
-def _description(camera: Camera) -> dict[str, Any]:
-    """Return what the text chunk of a picture states: the name and the parameters of its view."""
-    parameters = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.world_to_camera.flatten().tolist()]
-    return {"name": camera.name, "size": [camera.width, camera.height], "camera": parameters}
+def _parameters(camera: Camera) -> CameraParameters:
+    """Return the parameters of a camera, as a file states them."""
+    given = {name: getattr(camera, name) for name in CameraParameters.model_fields if name != "world_to_camera"}
+    return CameraParameters(**given, world_to_camera=camera.world_to_camera.tolist())
 
 
-def _stated(path: Path) -> dict[str, Any] | None:
-    """Return the description of the view in a picture's text chunk; None if there is none."""
-    with Image.open(path) as image:
-        text = image.info.get(_CHUNK)
+def _stated(path: Path) -> PaintedOptions | None:
+    """Return the view that an image states in its text chunk; None if there is none, or it cannot be read."""
     try:
-        stated = json.loads(text) if isinstance(text, str) else None
-    except ValueError:
+        with Image.open(path) as image:
+            return PaintedOptions.model_validate_json(image.info[_CHUNK])
+    except (OSError, SyntaxError, KeyError, ValueError):
         return None
-    return stated if isinstance(stated, dict) and isinstance(stated.get("name"), str) else None
 
 
 def _check_view(
-    path: Path,
-    image: Tensor,
-    alpha: Tensor,
-    camera: Camera,
-    cameras: Sequence[Camera],
-    render: Callable[[Camera], Tensor],
+    path: Path, painted: PaintedView, cameras: Sequence[Camera], render: Callable[[Camera], Tensor]
 ) -> None:
-    """Check that a picture that states no view shows the one that it is said to.
+    """Check that an image that states no view shows the one that it is said to.
 
     Raises:
         ImageError: If another view fits it clearly better.
     """
-    painting = torch.cat([image, alpha[:, :, None]], dim=2).permute(2, 0, 1)[None]
+    painting = torch.cat([painted.image, painted.alpha[:, :, None]], dim=2).permute(2, 0, 1)[None]
 
     def fit(other: Camera) -> float:
-        """Return the PSNR of a view with the picture's colors, by the affine map that fits best."""
+        """Return the PSNR of a view with the image's colors, by the affine map that fits best."""
         small = resized(other, _COMPARED_SIDE)
         pixels = torch.nn.functional.interpolate(painting, (small.height, small.width), mode="area")
         colors, weight = pixels[0, :3].flatten(1).T.double(), pixels[0, 3].flatten().double()[:, None]
@@ -185,17 +268,88 @@ def _check_view(
         return float(-10 * torch.log10(error.clamp_min(1e-12)))
 
     best = max(spread(cameras, _MOST_COMPARED), key=fit)
-    if fit(best) > fit(camera) + _CLEARLY:
-        raise ImageError(f"{path}: does not look like the view {camera.name}, but like {best.name}. Name that view.")
+    if fit(best) > fit(painted.camera) + _CLEARLY:
+        name = painted.camera.name
+        raise ImageError(f"{path}: does not look like the view {name}, but like {best.name}. Name that view.")
 
 
-def write_painted(request: PaintRequest, file: SceneFile, painted: Painted) -> None:
-    """Write a painted scene, and beside it a report.
+class _InterruptedError(Exception):
+    """Interruption of a job on request."""
+
+
+def run_painting(request: JobSpec, listener: Listener, options: WorkerOptions) -> Result:
+    """Run a job with painted views in this process. It takes seconds, so there are no checkpoints.
+
+    It writes the scene and, beside it, report, plan and colors.
+
+    Raises:
+        SgsstError: If the job fails; nothing is written then.
+    """
+    started = time.perf_counter()
+    _check_outputs(request)
+    inputs = read_paintings(request)
+    file, now = inputs.scene_file, Progress(stage="painting", total=PASSES)
+    lines = [(line.item, f"{line.decision}: {line.reason}") for line in inputs.decisions]
+    listener.prepared(Prepared([("scene", describe_scene(file)), *lines], 0, PASSES))
+    first = time.perf_counter()
+
+    def show(done: int) -> None:
+        nonlocal now
+        left = (time.perf_counter() - first) / done * (PASSES - done) if done else inputs.seconds
+        now = Progress(stage="painting", step=done, total=PASSES, eta_s=left)
+        listener.progress(now)
+        if listener.stop():
+            raise _InterruptedError
+
+    rasterizer = make_rasterizer("cpu", file.scene, background=request.settings.background, near=request.source.near)
+    side = max(camera.side for camera in inputs.cameras)  # their pixels are compared with those of the painted views
+    others = [resized(camera, side) for camera in spread(inputs.capture.cameras, _OTHERS)]
+    try:
+        painted = paint(file.scene, inputs.views, rasterizer, others=others, show=show)
+    except _InterruptedError:
+        return Result(stopped="interrupted", steps=now.step, total=PASSES)
+    if options.preview_folder:
+        camera = inputs.cameras[0]
+        camera = resized(camera, min(camera.side, _THUMBNAIL_SIDE))
+        after = replace(file, scene=replace(file.scene, sh_dc=painted.sh_dc))
+        save_thumbnail(options.preview_folder, *(_render(rasterizer, each, camera) for each in (file, after)))
+    _write(request, inputs, painted, time.perf_counter() - started)
+    before, after_ = painted.psnr_before, painted.psnr_after
+    return Result(stopped="finished", steps=PASSES, total=PASSES, psnr_before=before, psnr_after=after_)
+
+
+def _check_outputs(request: JobSpec) -> None:
+    """Check that the outputs can be written, and are none of the inputs.
+
+    Raises:
+        OutputError: If one cannot be written.
+    """
+    result_format(request.out)
+    check_file(request.out)
+    inputs = {request.source.scene: "scene itself"} | {file.path: "painted image" for file in request.paintings}
+    if request.source.cameras is not None:
+        inputs[request.source.cameras] = "camera file"
+    outputs = Outputs.of(request.out)
+    for path, description in inputs.items():
+        for out in (request.out, outputs.report, outputs.plan, outputs.colors):
+            check_is_not_input(out, path, description)
+
+
+def _write(request: JobSpec, inputs: PaintInputs, painted: Painted, seconds: float) -> None:
+    """Write the painted scene, and beside it report, plan and colors.
 
     Raises:
         OutputError: If a file cannot be written.
     """
-    save(request.out, replace(file, scene=replace(file.scene, sh_dc=painted.sh_dc)))
+    file, outputs = inputs.scene_file, Outputs.of(request.out)
+    if request.pad_sh:
+        write_stylized(file, request.out, painted.sh_dc, pad_sh=True)
+    else:
+        save(request.out, replace(file, scene=replace(file.scene, sh_dc=painted.sh_dc)))
+    if request.colors and file.retained is None:
+        write_colors(outputs.colors, painted.sh_dc)
+    views = [{"name": camera.name, "width": camera.width, "height": camera.height} for camera in inputs.cameras]
     figures = {name: value for name, value in vars(painted).items() if name != "sh_dc"}
-    with atomic_path(request.report) as temporary:
-        temporary.write_text(json.dumps({"gaussians": len(file.scene), **figures}, indent=2) + "\n", "utf-8")
+    report = {"version": REPORT_VERSION, "gaussians": len(file.scene), "views": views, **figures}
+    write_json(outputs.report, {**report, "seconds": round(seconds, 2)})
+    write_json(outputs.plan, inputs.plan)

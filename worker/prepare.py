@@ -411,8 +411,7 @@ class Previews:
         try:
             before = _rendered(stylizer, stylizer.job.views.scene.sh_dc.to(stylizer.sh_dc.device), _THUMBNAIL_SIDE)
             after = _rendered(stylizer, stylizer.shown(), _THUMBNAIL_SIDE)
-            middle = before.shape[1] // 2
-            save_jpg(self._path(_THUMBNAIL), torch.cat([before[:, :middle], after[:, middle:]], dim=1))
+            save_thumbnail(self._folder, before, after)
         except Exception as error:
             self._warn(f"The thumbnail could not be rendered: {error}")
 
@@ -430,6 +429,13 @@ class Previews:
     def _path(self, name: str) -> Path:
         self._folder.mkdir(parents=True, exist_ok=True)
         return self._folder / name
+
+
+def save_thumbnail(folder: Path, before: Tensor, after: Tensor) -> None:
+    """Write the thumbnail of a job to its folder of previews, given two images [h, w, 3] of one view."""
+    middle = before.shape[1] // 2
+    folder.mkdir(parents=True, exist_ok=True)
+    save_jpg(folder / _THUMBNAIL, torch.cat([before[:, :middle], after[:, middle:]], dim=1))
 
 
 def _shown_view(covered: Sequence[int]) -> int:

@@ -93,13 +93,18 @@ def stylize(request: JobSpec, workers: int | None, listener: Listener, options: 
     """Run a job in this process, or on up to `workers` ranks, each in a process of its own.
 
     Args:
-        workers: Maximum number of ranks; None for this process.
+        workers: Maximum number of ranks; None for this process. Painted views need no more.
         options: Options of running and watching ranks.
 
     Raises:
         SgsstError: If the job fails.
         RanksFailedError: If ranks are lost too often, or fail for a reason that is not an error of the job.
     """
+    if request.paintings:
+        from worker.painting import run_painting
+
+        result = run_painting(request, listener, options)
+        return Ended(result, result.steps, result.total, None)
     if workers is not None:
         from worker.ranks.driver import stylize_on_ranks
 

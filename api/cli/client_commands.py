@@ -25,8 +25,8 @@ from api.cli.console import (
     transfer_bar,
 )
 from api.cli.options import (
-    JobArguments,
     JsonOption,
+    SubmittedArguments,
     cameras_of,
     file_to_write,
     path_to_write,
@@ -73,9 +73,9 @@ def _webhook_event(text: str) -> str:
 
 
 @with_options(JobParameters)
-@with_arguments(JobArguments)
+@with_arguments(SubmittedArguments)
 def submit(
-    inputs: JobArguments,
+    inputs: SubmittedArguments,
     *,
     options: JobParameters,
     parameters: Annotated[str, typer.Option(metavar="JSON", help="Additional parameters, as in the REST API.")] = "{}",
@@ -105,7 +105,8 @@ def submit(
 ) -> None:
     """Submit a job to a service, with the options of stylize. With --out, wait for the result.
 
-    SCENE, --style and --cameras may be URLs, if the service allows their hosts.
+    With --view in place of --style, the scene follows painted views. SCENE, --style and --cameras may be URLs, if the
+    service allows their hosts, or files of earlier jobs, such as /v1/jobs/JOB/artifacts/stylized.ply.
     """
     if out is not None:
         download_of_name(out.name)
@@ -115,6 +116,7 @@ def submit(
     styles, masks, settings = _styles_masks_and_parameters(inputs, options, parameters)
     cameras = cameras_of(inputs.scene, inputs.cameras, JobParameters.model_construct(**settings))
     files: dict[str, Any] = {"cameras": cameras, "photos": inputs.images, "masks": masks}
+    files["painted"] = {file.path: file.options.model_dump(exclude_none=True) for file in inputs.painted}
     with open_client(url, key) as client:
         if dry_run:
             with _sending_and_planning() as (progress, planning):
@@ -135,11 +137,11 @@ def submit(
 
 
 def _styles_masks_and_parameters(
-    inputs: JobArguments, options: JobParameters, parameters: str
+    inputs: SubmittedArguments, options: JobParameters, parameters: str
 ) -> tuple[list[Path | str], dict[str, Path], dict[str, Any]]:
     """Return the style images to send or their URLs, those of regions last, the masks, and the job's parameters."""
     values = options.model_dump(mode="json", exclude_unset=True)
-    styles = parse_styles(inputs.style)
+    styles = () if inputs.painted else parse_styles(inputs.style)
     if len(styles) > 1:
         values["style_weights"] = [file.weight for file in styles]
     images = [path_or_url(split_weight(text)[0]) for text in inputs.style]
@@ -505,7 +507,11 @@ def _job_text(job: Job) -> str:
     result = job.data.get("result")
     if result:
         lines.append(f"{'steps:':<12}{_step_count_text(result)}")
-        lines.append(f"{'loss:':<12}{loss_text(result['loss_before'], result['loss_after'])}")
+        if result.get("psnr_after") is not None:
+            painted = f"{result['psnr_before']:.1f} dB before, {result['psnr_after']:.1f} dB after"
+            lines.append(f"{'painted:':<12}{painted}")
+        else:
+            lines.append(f"{'loss:':<12}{loss_text(result['loss_before'], result['loss_after'])}")
     if job.error:
         lines.append(f"{'error:':<12}{job.error['message']}")
     return "\n".join(lines)

@@ -28,6 +28,7 @@ from worker.options import (
     REGIONS,
     SHAPES,
     VIEWS,
+    PaintedFile,
     RegionOptions,
     RunOptions,
     StylizeOptions,
@@ -246,6 +247,15 @@ CamerasOption = Annotated[Path | None, typer.Option(parser=local_path, **_CAMERA
 _STYLE = path_to_read("Style image.", show_default=False, rich_help_panel=ESSENTIALS)
 StyleOption = Annotated[Path, _STYLE]
 OptionalStyleOption = Annotated[Path | None, _STYLE]
+PaintedOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="[NAME=]FILE",
+        help="Painted image of a view, of the same size as the view; may be repeated. Transparent pixels are left "
+        "alone. A PNG that states its view needs no name.",
+        rich_help_panel=ESSENTIALS,
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -269,6 +279,14 @@ def source_of(scene: Path, cameras: Path | None, options: ViewOptions) -> SceneR
     return SceneRequest.of(scene, cameras_of(scene, cameras, options), options)
 
 
+_STYLES = typer.Option(
+    metavar="FILE[:WEIGHT]",
+    help="Style image; may be repeated. Several are mixed in proportion to their weights.",
+    rich_help_panel=ESSENTIALS,
+    show_default=False,
+)
+
+
 def _of_region(metavar: str, help: str) -> Any:
     """Return an option of regions."""
     return typer.Option(metavar=metavar, help=help, rich_help_panel=REGIONS)
@@ -282,15 +300,7 @@ class JobArguments:
     """
 
     scene: Annotated[str, typer.Argument(**_SCENE)]
-    style: Annotated[
-        list[str],
-        typer.Option(
-            metavar="FILE[:WEIGHT]",
-            help="Style image; may be repeated. Several are mixed in proportion to their weights.",
-            rich_help_panel=ESSENTIALS,
-            show_default=False,
-        ),
-    ]
+    style: Annotated[list[str], _STYLES]
     cameras: Annotated[str | None, typer.Option(**_CAMERAS)] = None
     images: Annotated[
         Path | None,
@@ -364,6 +374,25 @@ class JobArguments:
             style_background=options.style_background,
             pad_sh=options.pad_sh,
         )
+
+
+@dataclass(frozen=True)
+class SubmittedArguments(JobArguments):
+    """Files and regions of a job for a service, which stylizes the scene or lets it follow painted views."""
+
+    style: Annotated[list[str], _STYLES] = ()  # type: ignore[assignment]  # typer makes lists
+    view: PaintedOption = None
+
+    @property
+    def painted(self) -> list[PaintedFile]:
+        """Painted files.
+
+        Raises:
+            SettingsError: If there are style images too, or the name of a view cannot be one.
+        """
+        if self.view and self.style:
+            raise SettingsError("--style and --view are given. Stylize first, then paint on the result, or vice versa.")
+        return [PaintedFile.parse(text) for text in self.view or ()]
 
 
 _BEGINNING = """\

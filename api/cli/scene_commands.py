@@ -22,6 +22,7 @@ from api.cli.options import (
     CamerasOption,
     JobArguments,
     OptionalStyleOption,
+    PaintedOption,
     SceneArgument,
     StyleOption,
     file_to_write,
@@ -36,7 +37,7 @@ from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
 from sgsst_core.progress import clock, duration
 from sgsst_core.stylizing.progress_bar import job_bar, live_bar
-from worker.options import ESSENTIALS, StylizeOptions, VideoOptions, ViewOptions
+from worker.options import ESSENTIALS, PaintedFile, StylizeOptions, VideoOptions, ViewOptions
 
 if TYPE_CHECKING:
     from api.cli.scene_tools import VariantsRequest
@@ -317,15 +318,7 @@ def paint(
             rich_help_panel=ESSENTIALS,
         ),
     ],
-    view: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=FILE",
-            help="Painted picture of a view, of the same size as the view; may be repeated. Transparent pixels are "
-            "left alone.",
-            rich_help_panel=ESSENTIALS,
-        ),
-    ] = None,
+    view: PaintedOption = None,
     export: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Write the picture of a view to paint on.", rich_help_panel=ESSENTIALS),
@@ -336,36 +329,28 @@ def paint(
     chosen: StylizeOptions,
 ) -> None:
     """Paint one view or several, and the scene follows."""
-    from worker.painting import PaintRequest, export_view, paint_scene, write_painted
+    from worker.job import JobSpec
+    from worker.outputs import Outputs
+    from worker.painting import export_view, run_painting
+    from worker.ranks.rank import WorkerOptions
+    from worker.run import Listener
 
     if bool(view) == (export is not None):
-        raise SettingsError("Give --export NAME to write a picture, or --view NAME=FILE with a painted one.")
-    source, background = source_of(scene, cameras, options), chosen.settings().background
+        raise SettingsError("Give --export NAME to write an image, or --view NAME=FILE with a painted one.")
+    source, settings = source_of(scene, cameras, options), chosen.settings()
     if export is not None:
-        camera = export_view(source, export, background, out)
-        print_field("picture", f"{out}, {camera.width}x{camera.height}: paint on it, then use --view {export}={out}")
+        camera = export_view(source, export, settings.background, out)
+        print_field("image", f"{out}, {camera.width}x{camera.height}: paint on it, then use --view {out}")
         return
-    request = PaintRequest(source, _paintings(view or []), out, background)
+    paintings = tuple(PaintedFile.parse(text) for text in view or ())
+    request = JobSpec(source=source, styles=(), out=out, settings=settings, paintings=paintings)
     with live_bar(error_console) as bar:
         task = bar.add_task("painting", total=None)
-        file, painted = paint_scene(request, lambda done, total: bar.update(task, completed=done, total=total))
-    write_painted(request, file, painted)
-    print_field("painted pixels", f"{painted.psnr_before:.1f} dB before, {painted.psnr_after:.1f} dB after")
-    print_field("Gaussians", f"{painted.determined:,} of {len(file.scene):,} are determined; the others follow them")
+        listener = Listener(progress=lambda now: bar.update(task, completed=now.step, total=now.total))
+        result = run_painting(request, listener, WorkerOptions())
+    print_field("painted pixels", f"{result.psnr_before:.1f} dB before, {result.psnr_after:.1f} dB after")
     print_field("scene", out)
-    print_field("report", request.report)
-
-
-def _paintings(views: list[str]) -> dict[str, Path]:
-    paintings: dict[str, Path] = {}
-    for text in views:
-        name, equals, path = text.partition("=")
-        if not (name and equals and path):
-            raise SettingsError(f"--view {text}: must be NAME=FILE, such as --view front=front.png.")
-        if name in paintings:
-            raise SettingsError(f"--view {name} is given twice. Merge the two pictures into one.")
-        paintings[name] = Path(path)
-    return paintings
+    print_field("report", Outputs.of(out).report)
 
 
 #: Options of a job that apply to all variants.

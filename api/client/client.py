@@ -83,11 +83,12 @@ class AsyncClient:
         self,
         /,
         scene: str | Path,
-        style: str | Path | Sequence[str | Path],
+        style: str | Path | Sequence[str | Path] = (),
         *,
         cameras: str | Path | None = None,
         photos: str | Path | None = None,
         masks: Mapping[str, str | Path] | None = None,
+        painted: Mapping[str | Path, Mapping[str, Any]] | None = None,
         webhook: str | None = None,
         webhook_events: Sequence[str] = (),
         progress: Progress = no_progress,
@@ -95,14 +96,18 @@ class AsyncClient:
     ) -> Job:
         """Queue a job. Large files are uploaded in parts, and resume after a lost connection.
 
-        Scene, styles and cameras may be URLs that the service fetches, if its operator allows their hosts.
+        Scene, styles and cameras may be URLs that the service fetches, if its operator allows their hosts, or files of
+        earlier jobs, such as "/v1/jobs/JOB/artifacts/stylized.ply".
 
         Args:
-            style: Style image, or several that are mixed with the weights of the parameter `style_weights`.
+            style: Style image, or several that are mixed with the weights of the parameter `style_weights`; none with
+                `painted`.
             cameras: Camera file or folder, as for `sgsst stylize --cameras`; None for an orbit.
             photos: Folder of photos for the content term; None for unstylized renders.
             masks: Mask files, or folders of mask images, by the names that the parameter `regions` gives them
                 (`mask=NAME`, `masks=NAME`).
+            painted: Painted images, which the scene follows, each with its view: {"view": NAME}, {"camera": {...}} as
+                in the REST API, or {} for a PNG that states its view.
             webhook: URL that gets a message when the job has ended; None for none.
             webhook_events: Messages that it gets instead: of "started", "progress", "completed".
             progress: Callback that receives the uploaded bytes and the total bytes of all large files.
@@ -111,7 +116,8 @@ class AsyncClient:
         Raises:
             RequestError: If an input cannot be used; the message says which and why.
         """
-        files = _files(scene, style, cameras, photos, masks)
+        files = _files(scene, style, cameras, photos, masks, painted)
+        parameters |= {"painted": [*painted.values()]} if painted else {}
         given = {"webhook": webhook, "webhook_events": ",".join(webhook_events)}
         sent = {name: value for name, value in given.items() if value}
         created = await uploads.create_job(self._transport, files, parameters, sent, progress)
@@ -121,11 +127,12 @@ class AsyncClient:
         self,
         /,
         scene: str | Path,
-        style: str | Path | Sequence[str | Path],
+        style: str | Path | Sequence[str | Path] = (),
         *,
         cameras: str | Path | None = None,
         photos: str | Path | None = None,
         masks: Mapping[str, str | Path] | None = None,
+        painted: Mapping[str | Path, Mapping[str, Any]] | None = None,
         progress: Progress = no_progress,
         planning: Progress = no_progress,
         **parameters: Any,
@@ -135,7 +142,8 @@ class AsyncClient:
         Args:
             planning: Callback that receives the number of completed views of the survey, and of all.
         """
-        files = _files(scene, style, cameras, photos, masks)
+        files = _files(scene, style, cameras, photos, masks, painted)
+        parameters |= {"painted": [*painted.values()]} if painted else {}
         return await uploads.plan_job(self._transport, files, parameters, progress=progress, planning=planning)
 
     async def upload(self, path: str | Path, name: str | None = None, progress: Progress = no_progress) -> str:
@@ -338,6 +346,7 @@ def _files(
     cameras: str | Path | None,
     photos: str | Path | None,
     masks: Mapping[str, str | Path] | None,
+    painted: Mapping[str | Path, Mapping[str, Any]] | None,
 ) -> JobFiles:
     styles = [style] if isinstance(style, str | Path) else style
     return JobFiles(
@@ -346,6 +355,7 @@ def _files(
         None if cameras is None else path_or_url(cameras),
         None if photos is None else Path(photos),
         {name: Path(path) for name, path in (masks or {}).items()},
+        [Path(path) for path in painted or ()],
     )
 
 

@@ -148,6 +148,7 @@ class JobFiles:
     Attributes:
         cameras: Camera file or folder; None for an orbit.
         masks: Mask files, or folders of mask images, by the names that the job's regions give them.
+        painted: Painted images of views.
     """
 
     scene: Path | str
@@ -155,6 +156,7 @@ class JobFiles:
     cameras: Path | str | None = None
     photos: Path | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
+    painted: Sequence[Path] = ()
 
 
 def input_files(job: JobFiles) -> list[InputFile]:
@@ -174,7 +176,7 @@ def input_files(job: JobFiles) -> list[InputFile]:
     for mask, path in job.masks.items():
         images = [(each, f"{mask}/{name}") for each, name in image_files(path)] if path.is_dir() else [(path, mask)]
         files += [_input("mask", each, name) for each, name in images]
-    return files
+    return files + [_input("painted", *each) for each in zip(job.painted, different_names(job.painted), strict=True)]
 
 
 def _input(role: str, source: Path | str, name: str = "") -> InputFile:

@@ -363,8 +363,8 @@ async def get_input(
     role: Annotated[
         str,
         Path(
-            description="`scene`, `style`, `cameras`, `photos` or `mask`; of several files the first one, or `style:1` "
-            "and so on, counted from 0 in the order of the list.",
+            description="`scene`, `style`, `cameras`, `photos`, `mask` or `painted`; of several files the first one, "
+            "or `style:1` and so on, counted from 0 in the order of the list.",
             examples=["scene"],
         ),
     ],

@@ -433,7 +433,7 @@ def check_size(role: str, name: str, size: int) -> None:
         INVALID_INPUT: If the file is empty.
     """
     if not size:
-        code = f"invalid-{'image' if role in ('style', 'photos') else role}"
+        code = f"invalid-{'image' if role in ('style', 'photos', 'painted') else role}"
         raise problems.INVALID_INPUT(f"{name}: is empty. Send the file's content.", code=code, input=role)
 
 

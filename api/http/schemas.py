@@ -148,7 +148,7 @@ class InputView(BaseModel):
 
     model_config = _with_example(role="scene", name="scene.ply", size=42301, sha256=SHA256)
 
-    role: Literal["scene", "style", "cameras", "photos", "mask"]
+    role: Literal["scene", "style", "cameras", "photos", "mask", "painted"]
     name: str
     size: int
     sha256: str
@@ -221,7 +221,8 @@ class JobView(BaseModel):
     preview: str | None = Field(description="Artifact with the newest preview image; null if there is none yet.")
     progress: ProgressView | None
     result: dict[str, Any] | None = Field(
-        description="Why the job stopped (`stopped`), its `steps` of `total`, and its loss before and after."
+        description="Why the job stopped (`stopped`), its `steps` of `total`, and before and after: its loss, or with "
+        "painted views their PSNR in dB on painted pixels."
     )
     error: ErrorView | None
     parameters: dict[str, Any] = Field(
@@ -229,7 +230,8 @@ class JobView(BaseModel):
         "they were stored."
     )
     inputs: list[InputView] = Field(
-        description="Scene, style images and camera files. `GET /v1/jobs/{job_id}/inputs` lists photos and masks too."
+        description="Scene, style images, cameras and painted files. `GET /v1/jobs/{job_id}/inputs` lists photos and "
+        "masks too."
     )
     input_counts: dict[str, int] = Field(description="Number of files by role, photos and masks included.")
     links: Links
@@ -395,7 +397,7 @@ class PlanView(BaseModel):
     sh_degree: int
     views: int
     pixels: int
-    style: list[int] = Field(description="Width and height.")
+    style: list[int] = Field(description="Width and height; empty with painted files.")
     photos: int
     workers: int | None = Field(description="Requested workers; null if the service decides when the job starts.")
     estimated_seconds: float | None = Field(description="Estimated seconds of all steps; null if unknown.")

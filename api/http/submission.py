@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import json
 import re
+import secrets
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack, suppress
 from functools import partial
@@ -35,21 +36,23 @@ from api.http.schemas import JobView, PlanView, address, job_view, subpath
 from api.http.uploads import IdempotencyHeader, uploaded_name
 from service import problems
 from service.deadlines import suspended
-from service.inputs import MOST_STYLES, JobParameters, check_roles, default_job_name, staged_name
+from service.inputs import MOST_STYLES, RESULT, JobParameters, check_roles, default_job_name, staged_name
 from service.inspection.inspector import Show
 from service.problems import UPLOAD_ID, NoJobError
 from service.scheduling.webhooks import check_url
 from service.settings import check_weights
 from service.states import JobStatus, WebhookEvent
 from service.store.jobs import Idempotency, NewJob
-from service.store.tables import BlobRow, UploadRow
+from service.store.tables import ArtifactRow, BlobRow, UploadRow
 from sgsst_core.files.formats import TITLES
+from worker.options import MOST_PAINTED
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 #: Maximum bytes of a JSON body. Such a body contains no files, only the ids of uploads.
 _MAX_JSON = 1 << 20
-#: Path of an input, as in the API. The groups are the id of the job, and the input.
+#: Path of an input or of a result, as in the API. The groups are the id of the job, and the input.
 _PATH = re.compile(r"/v1/jobs/(job_[0-9a-f]{20,40})/inputs/([a-z]{1,10}(?::[0-9]{1,6})?)", re.ASCII)
+_RESULT_PATH = re.compile(rf"/v1/jobs/(job_[0-9a-f]{{20,40}})/artifacts/{re.escape(RESULT)}", re.ASCII)
 
 
 class Webhook(BaseModel):
@@ -68,7 +71,8 @@ class JobFromUploads(Webhook):
     """A job from files that the service already has, or that it fetches.
 
     Each file is named by the id of its upload (`POST /v1/uploads`), by the path of an input of an earlier job, such as
-    `/v1/jobs/JOB/inputs/style:1`, or by a URL that the service fetches, if its operator allows the host.
+    `/v1/jobs/JOB/inputs/style:1`, or of its result, `/v1/jobs/JOB/artifacts/stylized.ply`, or by a URL that the service
+    fetches, if its operator allows the host. A job has `style` files or `painted` files.
     """
 
     model_config = ConfigDict(
@@ -86,31 +90,36 @@ class JobFromUploads(Webhook):
     )
 
     scene: str = Field(
-        description=f"Id of the upload with the 3DGS scene: {TITLES}; or the path of an input, or a URL."
+        description=f"Id of the upload with the 3DGS scene: {TITLES}; or the path of an input or result, or a URL."
     )
-    style: str | Annotated[list[str], Field(min_length=1, max_length=MOST_STYLES)] = Field(
+    style: str | Annotated[list[str], Field(max_length=MOST_STYLES)] = Field(
+        default_factory=list,
         description="Id of the upload with the style image, the path of an input, or a URL; or a list of several, "
-        "which are mixed by `style_weights`, or belong to `regions`."
+        "which are mixed by `style_weights`, or belong to `regions`.",
     )
     cameras: list[str] = Field(default_factory=list, max_length=8, description="Camera files; empty for an orbit.")
     photos: list[str] = Field(default_factory=list, max_length=10_000, description="Photos for the content term.")
     mask: list[str] = Field(default_factory=list, max_length=10_000, description="Masks that `regions` name.")
+    painted: list[str] = Field(
+        default_factory=list,
+        max_length=MOST_PAINTED,
+        description="Painted images of views, which the scene follows; `parameters.painted` has the views.",
+    )
     parameters: JobParameters = Field(default_factory=JobParameters)
 
 
 _FILE = {"type": "string", "format": "binary"}
 _FORM = {
     "type": "object",
-    "required": ["scene", "style"],
+    "required": ["scene"],
     "properties": {
         "scene": {**_FILE, "description": f"3DGS scene: {TITLES}; or text, as for JSON."},
         "style": {
             "type": "array",
             "items": _FILE,
-            "minItems": 1,
             "maxItems": MOST_STYLES,
-            "description": "Style image; or text, as for JSON. Several are mixed by `style_weights`; those that "
-            "`regions` name belong to the regions.",
+            "description": "Style image; or text, as for JSON. Needed without `painted`. Several are mixed by "
+            "`style_weights`; those that `regions` name belong to the regions.",
         },
         "cameras": {
             "type": "array",
@@ -123,6 +132,13 @@ _FORM = {
             "items": _FILE,
             "description": "Mask that a region in `regions` names: one bit per Gaussian (.bin), or .npy; or images of "
             "views in a folder.",
+        },
+        "painted": {
+            "type": "array",
+            "items": _FILE,
+            "maxItems": MOST_PAINTED,
+            "description": "Painted image of a view, in place of style images; or text, as for JSON. The scene follows "
+            "it where it is opaque.",
         },
         "parameters": {"type": "string", "description": "JSON: see JobParameters."},
         "webhook": {"type": "string", "description": "URL that gets messages about the job."},
@@ -190,11 +206,11 @@ async def create_job(
         reading = _from_json(request, context) if is_json else _from_form(request, context, receipt)
         received, parameters, webhook = await reading
         find_inputs = partial(_find_inputs, context, caller, received, parameters, webhook)
-        fetched: dict[str, str] = {}
+        fetched = await _adopt_results(context, caller, received, receipt)
         if urls := context.fetcher.urls(received.uploads):
             await context.threads.run(caller.owner, find_inputs, fetched)
             with suspended():  # fetching has its own deadline
-                fetched = await context.fetcher.fetch(urls, receipt)
+                fetched |= await context.fetcher.fetch(urls, receipt)
         inputs, rows = await context.threads.run(caller.owner, find_inputs, fetched)
         recall = partial(context.inspector.recall, "validate", caller.owner, inputs, parameters)
         findings = await context.threads.run(caller.owner, recall)
@@ -238,10 +254,12 @@ def _find_inputs(
     """Return the entries of all files of a job and their blobs, after the checks that need no file's content.
 
     Args:
-        fetched: SHA-256 of each input by URL; missing ones are entries without a blob.
+        fetched: SHA-256 of each input by URL, and of each result by its path; missing ones are entries without a blob.
     """
     check_weights()
     inputs, rows = _resolve_inputs(context, caller, received, fetched)
+    if (count := sum(entry["role"] == "painted" for entry in inputs)) or parameters.painted:
+        parameters.check_painted(count)
     regions = parameters.region_requests
     check_roles(inputs, orbit=parameters.orbit is not None, weights=parameters.style_weights, regions=regions)
     if webhook.webhook:
@@ -303,7 +321,7 @@ async def _from_json(request: Request, context: Context) -> _Parts:
         raise problems.INVALID_REQUEST(f"parameters: has more than {MAX_TEXT} bytes.", input="parameters")
     styles = [job.style] if isinstance(job.style, str) else job.style
     named = [("scene", job.scene), *(("style", each) for each in styles)]
-    named += [(role, each) for role in ("cameras", "photos", "mask") for each in getattr(job, role)]
+    named += [(role, each) for role in ("cameras", "photos", "mask", "painted") for each in getattr(job, role)]
     if len(named) > (most := most_files(context.settings)):
         raise problems.TOO_MANY_FILES(limit=most, what="files")
     uploads = [(index, *each) for index, each in enumerate(named)]
@@ -327,6 +345,9 @@ def _resolve_inputs(
         if is_url(text):
             resolved.append((file_name(text), fetched.get(text, "")))
             continue
+        if text in fetched:
+            resolved.append((RESULT, fetched[text]))
+            continue
         if reference := _PATH.fullmatch(text.removeprefix(subpath.get())):
             entry = _referred_input(context, caller, reference[1], reference[2], role, released)
             resolved.append((entry["name"], entry["sha256"]))
@@ -343,6 +364,38 @@ def _resolve_inputs(
         size = rows[sha256].size if sha256 else 0
         inputs.insert(index, {"role": role, "name": name, "sha256": sha256, "size": size})
     return inputs, rows
+
+
+async def _adopt_results(context: Context, caller: Caller, received: Received, receipt: Receipt) -> dict[str, str]:
+    """Turn results of the caller's jobs that a request names into blobs, and return their SHA-256 by path.
+
+    Raises:
+        UNKNOWN_INPUT: If a job does not exist, or has no result.
+    """
+    results = await asyncio.to_thread(_referred_results, context, caller, received)
+    run = partial(context.threads.run, caller.owner, _adopt_result, context, receipt)
+    return {path: await run(row, size=row.size) for path, row in results.items()}
+
+
+def _referred_results(context: Context, caller: Caller, received: Received) -> dict[str, ArtifactRow]:
+    results = {}
+    for _, role, text in received.uploads:
+        if reference := _RESULT_PATH.fullmatch(text.removeprefix(subpath.get())):
+            row = None
+            with suppress(NoJobError):
+                row = context.store.jobs.artifact(find(context, caller, reference[1]).id, RESULT)
+            if row is None:
+                raise problems.UNKNOWN_INPUT(job_id=reference[1], name=RESULT, input=role)
+            results[text] = row
+    return results
+
+
+def _adopt_result(context: Context, receipt: Receipt, row: ArtifactRow) -> str:
+    receipt.charge(row.size)
+    context.blobs.ensure_space(row.size)
+    copy = context.blobs.incoming / f"{secrets.token_hex(12)}.part"
+    context.artifacts.fetch(row.location, copy, row.sha256)
+    return context.blobs.add(copy, receipt.id)
 
 
 def _referred_input(

@@ -9,7 +9,7 @@ import { seconds, words } from "./words.js";
 
 const say = words.submit;
 /** Parameters that other parts of the form set. */
-const ELSEWHERE = ["name", "style_weights", "regions", "preset"];
+const ELSEWHERE = ["name", "style_weights", "regions", "painted", "preset"];
 
 export class OptionsPart {
   /** @param {Control} name control for the job's name, which is shown elsewhere */

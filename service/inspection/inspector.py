@@ -354,7 +354,7 @@ class Inspector:
         checked: Callable[[], None],
     ) -> dict[str, Any]:
         seconds = self._settings.inspection_seconds + _SECONDS_PER_BYTE * _size(inputs)
-        if work == "plan" or parameters.selects_by_images:
+        if work == "plan" or parameters.renders_views:
             seconds += self._settings.dry_run_seconds
         async with self._threads.folder(owner, self._folder) as folder:
             paths = await self._threads.run(owner, self._blobs.fetch, rows, folder, size=_size(inputs))
@@ -411,9 +411,9 @@ def _key(
     """Return the key of a finding. It includes the owner, so that no finding shows what others have inspected."""
     files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
     values = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
-    # style weights are matched to styles by their order
-    styles = [entry["name"] for entry in inputs if entry["role"] == "style"]
-    order = styles if len(styles) > 1 else []
+    # style weights are matched to styles by their order, and views to painted files
+    ordered = [entry["name"] for entry in inputs if entry["role"] in ("style", "painted")]
+    order = ordered if len(ordered) > 1 else []
     text = json.dumps([_VERSION, work, owner, files, order, values, _limits(settings)], sort_keys=True)
     return f"{work}:{hashlib.sha256(text.encode()).hexdigest()}"
 

@@ -58,6 +58,7 @@ from worker.derived import VideoRequest, blend, convert, render_video, write_pag
 from worker.inputs import Inputs, cropped, errors_of, read_inputs
 from worker.job import SceneRequest, check_steps
 from worker.options import JobVideo
+from worker.painting import PaintInputs, read_paintings
 from worker.prepare import dry_run
 from worker.processes import die_with_parent, process_start
 
@@ -121,8 +122,10 @@ class _Limits:
 _Send = Callable[[dict[str, Any]], None]
 
 
-def _read(request: WorkRequest) -> Inputs:
-    """Read every input of a job as the job would, without rendering."""
+def _read(request: WorkRequest) -> Inputs | PaintInputs:
+    """Read every input of a job as the job would, without rendering more than that needs."""
+    if request.staged.painted:
+        return read_paintings(job_spec(request.staged, request.parameters), _Limits(**request.limits))
     check_steps(request.parameters.settings())
     installed = [entry.name for entry in list_network_weights() if entry.path]
     wanted = [name for name in ("vgg19", "vgg16") if request.parameters.backbone in ("auto", name)]
@@ -133,22 +136,23 @@ def _read(request: WorkRequest) -> Inputs:
     return read_inputs(spec, limits=_Limits(**request.limits))
 
 
-def _findings(inputs: Inputs) -> dict[str, Any]:
+def _findings(inputs: Inputs | PaintInputs) -> dict[str, Any]:
     """Return `gaussians`, `dropped`, `sh_degree`, `style` (width, height), `photos`, `views`, and `pixels` of these.
 
     `up` is that of an orbit, in the format of the API; None with cameras. `foreign` says that cameras hardly show the
-    scene; None if they do.
+    scene; None if they do. Both are None for painted views, which are those of `views`; they have no style.
     """
-    scene, image, up = inputs.scene_file.scene, inputs.style.images[0], inputs.orbit and inputs.orbit.up
+    scene = inputs.scene_file.scene
+    of_scene = {"gaussians": len(scene), "dropped": inputs.scene_file.dropped, "sh_degree": scene.sh_degree}
+    of_scene |= {"views": len(inputs.cameras), "pixels": _pixels(inputs.cameras)}
+    if isinstance(inputs, PaintInputs):
+        return {**of_scene, "style": [], "photos": 0, "up": None, "foreign": None}
+    image, up = inputs.style.images[0], inputs.orbit and inputs.orbit.up
     foreign = [f"{each.decision}; {each.reason}" for each in inputs.decisions if each.decision.startswith(OTHER_FRAME)]
     return {
-        "gaussians": len(scene),
-        "dropped": inputs.scene_file.dropped,
-        "sh_degree": scene.sh_degree,
+        **of_scene,
         "style": [image.shape[1], image.shape[0]],
         "photos": len(inputs.photos or []),
-        "views": len(inputs.cameras),
-        "pixels": _pixels(inputs.cameras),
         "up": up and {"direction": up.name, "sure": up.sure, "candidates": up.candidates, "reason": up.reason},
         "foreign": foreign[0].removeprefix("warning: ") if foreign else None,
     }
@@ -165,6 +169,15 @@ def _plan(request: WorkRequest, send: _Send) -> dict[str, Any]:
     inputs, settings = _read(request), request.parameters.settings()
     findings, spec = _findings(inputs), job_spec(request.staged, request.parameters)
     send({"checked": findings})
+    if isinstance(inputs, PaintInputs):
+        return {
+            **findings,
+            "plan": inputs.plan,
+            "estimated_seconds": inputs.seconds,
+            "total_seconds": _seconds_to_start() + time.perf_counter() - started + inputs.seconds,
+            "warnings": warnings_of(inputs.decisions),
+            "memory_bytes": inputs.peak_bytes,
+        }
     to_write = request.output and request.output_file
     left = seconds_left(settings.within, time.time() - _seconds_to_start() - (time.perf_counter() - started))
     job = dry_run(spec, inputs, lambda now: _show(now, send), to_write, left)
@@ -459,7 +472,7 @@ def _compile_kernels() -> None:
 def _memory_besides_reading(request: WorkRequest) -> int:
     """Return the memory limit in bytes for everything but reading: threads, and rendering or writing."""
     threads: int = request.threads * _THREAD_BYTES
-    if request.work == "validate" and not request.parameters.selects_by_images:
+    if request.work == "validate" and not request.parameters.renders_views:
         return threads
     default = default_memory_limit()
     return threads + min(request.parameters.settings().memory_limit or default, default)

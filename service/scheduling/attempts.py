@@ -151,7 +151,8 @@ class Stager:
         (folder / "out").mkdir(parents=True)
         job = lease.job
         checkpoint = self._store.jobs.artifact(job.id, CHECKPOINT)
-        workplace = self._workplace(lease, checkpoint) if self.cluster and not self._artifacts.local else None
+        on_ranks = self.cluster and not self._artifacts.local and not spec.paintings
+        workplace = self._workplace(lease, checkpoint) if on_ranks else None
         if workplace is None:
             self._stage(folder, lease, checkpoint)
         settings = spec.settings

@@ -213,7 +213,9 @@ class Capacity:
 
 
 def _seconds_of_steps(job: JobRow) -> float:
-    """Estimate the duration of all steps of a job on one GPU in seconds."""
+    """Estimate the duration of all steps of a job on one GPU in seconds; 0 for painted views, which have no steps."""
+    if any(entry["role"] == "painted" for entry in job.inputs):
+        return 0.0
     settings = _settings(job)
     side = min(_requested(job, "resolution") or _LONGER_SIDE, settings.max_resolution or math.inf)
     scales = scale_count(int(_ASPECT * side), int(side), settings.coarsest_side)

@@ -213,7 +213,7 @@ def _position(progress: dict[str, Any]) -> tuple[int, int]:
 
 
 #: Roles of few files, which are shown with every job.
-_NAMED_ROLES = ("scene", "style", "cameras")
+_NAMED_ROLES = ("scene", "style", "cameras", "painted")
 
 #: Table of the entries in `jobs.inputs`, and expressions for the position, the JSON and the role of an entry.
 _ENTRIES = {

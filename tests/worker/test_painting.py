@@ -10,11 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from api.cli.console import BAD_INPUT
 from api.cli.main import main
 from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.painting.solver import PASSES
+from sgsst_core.progress import Progress
+from sgsst_core.settings import make_settings
 from tests.small_scenes import wall
+from worker.job import JobSpec, SceneRequest
+from worker.options import PaintedFile
+from worker.painting import run_painting
+from worker.ranks.rank import WorkerOptions
+from worker.run import Listener
 
 OPTIONS = ("--orbit", "6", "--resolution", "96")
 
@@ -94,8 +103,43 @@ def test_result_has_the_format_of_its_name(folder: Path) -> None:
     assert read_scene(out).format == "spz"
 
 
+def test_picture_is_recognized_by_itself(folder: Path) -> None:
+    out = str(folder / "painted.ply")
+    shutil.copy(folder / "view.png", folder / "renamed.png")
+    assert main(["paint", str(folder / "scene.ply"), "--view", str(folder / "renamed.png"), "--out", out]) == 0
+    report = json.loads((folder / "painted.report.json").read_text())
+    assert report["views"] == [{"name": "orbit_0000", "width": 91, "height": 76}]
+    assert report["psnr_before"] > 45, "the picture has the resolution of its export, not of the cameras"
+
+
+def test_hostile_text_chunk_is_ignored(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    metadata = PngInfo()
+    metadata.add_text("sgsst-view", '{"view": "orbit_0000", "camera": {"width": 1e99}}')
+    with Image.open(folder / "view.png") as image:
+        image.save(folder / "hostile.png", pnginfo=metadata)
+    out = str(folder / "painted.ply")
+    assert main(["paint", str(folder / "scene.ply"), "--view", str(folder / "hostile.png"), "--out", out]) == BAD_INPUT
+    assert "does not state its view" in " ".join(capsys.readouterr().err.split())
+
+
+def test_interrupted_job_writes_nothing(folder: Path, tmp_path: Path) -> None:
+    request = JobSpec(
+        source=SceneRequest(scene=folder / "scene.ply"),
+        styles=(),
+        out=tmp_path / "painted.ply",
+        settings=make_settings(),
+        paintings=(PaintedFile(folder / "view.png"),),
+    )
+    reported: list[Progress] = []
+    listener = Listener(progress=reported.append, stop=lambda: reported[-1].step == 3)
+    result = run_painting(request, listener, WorkerOptions())
+    assert (result.stopped, result.steps, result.total) == ("interrupted", 3, PASSES)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_picture_of_another_view_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert paint(folder, "view.png", "orbit_0003") == BAD_INPUT
-    assert "is a picture of the view orbit_0000" in " ".join(capsys.readouterr().err.split())
-    assert paint(folder, "view.png", "front") == BAD_INPUT
+    assert "is an image of the view orbit_0000" in " ".join(capsys.readouterr().err.split())
+    Image.open(folder / "view.png").convert("RGB").save(folder / "unnamed.png")
+    assert paint(folder, "unnamed.png", "front") == BAD_INPUT
     assert "No view is called front" in " ".join(capsys.readouterr().err.split())

@@ -1,21 +1,22 @@
 // Stylize a scene: node example.js scene.ply painting.jpg stylized.ply
+// Let it follow a painted view: node example.js scene.ply painted.png painted.ply orbit_0000
 import { readFile, writeFile } from "node:fs/promises";
 import { basename } from "node:path";
 import { setTimeout } from "node:timers/promises";
 import createClient from "openapi-fetch";
 import type { components, paths } from "./schema.js";
 
-const [scene = "", style = "", out = ""] = process.argv.slice(2);
+const [scene = "", image = "", out = "", view = ""] = process.argv.slice(2);
 const key = process.env.SGSST_KEY;
 const service = createClient<paths>({
   baseUrl: process.env.SGSST_URL ?? "http://127.0.0.1:8000",
   redirect: "error", // the key is for this address alone
   headers: key ? { Authorization: `Bearer ${key}` } : {},
 });
-const parameters: Partial<components["schemas"]["JobParameters"]> = { preset: "preview", orbit: 24 };
+const parameters: Partial<components["schemas"]["JobParameters"]> = view ? { orbit: 24, painted: [{ view }] } : { preset: "preview", orbit: 24 };
 const form = new FormData();
 form.append("scene", new Blob([await readFile(scene)]), basename(scene));
-form.append("style", new Blob([await readFile(style)]), basename(style));
+form.append(view ? "painted" : "style", new Blob([await readFile(image)]), basename(image));
 form.append("parameters", JSON.stringify(parameters));
 const submitted = await service.POST("/v1/jobs", { body: form as never, bodySerializer: () => form });
 if (submitted.error) throw new Error(submitted.error.detail);

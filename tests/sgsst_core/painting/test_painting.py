@@ -11,7 +11,7 @@ from torch import Tensor
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.errors import CameraError
 from sgsst_core.orbit import orbit
-from sgsst_core.painting import solver
+from sgsst_core.painting import solver, spreading
 from sgsst_core.painting.solver import PaintedColors, PaintedView, paint
 from sgsst_core.painting.spreading import Spreading
 from sgsst_core.rasterizer import make_rasterizer
@@ -47,13 +47,12 @@ def blend_weights(scene: Scene, camera: Camera) -> Tensor:
     return torch.stack(columns, dim=1).double()
 
 
-def test_colors_are_those_of_dense_least_squares(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(solver, "ITERATIONS", 200)
+def test_colors_are_those_of_dense_least_squares(scene: Scene) -> None:
     scene = scene.subset(torch.arange(0, len(scene), max(len(scene) // 60, 1)))
     camera = cameras_of(scene)[0]
     image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(5)) * 0.2 + 0.4
     problem = PaintedColors(scene, [full(camera, image)], make_rasterizer("cpu", scene))
-    solved = problem.solve(problem.original, bounded=False)
+    solved = problem.solve(problem.original, bounded=False, iterations=200)
     weights, rest = blend_weights(scene, camera), rest_colors(scene.sh_rest, scene.means, camera).double()
     ridge = solver.RELATIVE_RIDGE * weights.sum(dim=0) + solver.RIDGE
     original = COLOR_OFFSET + SH_C0 * scene.sh_dc.double()
@@ -118,3 +117,29 @@ def test_map_of_colors_reaches_everywhere() -> None:
     change = -0.5 * colors
     spread = Spreading(means, colors, confidence)(torch.where(confidence[:, None] > 0, change, 0.0))
     assert (spread - change).abs().mean() < 0.02
+
+
+def neighbors_of_gray(means: Tensor, confidence: Tensor, change: Tensor) -> Tensor:
+    """Return the change of all Gaussians of one color by a plain search for the neighbors of each, in float64."""
+    low, high = torch.quantile(means, torch.tensor([0.1, 0.9], dtype=torch.float64), dim=0)
+    known = confidence > spreading._LEAST
+    mean = (confidence[known, None] * change[known]).sum(dim=0) / confidence[known].sum()
+    away = torch.cdist(means, means[known]) / (high - low).norm()
+    nearest, rows = away.topk(spreading._NEIGHBORS, largest=False)
+    votes = confidence[known][rows] * torch.exp(-0.5 * (nearest / nearest[:, spreading._NEIGHBORS // 2, None]).square())
+    local = (votes[:, :, None] * (change[known] - mean)[rows]).sum(dim=1) / votes.sum(dim=1, keepdim=True)
+    return mean + torch.exp(-(nearest[:, spreading._NEAR - 1, None] / spreading._FADE).square()) * local
+
+
+def test_neighbors_are_those_of_a_plain_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(3)
+    means = torch.rand(3000, 3, generator=generator, dtype=torch.float64)
+    change = torch.sin(5 * means)
+    confidence = torch.rand(3000, generator=generator, dtype=torch.float64) * (means[:, 0] < 0.6)
+    wanted, gray = neighbors_of_gray(means, confidence, change), torch.full_like(means, 0.5)
+    monkeypatch.setattr(spreading, "_MOST", 2000)  # fewer than there are Gaussians, which then share cells
+    shared = Spreading(means, gray, confidence)(change)
+    assert (shared - wanted).abs().mean() < 0.2 * (wanted - wanted.mean(dim=0)).abs().mean()
+    monkeypatch.setattr(spreading, "_MOST", 3000)
+    monkeypatch.setattr(spreading, "_APPROXIMATION", 0.0)
+    assert (Spreading(means, gray, confidence)(change) - wanted).abs().max() < 1e-3
