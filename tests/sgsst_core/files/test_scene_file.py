@@ -8,6 +8,7 @@ import re
 import struct
 import sys
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -545,21 +546,31 @@ def written(folder: Path, degree: int = 3) -> Path:
     return folder / "scene.ply"
 
 
+def rewritten(
+    source: Path, target: str, kinds: Callable[[str], str | None], *, form: str = "little", **added: Any
+) -> Path:
+    """Write the Gaussians of a PLY to another one of its folder: little, big, as text, or mixed up.
+
+    Args:
+        kinds: Function that returns the type of a property; None to leave it out.
+        added: Values of further properties, which lie between the coefficients if properties are mixed up.
+    """
+    old = PlyData.read(source)["vertex"].data
+    names = (*old.dtype.names, *added)
+    names = (*names[20:], *names[:20]) if form == "mixed up" else names
+    rows = np.empty(len(old), [(name, kind) for name in names if (kind := kinds(name))])
+    for name in rows.dtype.names or ():
+        rows[name] = added[name] if name in added else old[name]
+    path, order = source.with_name(target), {"text": "=", "big": ">"}.get(form, "<")
+    PlyData([PlyElement.describe(rows, "vertex")], text=form == "text", byte_order=order).write(str(path))
+    return path
+
+
 def in_another_encoding(path: Path, form: str) -> Path:
-    """Write the same scene as ASCII, as big-endian, with doubles, or with another property between the coefficients."""
-    vertices = PlyData.read(path)["vertex"].data
-    kinds = [(name, "<f8" if form == "doubles" and "rest" in name else "<f4") for name in vertices.dtype.names]
-    if form == "mixed up":
-        kinds.insert(20, ("extra", "u1"))
-        kinds.append(kinds.pop(12))
-    rows = np.zeros(len(vertices), kinds)
-    for name in vertices.dtype.names:
-        rows[name] = vertices[name]
-    target = path.with_name("other.ply")
-    PlyData([PlyElement.describe(rows, "vertex")], text=form == "text", byte_order=">" if form == "big" else "<").write(
-        target
-    )
-    return target
+    """Write the same scene as text, as big-endian, with doubles, or with another property between the coefficients."""
+    double = "f_rest" if form == "doubles" else "nothing"
+    extra = {"extra": 0} if form == "mixed up" else {}
+    return rewritten(path, "other.ply", lambda name: "<f8" if double in name else "<f4", form=form, **extra)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -617,10 +628,8 @@ def test_compressed_scenes_are_attenuated_in_their_ply(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("small_blocks")
 def test_integer_coefficients_cannot_be_attenuated(tmp_path: Path) -> None:
-    vertices = PlyData.read(written(tmp_path, 1))["vertex"].data
-    kinds = [(name, "i4" if "rest" in name else "<f4") for name in vertices.dtype.names]
-    PlyData([PlyElement.describe(vertices.astype(kinds), "vertex")], byte_order="<").write(tmp_path / "whole.ply")
-    source = read_scene(tmp_path / "whole.ply")
+    path = rewritten(written(tmp_path, 1), "whole.ply", lambda name: "i4" if "rest" in name else "<f4")
+    source = read_scene(path)
     write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc)
     with pytest.raises(SceneError, match="f_rest_0 is stored as integers, which cannot be attenuated"):
         write_stylized(source, tmp_path / "out.ply", source.scene.sh_dc, sh_attenuation=0.5)
@@ -629,25 +638,13 @@ def test_integer_coefficients_cannot_be_attenuated(tmp_path: Path) -> None:
 def with_filter(path: Path, scene: Scene, deviations: torch.Tensor, *, text: bool = False) -> Path:
     """Write a PLY with the property filter_3D."""
     write_scene(path, scene)
-    old = PlyData.read(path)["vertex"].data
-    rows = np.empty(len(old), [*old.dtype.descr, ("filter_3D", "<f4")])
-    for name in old.dtype.names:
-        rows[name] = old[name]
-    rows["filter_3D"] = deviations.numpy()
-    PlyData([PlyElement.describe(rows, "vertex")], text=text, byte_order="=" if text else "<").write(str(path))
-    return path
+    return rewritten(path, path.name, lambda _: "<f4", form="text" if text else "little", filter_3D=deviations.numpy())
 
 
 def without_thickness(path: Path, scene: Scene) -> Path:
     """Write a PLY without the property scale_2."""
     write_scene(path, scene)
-    old = PlyData.read(path)["vertex"].data
-    kinds = [each for each in old.dtype.descr if each[0] != "scale_2"]
-    rows = np.empty(len(old), kinds)
-    for name, *_ in kinds:
-        rows[name] = old[name]
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
-    return path
+    return rewritten(path, path.name, lambda name: None if name == "scale_2" else "<f4")
 
 
 def deviations_of(scene: Scene) -> torch.Tensor:
@@ -764,13 +761,10 @@ def test_flat_gaussians_can_be_split(tmp_path: Path) -> None:
 
 def test_isotropic_gaussians_are_not_flat(tmp_path: Path) -> None:
     write_scene(tmp_path / "scene.ply", wall())
-    old = PlyData.read(tmp_path / "scene.ply")["vertex"].data
-    kinds = [each for each in old.dtype.descr if each[0] not in ("scale_1", "scale_2")]
-    rows = np.empty(len(old), kinds)
-    for name, *_ in kinds:
-        rows[name] = old[name]
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(tmp_path / "round.ply"))
-    assert read_scene(tmp_path / "round.ply").scene.rendering == CLASSIC
+    path = rewritten(
+        tmp_path / "scene.ply", "round.ply", lambda name: None if name in ("scale_1", "scale_2") else "<f4"
+    )
+    assert read_scene(path).scene.rendering == CLASSIC
 
 
 pxr = pytest.importorskip("pxr", reason="usd-core is not installed")
