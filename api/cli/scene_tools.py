@@ -352,9 +352,9 @@ def run_quality(request: VariantsRequest, progress: Any) -> Quality:
 
 def quality_table(quality: Quality) -> Table:
     """Return a table of the quality measures of each variant. A star marks variants on the Pareto front."""
-    figures = ("style", "interior_style", "sliced_features", "color_distance", "content", "SSIM", "features")
-    ranges = [f"{reach}-range {measure}" for reach in ("short", "long") for measure in ("RMSE", "LPIPS")]
-    columns = (*figures, "background_sensitivity", "saturated", *ranges, "remaining loss", "steps")
+    figures = ("style", "interior style", "sliced features", "color distance", "content", "SSIM", "features")
+    ranges = [f"{reach} range {measure}" for reach in ("short", "long") for measure in ("RMSE", "LPIPS")]
+    columns = (*figures, "background sensitivity", "saturated", *ranges, "remaining loss", "steps")
     table = Table(
         Column("", no_wrap=True),
         *columns,
