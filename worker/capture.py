@@ -14,7 +14,7 @@ from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import read_scene_header
 from sgsst_core.files.formats.spz import SpzAxes, SpzHeader
 from sgsst_core.files.images import WHITE, Color
-from sgsst_core.files.photos import MAX_MISSING, Photo, PhotoFolder, check_photos, photo_size, some_names
+from sgsst_core.files.photos import MAX_MISSING, Photo, PhotoFolder, check_photos, photo_name, photo_size, some_names
 from sgsst_core.files.scene_file import SceneFile, read_scene
 from sgsst_core.orbit import Orbit, OrbitRequest, find_subject, find_up, make_orbit
 from sgsst_core.planning.survey import compare_photos, frame_warnings, implausible, shown_by
@@ -38,7 +38,7 @@ class Capture:
     Attributes:
         cameras: Cameras at the requested resolution.
         orbit: Orbit that generated the cameras; None if they come from a file.
-        names: Names of all requested cameras, including those of views that are left out.
+        names: Names of the photos of all requested cameras, including those of views that are left out.
         photo_sizes: Width and height of each camera's photo in the camera file.
         photos: Photo of each camera; None if the job uses unstylized renders.
         decisions: Decisions about cameras and photos for the plan.
@@ -70,7 +70,7 @@ class Capture:
             about = _about_lenses(self.cameras, "only the pinhole part of the cameras is used", reason)
             return replace(self, decisions=(*self.decisions, *about))
         matches = check_photos(folder, self.cameras)
-        missing = [camera.name for camera, photo in zip(self.cameras, matches, strict=True) if photo is None]
+        missing = [photo_name(camera) for camera, photo in zip(self.cameras, matches, strict=True) if photo is None]
         used = [index for index, photo in enumerate(matches) if photo is not None]
         photos = [photo for photo in matches if photo is not None]
         cameras = [undistorted(self.cameras[index]) for index in used]
@@ -78,7 +78,7 @@ class Capture:
         width = min((new.width / self.cameras[i].width for new, i in zip(cameras, used, strict=True)), default=1.0)
         size = f"at least {width:.0%} of their width, as much as their photos fill" if width < 1 else "their size"
         lines = _about_lenses(cameras, "the photos are undistorted", f"views keep {size}")
-        lines += _about_photos(sizes, photos, missing)
+        lines += _about_photos(cameras, sizes, photos, missing)
         if strangers := PhotoFolder(folder).strangers(self.names):
             reason = f"they have the name of no camera: {some_names(strangers)}"
             mostly = len(strangers) > MAX_MISSING * (len(strangers) + len(photos))
@@ -123,14 +123,18 @@ def read_capture(
         cameras = list(orbit.cameras)
     else:
         cameras = read_cameras(source.cameras, images, notes.append)
-    names = tuple(camera.name for camera in cameras)
+    names = tuple(dict.fromkeys(map(photo_name, cameras)))
+    panoramas = len({camera.panorama for camera in cameras} - {None})
     if source.views is not None:
         cameras = spread(cameras, source.views)
     sizes = [photo_size(camera) for camera in cameras]
     if source.resolution is not None:
         cameras = [resized(camera, source.resolution) for camera in cameras]
-    decisions = tuple(Decision("cameras", _PERHAPS_NOT_ALL, note) for note in notes)
-    return Capture(cameras, orbit, names, sizes, decisions=decisions)
+    decisions = [Decision("cameras", _PERHAPS_NOT_ALL, note) for note in notes]
+    if panoramas:
+        reason = "views are pinholes: one for each face of a cube, with the panorama's pixels per degree in its middle"
+        decisions.append(Decision("cameras", f"{panoramas} of {len(names)} are panoramas, six views each", reason))
+    return Capture(cameras, orbit, names, sizes, decisions=tuple(decisions))
 
 
 def choose_axes(source: SceneRequest, images: Path | None = None) -> tuple[SpzAxes, list[Decision]]:
@@ -222,14 +226,16 @@ def orbit_request(source: SceneRequest) -> OrbitRequest:
 
 
 def _about_lenses(cameras: Sequence[Camera], decision: str, reason: str) -> list[Decision]:
-    """Return the decision about distorted cameras; nothing if there are none."""
-    models = sorted({camera.lens.model for camera in cameras if camera.lens})
-    count = sum(camera.lens is not None for camera in cameras)
+    """Return the decision about distorted cameras; nothing if there are none. Cube faces have no distortion."""
+    distorted = [camera.lens.model for camera in cameras if camera.lens and camera.panorama is None]
+    models, count = sorted(set(distorted)), len(distorted)
     about = f"{count} of {len(cameras)} cameras have lens distortion ({', '.join(models)})"
     return [Decision("lenses", decision, f"{about}; {reason}")] if models else []
 
 
-def _about_photos(sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]) -> list[Decision]:
+def _about_photos(
+    cameras: Sequence[Camera], sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], missing: Sequence[str]
+) -> list[Decision]:
     """Return the decisions about missing, resized and rotated photos."""
     lines = []
     if missing:
@@ -242,7 +248,8 @@ def _about_photos(sizes: Sequence[tuple[int, int]], photos: Sequence[Photo], mis
         lines.append(
             Decision("photos", f"{len(other)} are resized to their views", f"they have other sizes, such as {shapes}")
         )
-    shared = [path.name for path, count in Counter(photo.path for photo in photos).items() if count > 1]
+    single = [photo.path for camera, photo in zip(cameras, photos, strict=True) if camera.panorama is None]
+    shared = [path.name for path, count in Counter(single).items() if count > 1]
     if shared:
         text = f"warning: {len(shared)} belong to several cameras each, of which they can show one"
         lines.append(Decision("photos", text, f"the names of these cameras are the same: {some_names(shared)}"))

@@ -408,7 +408,7 @@ def video_cameras(
     Args:
         scene: Scene that a turntable surrounds.
         source: Up direction, elevation, radius and near plane of a turntable.
-        through: Cameras that the path leads through; None for a turntable.
+        through: Cameras that the path leads through, of panoramas only the front faces; None for a turntable.
         side: Longer side in pixels; None for the cameras' own, but at most `DEFAULT_SIDE`.
         remaining: [N] bool, Gaussians of a cropped scene that a turntable surrounds; None for all.
         even: Whether sides must be even.
@@ -419,7 +419,8 @@ def video_cameras(
     if through is not None:
         if not through:
             raise CameraError("A camera path needs at least one camera. Give some, or use the path orbit.")
-        path = CameraPath(in_path_order(through)).evenly(options.frames)
+        ahead = [camera for camera in through if camera.name == f"{camera.panorama}.front" or camera.panorama is None]
+        path = CameraPath(in_path_order(ahead or through)).evenly(options.frames)
         side = side or min(DEFAULT_SIDE, max(path[0].width, path[0].height))
         return [framed(camera, side, even=even) for camera in path]
     request = orbit_request(source)

@@ -117,7 +117,7 @@ def export_view(source: SceneRequest, name: str, background: Color, out: Path) -
     if out.suffix.lower() != ".png":  # a mistyped path must not overwrite a scene
         raise OutputError(f"{out}: not the name of a PNG image. Give one, such as {name}.png.")
     file, capture = read_scene_and_capture(source)
-    camera = _named(capture.cameras, name)
+    camera = camera_named(capture.cameras, name)
     image = _render(make_rasterizer("cpu", file.scene, background=background, near=source.near), file, camera)
     metadata = PngInfo()
     metadata.add_text(_CHUNK, PaintedOptions(view=name, camera=_parameters(camera)).model_dump_json())
@@ -196,7 +196,7 @@ def _camera_of(painted: PaintedFile, cameras: Sequence[Camera], limits: InputLim
         return Camera.from_matrix(camera.world_to_camera, intrinsics, camera.width, camera.height, name)
     if known.view is None:
         raise CameraError(f"{path}: does not state its view. Name the view, or export the image again.")
-    return _named(cameras, known.view)
+    return camera_named(cameras, known.view)
 
 
 def _check_together(paintings: Sequence[PaintedFile], cameras: Sequence[Camera]) -> None:
@@ -217,10 +217,14 @@ def _check_together(paintings: Sequence[PaintedFile], cameras: Sequence[Camera])
         )
 
 
-def _named(cameras: Sequence[Camera], name: str) -> Camera:
-    """Return the camera of a name."""
+def camera_named(cameras: Sequence[Camera], name: str) -> Camera:
+    """Return the camera of a name; given that of a panorama, its front face.
+
+    Raises:
+        CameraError: If there is none.
+    """
     for camera in cameras:
-        if camera.name == name:
+        if name in (camera.name, camera.panorama):
             return camera
     some = ", ".join(camera.name for camera in cameras[:5])
     raise CameraError(f"No view is called {name}. There are {len(cameras)}: {some}{', ...' * (len(cameras) > 5)}.")

@@ -44,7 +44,7 @@ _SUMMARIES: dict[str, dict[str, str]] = {
     "scene_commands": {
         "plan": "Show what a stylization would skip and why, and what a step would cost.",
         "check": "Report extreme values in a scene, its views and its style, and their consequences.",
-        "render": "Render all views of a scene as images, or a video along a camera path.",
+        "render": "Render all views of a scene as images, a video along a camera path, or a 360-degree image.",
         "convert": "Convert a scene to another format, which the name of OUT determines.",
         "blend": "Blend scenes that differ only in color: a scene and its results, or several results.",
         "view": "Write a scene as one HTML file, which shows it in 3D in a browser, without a server.",

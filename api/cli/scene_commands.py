@@ -125,7 +125,20 @@ def render(
             rich_help_panel=ESSENTIALS,
         ),
     ] = None,
+    panorama: Annotated[
+        Path | None,
+        typer.Option(
+            help="360-degree image to write instead: a level equirectangular PNG from the position of a camera, 4096 "
+            "pixels wide, or --resolution.",
+            callback=file_to_write,
+            rich_help_panel=ESSENTIALS,
+        ),
+    ] = None,
     cameras: CamerasOption = None,
+    position: Annotated[
+        str | None,
+        typer.Option("--from", metavar="NAME", help="Camera of the 360-degree image. [default: the first one]"),
+    ] = None,
     compare: Annotated[
         Path | None,
         path_to_read("Unstylized scene: the video starts with it and ends with SCENE."),
@@ -138,13 +151,18 @@ def render(
     video_options: VideoOptions,
     chosen: StylizeOptions,
 ) -> None:
-    """Render all views of a scene as images, or a video along a camera path."""
+    """Render all views of a scene as images, a video along a camera path, or a 360-degree image."""
     from worker.job import SceneRequest
 
     background = chosen.settings().background
     given = [*video_options.model_fields_set, *(["compare"] if compare else []), *(["transparent"] * transparent)]
-    if (out is None) == (video is None):
-        raise SettingsError("Give --out FOLDER for images of the views, or --video FILE for a video, but not both.")
+    if [out, video, panorama].count(None) != 2:
+        raise SettingsError(
+            "Give one of --out FOLDER for images of the views, --video FILE for a video, and --panorama FILE for a "
+            "360-degree image."
+        )
+    if position is not None and panorama is None:
+        raise SettingsError("--from requires --panorama. Add it, or omit --from.")
     around = video is not None and video_options.path == "orbit"
     source = (SceneRequest.of if around else source_of)(scene, cameras, options)
     if video is not None:
@@ -153,6 +171,12 @@ def render(
         _render_video(VideoRequest(source, video, video_options, background, compare, transparent))
     elif given:
         raise SettingsError(f"--{given[0]} requires --video. Add it, or omit --{given[0]}.")
+    elif panorama is not None:
+        from api.cli.scene_tools import render_panorama
+
+        with _frame_bar() as progress:
+            camera = render_panorama(source, background, position, panorama, progress, _print_warning)
+        print_field("panorama", f"{panorama}, from the position of {camera.name}")
     elif out is not None:
         from api.cli.scene_tools import render_views
 

@@ -34,12 +34,15 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.report.document import machine, plan_json
 from sgsst_core.report.images import write_views
 from sgsst_core.scene.camera import Camera, resized
+from sgsst_core.scene.panorama import faces_to_render, join_faces, level
 from sgsst_core.scene.spherical_harmonics import scene_colors
+from worker.capture import orbit_request
 from worker.derived import blend
 from worker.inputs import check_something_seen, read_inputs, read_scene_and_capture
 from worker.job import JobSpec, SceneRequest, check_choice
 from worker.options import ViewOptions, split_weight
 from worker.outputs import check_is_not_input
+from worker.painting import camera_named
 from worker.prepare import dry_run
 
 if TYPE_CHECKING:  # it imports matplotlib, for which the other commands need not wait
@@ -182,6 +185,55 @@ def render_views(
         save_png(path, rasterizer.render(scene_colors(scene, camera), camera))
         progress(index + 1, len(cameras))
     return paths
+
+
+#: Width in pixels of a panorama, unless the request has a resolution.
+PANORAMA_WIDTH = 4096
+
+
+def render_panorama(
+    source: SceneRequest,
+    background: tuple[float, float, float],
+    name: str | None,
+    out: Path,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    warn: Callable[[str], None] = lambda line: None,
+) -> Camera:
+    """Render a level equirectangular PNG from the position of a camera, and return the camera.
+
+    All inputs are checked first. Up is the requested axis, or the mean of the cameras' own up directions.
+
+    Args:
+        background: Background color, in 0..1.
+        name: Name of the camera, or of the panorama in the camera file; None for the first camera.
+        progress: Callback that receives the numbers of completed and of all cube faces.
+        warn: Callback for warnings about scene and cameras.
+
+    Raises:
+        InvalidInputError: If scene or cameras cannot be used, no camera has this name, or `out` is not a PNG's name.
+    """
+    check_choice(source)
+    if out.suffix.lower() != ".png":  # a mistyped path must not overwrite a scene
+        raise OutputError(f"{out}: not the name of a PNG image. Give one, such as panorama.png.")
+    file, capture = read_scene_and_capture(source)
+    scene, cameras = file.scene, capture.cameras
+    camera = cameras[0] if name is None else camera_named(cameras, name)
+    ups = torch.stack([-each.world_to_camera[1, :3] for each in cameras])
+    requested = orbit_request(source).up
+    up = ups.mean(dim=0) if requested is None else torch.tensor(requested, dtype=torch.float64)
+    width = max(2, (source.resolution or PANORAMA_WIDTH) // 2 * 2)
+    faces = faces_to_render(level(camera, up), width)
+    rasterizer = make_rasterizer("cpu", scene, background=background, near=source.near, memory=0)
+    check_something_seen(scene, faces, rasterizer)
+    for line in warnings_of(capture.decisions):
+        warn(line)
+    images = []
+    for face in faces:
+        images.append(rasterizer.render(scene_colors(scene, face), face))
+        progress(len(images), len(faces))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_png(out, join_faces(images, width))
+    return camera
 
 
 def view_file_names(cameras: Sequence[Camera]) -> list[str]:

@@ -9,6 +9,11 @@ import { words } from "./words.js";
  *   `axes`: right, down and forward in the world
  */
 
+/** Cube faces of a panorama: their axes right, down and forward, as signed numbers of those of the panorama from 1. */
+const FACES = { front: [1, 2, 3], right: [-3, 2, 1], back: [-1, 2, -3], left: [3, 2, -1], up: [1, 3, -2], down: [1, -3, 2] };
+/** Numbers of parameters of COLMAP's camera models that are shown: both without a lens, and panoramas. */
+const PARAMETERS = new Map([[0, 3], [1, 4], [17, 2]]);
+
 /**
  * Read the cameras of camera files. The service supports more formats, and its reading is the one that counts.
  *
@@ -22,7 +27,7 @@ export async function readCameras(files) {
   for (const file of files.filter((each) => each.name.toLowerCase().endsWith(".json"))) {
     const content = JSON.parse(await file.blob.text());
     if (Array.isArray(content)) return content.map(inriaCamera);
-    if (Array.isArray(content?.frames)) return content.frames.map((/** @type {any} */ frame) => transformsCamera({ ...content, ...frame }));
+    if (Array.isArray(content?.frames)) return byFace(content.frames.map((/** @type {any} */ frame) => transformsCameras({ ...content, ...frame })));
   }
   throw new Error(words.cameras.notReadHere);
 }
@@ -36,14 +41,14 @@ function inriaCamera(entry) {
   });
 }
 
-/** @param {any} values */
-function transformsCamera(values) {
+/** @param {any} values @returns {JobCamera[]} */
+function transformsCameras(values) {
   const m = values.transform_matrix, column = (/** @type {number} */ k, sign = 1) => [0, 1, 2].map((row) => sign * Number(m[row][k]));
   const width = values.w ?? 800, height = values.h ?? 800;
+  const pose = { name: String(values.file_path ?? ""), position: column(3), axes: [column(0), column(1, -1), column(2, -1)], width, height };
+  if (/^(equirectangular|spherical)$/i.test(values.camera_model)) return cubeFaces(pose);
   const fx = values.fl_x ?? width / 2 / Math.tan((values.camera_angle_x ?? 0.8) / 2);
-  return checked({
-    name: String(values.file_path ?? ""), position: column(3), axes: [column(0), column(1, -1), column(2, -1)], fx, fy: values.fl_y ?? fx, width, height,
-  });
+  return [checked({ ...pose, fx, fy: values.fl_y ?? fx })];
 }
 
 /** @param {ArrayBuffer} images @param {ArrayBuffer} intrinsics */
@@ -52,19 +57,19 @@ function colmapCameras(images, intrinsics) {
   const models = new Map();
   let view = new DataView(intrinsics), at = 8;
   for (let left = Number(view.getBigUint64(0, true)); left > 0; left--) {
-    const id = view.getUint32(at, true), model = view.getInt32(at + 4, true);
-    if (model > 1) throw new Error(words.cameras.notReadHere);
-    const values = [8, 16, 24, 32].map((offset) => view.getFloat64(at + offset + 16, true));
+    const id = view.getUint32(at, true), model = view.getInt32(at + 4, true), count = PARAMETERS.get(model);
+    if (!count) throw new Error(words.cameras.notReadHere);
     const size = [Number(view.getBigUint64(at + 8, true)), Number(view.getBigUint64(at + 16, true))];
-    models.set(id, [...size, values[0], model ? values[1] : values[0]]);
-    at += 24 + (model ? 32 : 24);
+    const focal = [24, model === 1 ? 32 : 24].map((offset) => view.getFloat64(at + offset, true));
+    models.set(id, count === 2 ? size : [...size, ...focal]);
+    at += 24 + 8 * count;
   }
   view = new DataView(images);
   at = 8;
   const found = [];
   for (let left = Number(view.getBigUint64(0, true)); left > 0; left--) {
     const [w, x, y, z, ...t] = Array.from({ length: 7 }, (_, i) => view.getFloat64(at + 4 + 8 * i, true));
-    const [width, height, fx, fy] = models.get(view.getUint32(at + 60, true)) ?? [0, 0, 0, 0];
+    const [width, height, ...focal] = models.get(view.getUint32(at + 60, true)) ?? [0, 0, 0, 0];
     let end = at + 64;
     while (view.getUint8(end)) end++;
     const name = new TextDecoder().decode(new Uint8Array(images, at + 64, end - at - 64));
@@ -74,9 +79,27 @@ function colmapCameras(images, intrinsics) {
       [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
       [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ];
-    found.push(checked({ name, position: axes.map((axis, i) => times(axis, -t[i])).reduce(sum), axes, fx, fy, width, height }));
+    const pose = { name, position: axes.map((axis, i) => times(axis, -t[i])).reduce(sum), axes, width, height };
+    found.push({ name, cameras: focal.length ? [checked({ ...pose, fx: focal[0], fy: focal[1] })] : cubeFaces(pose) });
   }
-  return found.sort((a, b) => (a.name < b.name ? -1 : 1));
+  return byFace(found.sort((a, b) => (a.name < b.name ? -1 : 1)).map(({ cameras }) => cameras));
+}
+
+/**
+ * Return the cube faces of a panorama, named and sized as the service does.
+ *
+ * @param {{name: string, position: Vector, axes: Vector[], width: number, height: number}} panorama
+ */
+function cubeFaces({ name, position, axes, width }) {
+  const side = Math.ceil(width / Math.PI), size = { fx: side / 2, fy: side / 2, width: side, height: side };
+  return Object.entries(FACES).map(([face, signed]) =>
+    checked({ name: `${name}.${face}`, position, axes: signed.map((n) => times(axes[Math.abs(n) - 1], Math.sign(n))), ...size }));
+}
+
+/** Return the first camera of each image, then the further ones of panoramas, as the service does. @param {JobCamera[][]} images */
+function byFace(images) {
+  const most = Math.max(0, ...images.map((cameras) => cameras.length));
+  return Array.from({ length: most }, (_, i) => images.flatMap((cameras) => cameras[i] ?? [])).flat();
 }
 
 /** @param {JobCamera} camera @returns {JobCamera} */

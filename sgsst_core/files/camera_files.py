@@ -2,7 +2,8 @@
 
 All formats are converted to `Camera`: a pinhole camera with a world-to-camera pose, axes x right, y down, z forward,
 and pixel centers at half-integers. This is COLMAP's convention; the JSON formats share it for the principal point. A
-camera with lens distortion is the pinhole with the same focal lengths and principal point, and has a `Lens`.
+camera with lens distortion is the pinhole with the same focal lengths and principal point, and has a `Lens`. A
+panorama becomes the cameras of its cube faces.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from __future__ import annotations
 import json
 import math
 from collections import ChainMap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -35,12 +37,15 @@ from sgsst_core.files.images import image_size
 from sgsst_core.files.photos import PhotoFolder
 from sgsst_core.scene.camera import COEFFICIENTS, FORMULAS, Camera, Lens
 from sgsst_core.scene.gaussians import exact_rotation
+from sgsst_core.scene.panorama import cube_faces
 
 #: Largest deviation of a size from whole pixels that is attributed to rounding: 119.99999 is 120.
 _WHOLE_TOLERANCE = 0.01
 
-#: Camera models without a focal length.
-_NO_PINHOLES = ("EQUIRECTANGULAR", "SPHERICAL", "ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
+#: Names of the camera model of 360-degree panoramas.
+_PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")
+#: Other camera models without a focal length.
+_NO_PINHOLES = ("ORTHOPHOTO", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
 #: Offset of a principal point from the middle of an image, relative to half its sides, above which an image counts as
 #: resized if the file gives no sizes.
 _OFF_CENTER = 0.1
@@ -54,7 +59,8 @@ _ONE_FOCAL = (
 def read_cameras(path: Path, photos: Path | None = None, warn: Warn | None = None) -> list[Camera]:
     """Detect the format of a camera file or folder (see `find_cameras`), and read its cameras.
 
-    Cameras from JSON keep their order; COLMAP's images are sorted by name.
+    Cameras from JSON keep their order; COLMAP's images are sorted by name. A panorama has its front face in its place;
+    the other faces of all panoramas follow, one direction after the other, so that evenly spread views look around.
 
     nerfstudio trains in a coordinate frame of its own. To match a scene exported by nerfstudio, cameras must be
     transformed by the `dataparser_transforms.json` of its training run. If that file lies beside the transforms.json,
@@ -77,13 +83,15 @@ def read_cameras(path: Path, photos: Path | None = None, warn: Warn | None = Non
     content = load_json(file)
     refuse_camera_json(file, content)
     if isinstance(content, list):
-        return _convert_entries(file, content, _inria_camera)
+        return _convert_entries(file, content, lambda where, entry: [_inria_camera(where, entry)])
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         return _read_transforms(file, content, photos)
     raise CameraError(f"{file}: is in no known camera format. Give {FORMATS}.")
 
 
-def _convert_entries(path: Path, entries: list[Any], convert: Any) -> list[Camera]:
+def _convert_entries(
+    path: Path, entries: list[Any], convert: Callable[[str, dict[str, Any]], list[Camera]]
+) -> list[Camera]:
     """Convert the entries of a JSON list; error messages name the entry by its index."""
     if not entries:
         raise CameraError(f"{path}: holds no cameras. Export them again.")
@@ -93,7 +101,12 @@ def _convert_entries(path: Path, entries: list[Any], convert: Any) -> list[Camer
         if not isinstance(entry, dict):
             raise CameraError(f"{where}: is not an object with named values. Give {FORMATS}.")
         cameras.append(convert(where, entry))
-    return cameras
+    return _by_face(cameras)
+
+
+def _by_face(cameras: Iterable[list[Camera]]) -> list[Camera]:
+    """Return the cameras of images, of which a panorama has several: the first of each image, then the others."""
+    return [camera for faces in zip_longest(*cameras) for camera in faces if camera is not None]
 
 
 def _stated(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -119,7 +132,7 @@ def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -
     common = _stated(content)
     frame_change = _dataparser_change(path, common)
 
-    def convert(where: str, frame: dict[str, Any]) -> Camera:
+    def convert(where: str, frame: dict[str, Any]) -> list[Camera]:
         name = str(PurePosixPath(_name(where, frame, "file_path").replace("\\", "/")))
         where = f"{where} ({name!r})"
         values = ChainMap(_stated(frame), common)  # a copy of the common values per frame could take hours
@@ -130,10 +143,13 @@ def _read_transforms(path: Path, content: dict[str, Any], photos: Path | None) -
         pose = frame_change(pose)
         pose[:3, 1:3] *= -1  # from OpenGL's axes (x right, y up, z backward) to those of `Camera`
         model = _transforms_model(where, values)
+        if model in _PANORAMAS:
+            return _panorama(where, name, size, _inverse(where, pose))
         pinhole = _transforms_intrinsics(where, values, size)
         keys = COEFFICIENTS[FORMULAS.get(model)]
         coefficients = [_number(where, values, key) if values.get(key) is not None else 0.0 for key in keys]
-        return _camera(where, name, size, pinhole, _inverse(where, pose), Lens.of(model, coefficients, size, pinhole))
+        lens = Lens.of(model, coefficients, size, pinhole)
+        return [_camera(where, name, size, pinhole, _inverse(where, pose), lens)]
 
     return _convert_entries(path, content["frames"], convert)
 
@@ -146,8 +162,8 @@ def _transforms_model(where: str, values: Mapping[str, Any]) -> str:
     model = str(values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "")).upper()
     if model in _NO_PINHOLES or model.startswith("VR180"):
         raise CameraError(
-            f"{where}: has camera model {model[:40]}, which has no pinhole part. Split the panoramas into perspective "
-            "images first, for example with `ns-process-data images --camera-type equirectangular`."
+            f"{where}: has camera model {model[:40]}, which is neither a pinhole with a lens nor a 360-degree panorama "
+            "(EQUIRECTANGULAR). Give the cameras of such images."
         )
     return model
 
@@ -237,7 +253,7 @@ def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
     notes: list[str] = []
     lenses, images = read_model(folder, notes.append)
     cameras = []
-    for image in images:
+    for image in sorted(images, key=lambda image: image.name):
         where = f"{folder}: image {image.name!r}"
         lens = lenses.get(image.camera)
         if lens is None:
@@ -245,9 +261,18 @@ def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
         matrix = np.eye(4)
         matrix[:3, :3] = _rotation_matrix(where, image.rotation)
         matrix[:3, 3] = image.translation
+        size = (lens.width, lens.height)
+        if lens.model in _PANORAMAS:
+            if lens.parameters != size:
+                raise CameraError(
+                    f"{where}: is a panorama of {size[0]} x {size[1]}, but the parameters of its camera state another "
+                    "size. Export the model again."
+                )
+            cameras.append(_panorama(where, image.name, size, matrix))
+            continue
         of_photos = _colmap_lens(where, lens)
         pinhole = (of_photos.fx, of_photos.fy, of_photos.cx, of_photos.cy)
-        cameras.append(_camera(where, image.name, (lens.width, lens.height), pinhole, matrix, of_photos))
+        cameras.append([_camera(where, image.name, size, pinhole, matrix, of_photos)])
     if not cameras:
         reasons = "".join(f" {note}." for note in notes)
         raise CameraError(f"{folder}: the COLMAP model has no registered image. Run `colmap mapper` again.{reasons}")
@@ -256,15 +281,10 @@ def _read_colmap(folder: Path, warn: Warn) -> list[Camera]:
         notes.append(f"{folder}: {unused:,} of {len(lenses):,} cameras belong to no image. {COMPARE}")
     for note in notes:
         warn(note)
-    return sorted(cameras, key=lambda camera: camera.name)
+    return _by_face(cameras)
 
 
 def _colmap_lens(where: str, camera: ColmapCamera) -> Lens:
-    if camera.model == "EQUIRECTANGULAR":
-        raise CameraError(
-            f"{where}: has camera model EQUIRECTANGULAR, which has no pinhole part. Use the cameras of perspective "
-            "images: COLMAP's example `panorama_sfm.py` makes both from panoramas."
-        )
     if camera.model in _ONE_FOCAL:
         fx, cx, cy, *rest = camera.parameters
         pinhole = (fx, fx, cx, cy)
@@ -307,6 +327,12 @@ def _camera(
         raise CameraError(f"{where}: holds NaN or infinite values. Export the cameras again.")
     matrix = torch.from_numpy(exact_rotation(where, world_to_camera))
     return Camera(name, *size, *intrinsics, matrix, lens=lens if lens and lens.distorts else None)
+
+
+def _panorama(where: str, name: str, size: tuple[int, int], world_to_camera: NDArray[Any]) -> list[Camera]:
+    """Return the cube faces of a panorama, after the checks of `_camera`."""
+    checked = _camera(where, name, size, (1.0, 1.0, 0.0, 0.0), world_to_camera)
+    return cube_faces(name, *size, checked.world_to_camera)
 
 
 def _inverse(where: str, pose: NDArray[Any]) -> NDArray[Any]:

@@ -221,7 +221,8 @@ _MODELS = {
     16: ("EUCM", 6),
     17: ("EQUIRECTANGULAR", 2),
 }
-_PARAMETERS = dict(_MODELS.values())
+#: Numbers of parameters by name in text files. Programs that had panoramas before COLMAP call them SPHERICAL.
+_PARAMETERS = {**dict(_MODELS.values()), "SPHERICAL": 2}
 #: Stricter than `int` and `float`, which accept `1_0` and digits of other scripts.
 _INTEGER = re.compile("[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")

@@ -150,9 +150,10 @@ def check_photos(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     if not folder.is_dir():
         raise ImageError(f"{folder}: is not a folder of photos. Give the folder that the cameras' names refer to.")
     files = PhotoFolder(folder)
-    matches = [files.named(camera.name) for camera in cameras]
-    missing = [camera.name for camera, paths in zip(cameras, matches, strict=True) if not paths]
-    several = {camera.name: paths for camera, paths in zip(cameras, matches, strict=True) if len(paths) > 1}
+    names = [photo_name(camera) for camera in cameras]
+    matches = [files.named(name) for name in names]
+    missing = [name for name, paths in zip(names, matches, strict=True) if not paths]
+    several = {name: paths for name, paths in zip(names, matches, strict=True) if len(paths) > 1}
     by_name = (
         "Photos are found by the cameras' names, with or without extension: give the folder that holds exactly these."
     )
@@ -190,8 +191,9 @@ def check_names(folder: Path, names: Sequence[str], *, masks: bool = False) -> N
 
 
 def some_names(names: Sequence[str]) -> str:
-    """Return the first names of a list, separated by commas."""
-    return ", ".join(names[:_NAMES_IN_MESSAGE]) + (", ..." if len(names) > _NAMES_IN_MESSAGE else "")
+    """Return the first different names of a list, separated by commas."""
+    different = list(dict.fromkeys(names))  # the faces of a panorama have one photo
+    return ", ".join(different[:_NAMES_IN_MESSAGE]) + (", ..." if len(different) > _NAMES_IN_MESSAGE else "")
 
 
 def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
@@ -208,14 +210,14 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
     files = PhotoFolder(folder, masks=True)
     masks: list[Photo | None] = []
     for camera in cameras:
-        paths = files.named(camera.name)
+        paths = files.named(photo_name(camera))
         if len(paths) > 1:
-            raise ImageError(f"{folder}: holds more than one mask for view {camera.name}. Leave one.")
+            raise ImageError(f"{folder}: holds more than one mask for view {photo_name(camera)}. Leave one.")
         masks.append(_fitting(paths[0], camera) if paths else None)
     if not any(masks):
         raise ImageError(
             f"{folder}: holds no mask for any of {len(cameras)} views. Masks are found by the cameras' names, with or "
-            f"without extension, or with `.png` or `.mask.png` behind it, such as {cameras[0].name}."
+            f"without extension, or with `.png` or `.mask.png` behind it, such as {photo_name(cameras[0])}."
         )
     return masks
 
@@ -223,8 +225,8 @@ def find_masks(folder: Path, cameras: Sequence[Camera]) -> list[Photo | None]:
 def load_photo(photo: Photo, camera: Camera, *, background: Color = BLACK, color_managed: bool = True) -> Tensor:
     """Read a photo as its pinhole camera sees it: [height, width, 3] float32 in 0..1.
 
-    If the camera has a lens, its distortion is removed (`undistort`). Otherwise the photo is resized to the camera's
-    size (antialiased bicubic).
+    If the camera has a lens, its distortion is removed (`undistort`), and a cube face is taken from its panorama.
+    Otherwise the photo is resized to the camera's size (antialiased bicubic).
 
     Args:
         photo: Photo of the camera, from `check_photos` or `find_masks`.
@@ -267,6 +269,12 @@ def undistort(photo: Tensor, camera: Camera) -> Tensor:
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
     u, v = lens.positions(*torch.meshgrid(x, y, indexing="xy"))
+    if camera.panorama is not None:  # beyond a pole is the other side, beyond the right edge the left one
+        above, below = planes[:, :, [0, -1]].roll(planes.shape[3] // 2, dims=3).split(1, dim=2)
+        planes = torch.cat([above, planes, below], dim=2)
+        planes = torch.nn.functional.pad(planes, (1, 1, 0, 0), mode="circular")
+        u = (u - 0.5) * (1 - 2 / planes.shape[3]) + 0.5
+        v = (v - 0.5) * (1 - 2 / planes.shape[2]) + 0.5
     grid = (2 * torch.stack([u, v], dim=2) - 1).float()[None]
     sampled = torch.nn.functional.grid_sample(planes, grid, "bilinear", "border", align_corners=False)
     return sampled[0].permute(1, 2, 0).clamp(0, 1).contiguous()
@@ -278,6 +286,11 @@ def fits(size: tuple[int, int], camera: Camera) -> bool:
     # a camera's size is rounded to whole pixels, which changes the aspect ratio of a small camera
     allowed = ASPECT_TOLERANCE + 0.5 / min(width, height)
     return abs(size[0] * height / (size[1] * width) - 1) <= allowed
+
+
+def photo_name(camera: Camera) -> str:
+    """Return the name of a camera's photo: its own, or that of the panorama of which it is a face."""
+    return camera.panorama or camera.name
 
 
 def photo_size(camera: Camera) -> tuple[int, int]:

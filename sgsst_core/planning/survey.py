@@ -230,23 +230,25 @@ _TINY = 1e-12
 def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list[Decision]:
     """Return a warning if the near plane hides much, or cameras seem to be in another coordinate frame than the scene.
 
-    Views are rendered only if they show few Gaussians.
+    Views are rendered only if they show few Gaussians. Panoramas say nothing about the frame: together, the faces of
+    one show every Gaussian in any frame.
 
     Raises:
         CameraError: If the cameras show almost nothing of the scene.
     """
-    shown = shown_by(scene.means, cameras, near)
+    single = [camera for camera in cameras if camera.panorama is None]
+    shown = shown_by(scene.means, single or cameras, near)
     hidden = []
     if shown.near is not None:
         warning = f"warning: {hidden_text(shown, len(scene), near)}"
         hidden = [Decision("cameras", warning, f"they are not drawn; add --near {shown.near:g} to draw them")]
-    if shown.typical >= _LITTLE_SHOWN or (hidden and shown.together):
+    if not single or shown.typical >= _LITTLE_SHOWN or (hidden and shown.together):
         return hidden
     rasterizer = make_rasterizer("cpu", scene, near=near)
-    views = [resized(camera, _SIDE) for camera in spread(cameras, _VIEWS)]
+    views = [resized(camera, _SIDE) for camera in spread(single, _VIEWS)]
     uncovered = mean(float(1 - rasterizer.coverage(view).mean(dtype=torch.float64)) for view in views)
     if uncovered == 1:
-        raise nothing_seen(scene.means, cameras, near)
+        raise nothing_seen(scene.means, single, near)
     if uncovered <= _MUCH_UNCOVERED or hidden:
         return hidden
     text = (
@@ -259,7 +261,7 @@ def frame_warnings(scene: Scene, cameras: Sequence[Camera], near: float) -> list
     )
     if shown.typical < _NEARLY_NOTHING and shown.together < _HALF and uncovered > _MOSTLY_UNCOVERED:
         raise CameraError(
-            f"Cameras and scene have different coordinate frames: {text}, and all {len(cameras)} views together reach "
+            f"Cameras and scene have different coordinate frames: {text}, and all {len(single)} views together reach "
             f"{shown.together:.1%}. Instead, {advice}."
         )
     return [Decision("cameras", f"{OTHER_FRAME}: {text}", advice)]

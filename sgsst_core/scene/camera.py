@@ -46,6 +46,7 @@ class Camera:
         resolution: Longer side in pixels of the 4:3 view with the same number of pixels, for cameras whose aspect ratio
             was fitted to the content. None if resolutions refer to the camera's own longer side.
         lens: Lens that took the camera's photos; None if they are those of a pinhole. Renders never have distortion.
+            Cube faces have that of their panorama.
         whole: Camera of the whole view, if this is the camera of a rectangle of it (`cropped`); None otherwise.
 
     Example:
@@ -115,6 +116,11 @@ class Camera:
         """Camera position in the world, [3] float64."""
         rotation = self.world_to_camera[:3, :3]
         return -rotation.T @ self.world_to_camera[:3, 3]
+
+    @property
+    def panorama(self) -> str | None:
+        """Name of the panorama of which this is a cube face; None for any other camera."""
+        return self.name.rpartition(".")[0] if self.lens and self.lens.kind == "equirectangular" else None
 
     @property
     def slope_limits(self) -> tuple[float, float, float, float]:
@@ -218,13 +224,14 @@ def undistorted(camera: Camera) -> Camera:
     """Return the pinhole camera that undistorted photos fill without black borders.
 
     Focal lengths do not change, so pixels keep their size in the photo's center, as in COLMAP's `image_undistorter`.
-    The frame is cropped around the principal point with its aspect ratio. It is never enlarged.
+    The frame is cropped around the principal point with its aspect ratio. It is never enlarged. A panorama fills its
+    cube faces.
 
     Raises:
         CameraError: If the lens model is not implemented, or less than a tenth of the frame remains.
     """
     lens = camera.lens
-    if lens is None:
+    if lens is None or camera.panorama is not None:
         return camera
     if lens.kind is None:
         raise CameraError(
@@ -337,15 +344,15 @@ class Lens:
 
     Attributes:
         model: Name of the camera model in the camera file.
-        kind: Formula: "radial" for the rational model, "fisheye" for the equidistant one; None if the model is not
-            implemented, so photos cannot be undistorted.
-        coefficients: Values of `COEFFICIENTS`.
+        kind: Formula: "radial" for the rational model, "fisheye" for the equidistant one, "equirectangular" for a cube
+            face of a panorama; None if the model is not implemented, so photos cannot be undistorted.
+        coefficients: Values of `COEFFICIENTS`; for a cube face, its axes in those of the panorama (`panorama.FACES`).
         width, height: Size of the photos in pixels.
-        fx, fy, cx, cy: Intrinsics of the photos in pixels.
+        fx, fy, cx, cy: Intrinsics of the photos in pixels; those of a panorama apply to longitude and latitude.
     """
 
     model: str
-    kind: Literal["radial", "fisheye"] | None
+    kind: Literal["radial", "fisheye", "equirectangular"] | None
     coefficients: tuple[float, ...]
     width: int
     height: int
@@ -384,6 +391,10 @@ class Lens:
             bent = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
             factor = torch.where(radius > 1e-12, bent / radius.clamp_min(1e-12), 1.0)
             u, v = x * factor, y * factor
+        elif self.kind == "equirectangular":
+            axes = torch.tensor(self.coefficients, dtype=torch.float64).view(3, 3)
+            across, down, forward = (torch.stack([x, y, torch.ones_like(x)], dim=-1) @ axes).unbind(-1)
+            u, v = torch.atan2(across, forward), torch.atan2(down, torch.hypot(across, forward))
         else:
             assert self.kind == "radial"
             k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients

@@ -11,20 +11,26 @@ import pytest
 import torch
 from PIL import Image
 
+from api.cli.scene_tools import render_panorama
 from sgsst_core.errors import CameraError, ImageError
 from sgsst_core.files.formats import by_name
-from sgsst_core.files.images import BLACK, WHITE
-from sgsst_core.files.photos import load_photo
+from sgsst_core.files.images import BLACK, WHITE, save_png
+from sgsst_core.files.photos import check_names, find_masks, load_photo
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.progress import warnings_of
+from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.scene.panorama import FACES
 from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.sgsst_core.files.test_camera_files import colmap, views
 from tests.sgsst_core.objects import figure, ground, joined
 from tests.small_scenes import ball, cameras, wall, write_files
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
+from worker.derived import video_cameras
 from worker.inputs import read_scene_and_capture
 from worker.job import SceneRequest
+from worker.options import VideoOptions
 
 SCENE = wall()
 
@@ -149,6 +155,82 @@ def test_photos_of_lenses_without_a_formula_are_refused(tmp_path: Path) -> None:
     assert "lenses: only the pinhole part" in lines(capture.with_photos(None))[0]
     with pytest.raises(CameraError, match="FISHEYE624 cannot be undistorted here"):
         capture.with_photos(write_photos(tmp_path / "photos", ["view_0", "view_1", "view_2"]))
+
+
+def panoramas(folder: Path, *, width: int = 256) -> Path:
+    """Write a transforms.json with two panoramas at the first two `cameras`, and the last camera as a pinhole."""
+    file = distorted(folder / "transforms.json", 2, camera_model="EQUIRECTANGULAR", w=width, h=width // 2)
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        frame["file_path"] = f"images/{frame['file_path']}.png"
+    file.write_text(json.dumps(content))
+    return file
+
+
+def test_panoramas_become_cube_faces_with_their_photos(tmp_path: Path) -> None:
+    """Photos are panoramas that are rendered of the scene, level as the cameras are."""
+    source = request(tmp_path).model_copy(update={"cameras": panoramas(tmp_path)})
+    capture = read_capture(source, SCENE)
+    assert len(capture.cameras) == 13
+    assert capture.names == tuple(f"images/view_{index}.png" for index in range(3))
+    panorama = "cameras: 2 of 3 are panoramas, six views each: views are pinholes: one for each face of a cube"
+    (line,) = lines(capture.with_photos(None).checked(SCENE, 0.2))
+    assert line.startswith(panorama)
+    photos = tmp_path / "images"
+    photos.mkdir()
+    for index in range(2):
+        wide = source.model_copy(update={"resolution": 256})
+        camera = render_panorama(wide, BLACK, f"images/view_{index}.png", photos / f"view_{index}.png")
+        assert camera.name == f"images/view_{index}.png.front"
+    rasterizer = make_rasterizer("cpu", SCENE)
+    save_png(photos / "view_2.png", rasterizer.render(scene_colors(SCENE, capture.cameras[2]), capture.cameras[2]))
+    with_photos = capture.with_photos(photos).checked(SCENE, 0.2)
+    assert [text.partition(":")[0] for text in lines(with_photos)] == ["cameras"]
+    assert with_photos.photos
+    for photo, camera in zip(with_photos.photos, with_photos.cameras, strict=True):
+        seen = load_photo(photo, camera)
+        rendered = rasterizer.render(scene_colors(SCENE, camera), camera).clamp(0, 1)
+        assert seen.shape == rendered.shape
+        assert float((seen - rendered).square().mean().sqrt()) < 0.03, camera.name
+
+    (photos / "view_1.png").unlink()
+    missing = lines(capture.with_photos(photos))
+    assert "photos: warning: 6 of 13 views are left out: they have no photo: images/view_1.png" in missing
+    check_names(photos, capture.names)
+
+
+def test_masks_of_panoramas_apply_to_their_faces(tmp_path: Path) -> None:
+    cameras = read_capture(request(tmp_path).model_copy(update={"cameras": panoramas(tmp_path)}), SCENE).cameras
+    (tmp_path / "masks").mkdir()
+    upper_half = Image.new("L", (256, 128))
+    upper_half.paste(255, (0, 0, 256, 64))
+    upper_half.save(tmp_path / "masks" / "view_0.png.mask.png")
+    masks = {view.name: mask for view, mask in zip(cameras, find_masks(tmp_path / "masks", cameras), strict=True)}
+    assert [name for name, mask in masks.items() if mask] == [f"images/view_0.png.{face}" for face in FACES]
+    expected = {"front": 0.5, "right": 0.5, "back": 0.5, "left": 0.5, "up": 1.0, "down": 0.0}
+    for view in cameras:
+        if mask := masks[view.name]:
+            inside = float(load_photo(mask, view, color_managed=False).mean())
+            assert inside == pytest.approx(expected[view.name.rpartition(".")[2]], abs=0.01)
+
+
+def test_panoramas_say_nothing_about_the_coordinate_frame(tmp_path: Path) -> None:
+    """Together, the faces of a panorama show a small object in any frame; most of them show nothing of it."""
+    source = request(tmp_path).model_copy(update={"cameras": panoramas(tmp_path)})
+    capture = read_capture(source, SCENE)
+    alone = replace(capture, cameras=[view for view in capture.cameras if view.panorama])
+    assert [line.item for line in alone.checked(ball(), 0.2).decisions] == ["cameras"]
+    with pytest.raises(CameraError, match="sees a Gaussian"):
+        capture.checked(rotated(SCENE), 0.2)  # the pinhole sees nothing
+
+
+def test_videos_lead_through_the_front_faces_of_panoramas(tmp_path: Path) -> None:
+    source = request(tmp_path).model_copy(update={"cameras": panoramas(tmp_path)})
+    through = read_capture(source, SCENE).cameras
+    path = video_cameras(SCENE, source, through, VideoOptions(fps=3, seconds=1), 64, even=True)
+    ends = [frame.world_to_camera for frame in (path[0], path[-1])]
+    for pose, expected in zip(ends, (through[0], through[2]), strict=True):
+        assert torch.allclose(pose, expected.world_to_camera, atol=1e-6)
 
 
 def test_orbits_are_not_checked(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pty
 import re
@@ -32,6 +33,7 @@ from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.formats import RESULT_FORMATS, RESULT_SUFFIXES, by_name
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import write_stylized
+from sgsst_core.scene.camera import look_at
 from sgsst_core.scene.gaussians import TENSORS
 from sgsst_core.scene.stored_harmonics import held
 from tests.pngs import chunk, png
@@ -675,11 +677,39 @@ def test_comparison_starts_with_the_unstylized_scene(files: Files, tmp_path: Pat
         assert np.abs(middle - (before + after) / 2).max() <= 1
 
 
+def test_render_writes_a_panorama_from_the_position_of_a_camera(
+    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The ball lies straight ahead of the second camera, and to the right of the first one, whose heading is level."""
+    wide = tmp_path / "wide.png"
+    tilted = look_at(
+        "a/left.png", torch.tensor([-3.0, 0.0, 3.0]), torch.tensor([-3.0, 1.0, 5.0]), torch.tensor([0.0, -1.0, 0.0]),
+        width=64, height=48, focal=64.0,
+    )  # fmt: skip
+    write_files(files.ply.parent, ball(), [tilted, *cameras(1)])
+    command = ["render", str(files.ply), "--cameras", str(files.cameras), "--panorama", str(wide), "--up=-y"]
+    for options, middle in ((["--from", "view_0"], 0.5), ([], 0.75)):
+        assert main([*command, *options, "--resolution", "256", "--background", "1,2,3"]) == 0
+        image = np.asarray(Image.open(wide)).astype(int)
+        assert image.shape == (128, 256, 3)
+        rows, columns = np.nonzero(np.abs(image - [1, 2, 3]).max(axis=2))
+        assert rows.mean() / 128 == pytest.approx(0.5, abs=0.01)
+        assert columns.mean() / 256 == pytest.approx(middle, abs=0.01)
+        radius = math.asin(0.9 / 3) / (2 * math.pi)  # of the ball with a margin for the size of its Gaussians
+        assert np.ptp(columns) / 256 == pytest.approx(2 * radius, abs=0.02)
+    assert f"panorama: {wide}, from the position of a/left.png" in re.sub(" +", " ", capsys.readouterr().out)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--out", "views", "--video", "video.mp4"], "not both"),
+        (["--out", "views", "--video", "video.mp4"], "Give one of --out FOLDER"),
+        (["--video", "video.mp4", "--panorama", "wide.png"], "Give one of --out FOLDER"),
         ([], "--out FOLDER"),
+        (["--panorama", "wide.jpg"], "wide.jpg: not the name of a PNG image"),
+        (["--panorama", "wide.png", "--from", "nobody"], "No view is called nobody. There are 3: view_0, view_1"),
+        (["--panorama", "wide.png", "--fps", "10"], "--fps requires --video"),
+        (["--out", "views", "--from", "view_0"], "--from requires --panorama"),
         (["--video", "video.avi"], "is no video"),
         (["--video", "video.mp4", "--transparent"], "no alpha channel"),
         (["--out", "views", "--fps", "10"], "--fps requires --video"),

@@ -141,11 +141,26 @@ def test_plan_lists_camera_and_photo_decisions(service: Service, files: dict[str
         assert answer.json()["views"] == 2
 
 
+@pytest.mark.slow
+def test_panoramas_are_planned_as_the_faces_that_show_something(service: Service, files: dict[str, bytes]) -> None:
+    """The pinhole, the front faces and a side face of each panorama see the scene, a wall before the cameras."""
+    content = json.loads(blender(w=256, h=128))
+    for index in (0, 2):
+        content["frames"][index]["camera_model"] = "EQUIRECTANGULAR"
+    with service.client() as client:
+        answer = client.post("/v1/jobs", **request({**files, "cameras": json.dumps(content).encode()}))
+        assert answer.status_code == 200, answer.text
+        assert answer.json()["views"] == 13
+        lines = [f"{line['item']}: {line['decision']}: {line['reason']}" for line in answer.json()["plan"]["decisions"]]
+        assert any(line.startswith("cameras: 2 of 3 are panoramas, six views each: ") for line in lines)
+        assert "views: 8 of 13 are skipped: they see no Gaussian" in lines
+
+
 def test_mismatched_cameras_are_rejected_immediately(service: Service, files: dict[str, bytes]) -> None:
-    panorama = blender(camera_model="EQUIRECTANGULAR", w=64, h=32)
+    stereo = blender(camera_model="VR180_L", w=64, h=32)
     with service.client() as client:
         for name, content, detail in (
-            ("transforms.json", panorama, "which has no pinhole part"),
+            ("transforms.json", stereo, "which is neither a pinhole with a lens nor a 360-degree panorama"),
             ("cameras.xml", b"<?xml version='1.0'?>", "It may be cameras of Metashape."),
             ("reconstruction.json", b'[{"cameras": {}, "shots": {}}]', "export_colmap"),
         ):

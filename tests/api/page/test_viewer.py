@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import json
 import struct
@@ -29,6 +30,7 @@ from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.page.browser import Watched, decoded, psnr, rendered, serve_files, view_script
 from tests.real_scenes import scene_path
 from tests.sgsst_core.files.formats.samples import archived, ksplat, streamed
+from tests.sgsst_core.files.test_camera_files import CAPTURES
 from tests.sgsst_core.files.test_scene_file import with_filter, without_thickness
 from tests.sgsst_core.objects import joined
 from tests.small_scenes import cameras, wall, write_files
@@ -43,6 +45,12 @@ HALF_A_SECOND = """async () => {
     while (performance.now() - begin < 500) await new Promise(requestAnimationFrame);
 }"""
 Visit = Callable[..., Watched]
+#: Returns what the page reads of camera files, given as pairs of name and base64.
+READ_CAMERAS = """async ([base, files]) => {
+  const { readCameras } = await import(`${base}/cameras.js`);
+  const blob = (text) => new Blob([Uint8Array.from(atob(text), (character) => character.charCodeAt(0))]);
+  return await readCameras(files.map(([name, text]) => ({ name, blob: blob(text) })));
+}"""
 
 
 def base_of(watched: Watched) -> str:
@@ -63,6 +71,25 @@ def real_scene(shared_data: Path, name: str) -> tuple[Scene, list[Camera]]:
     if file.exists():
         return scene, [resized(camera, 240) for camera in read_cameras(file)[::33]]
     return scene, orbit(scene, 3, width=240, height=180)
+
+
+@pytest.mark.parametrize("capture", ["colmap4_panorama", "metashape_spherical"])
+def test_faces_of_panoramas_are_those_of_the_service(visit: Visit, files: dict[str, Path], capture: str) -> None:
+    """A mixed COLMAP model and a transforms.json are shown, and read as by the service."""
+    paths = sorted((CAPTURES / capture).rglob("*.*"))
+    expected = read_cameras(CAPTURES / capture)
+    watched = visit()
+    watched.page.get_by_label("Scene", exact=True).set_input_files(files["scene"])
+    watched.page.get_by_label("Cameras", exact=True).set_input_files(paths)
+    watched.page.get_by_text(f"{len(expected)} cameras shown in the scene").wait_for()
+    sent = [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in paths]
+    read = watched.page.evaluate(READ_CAMERAS, [base_of(watched), sent])
+    assert [each["name"] for each in read] == [camera.name for camera in expected]
+    for each, camera in zip(read, expected, strict=True):
+        assert all(each[key] == getattr(camera, key) for key in ("fx", "fy", "width", "height"))
+        assert np.allclose(each["position"], camera.center.numpy(), atol=1e-12)
+        assert np.allclose(each["axes"], camera.world_to_camera[:3, :3].numpy(), atol=1e-12)
+    watched.check()
 
 
 @pytest.mark.parametrize(("name", "degree"), [("broche", 0), ("playbot_synthetic_sh2", 2), ("snowmiku_plush", 3)])

@@ -28,6 +28,7 @@ from sgsst_core.files.camera_files import _rotation_matrix, read_cameras
 from sgsst_core.files.camera_folder import CameraWarning, cameras_beside, read_model
 from sgsst_core.files.photos import check_photos, find_masks
 from sgsst_core.scene.camera import Camera, look_at, undistorted
+from sgsst_core.scene.panorama import FACES, cube_faces
 from tests.small_scenes import LFS_POINTER
 
 WIDTH, HEIGHT = 640, 480
@@ -315,11 +316,42 @@ def test_colmap_cameras_with_coefficients_of_0_are_pinholes(tmp_path: Path, text
     assert {view.lens for view in read_cameras(folder)} == {None}
 
 
-def test_panoramas_are_refused(tmp_path: Path) -> None:
-    folder = colmap(tmp_path / "model", views(), text=True)
-    (folder / "cameras.txt").write_text("1 EQUIRECTANGULAR 640 320 640 320\n")
-    with pytest.raises(CameraError, match=r"EQUIRECTANGULAR, which has no pinhole part.*panorama_sfm"):
-        read_cameras(folder)
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "SPHERICAL"])
+def test_panoramas_of_text_models_become_cube_faces(tmp_path: Path, model: str) -> None:
+    folder = colmap(tmp_path / "model", views(2), text=True)
+    (folder / "cameras.txt").write_text(f"1 {model} 640 320 640 320\n")
+    cameras = read_cameras(folder)
+    names = [f"img_{index}.png.{face}" for face in FACES for index in range(2)]
+    assert [view.name for view in cameras] == names  # so that the evenly spread views of a few do not all look one way
+    for view, expected in zip(cameras[:2], views(2), strict=True):
+        assert torch.allclose(view.world_to_camera, expected.world_to_camera, atol=1e-12)
+    for size in ("640 300", "320 640"):
+        (folder / "cameras.txt").write_text(f"1 {model} 640 320 {size}\n")
+        with pytest.raises(CameraError, match=r"'img_0\.png': is a panorama of 640 x 320, but .* state another size"):
+            read_cameras(folder)
+
+
+def test_panoramas_match_the_projection_of_colmap() -> None:
+    """The model is written by pycolmap 4.2.1: two panoramas of 1024 x 512, and a pinhole between them by name."""
+    folder = CAPTURES / "colmap4_panorama" / "sparse" / "0"
+    cameras = read_cameras(folder.parents[1])
+    assert [view.name for view in cameras[:4]] == ["a.jpg.front", "b.jpg", "c.jpg.front", "a.jpg.right"]
+    assert len(cameras) == 13
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 5
+    faces_of_points = 0
+    for image in pycolmap.Reconstruction(folder).images.values():
+        for view in (view for view in cameras if image.name in (view.panorama, view.name)):
+            x, y, z = (points @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]).unbind(1)
+            inside = (z > 0) & (x.abs() <= z) & (y.abs() <= z)
+            if view.lens is None:
+                u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+            else:
+                u, v = (part * side for part, side in zip(view.lens.positions(x / z, y / z), (1024, 512), strict=True))
+            for index in inside.nonzero()[:, 0].tolist():
+                expected = image.project_point(points[index].numpy())
+                assert (float(u[index]), float(v[index])) == pytest.approx(expected, abs=1e-6)
+                faces_of_points += view.lens is not None
+    assert faces_of_points == 800  # each point in one face of each panorama
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
@@ -616,8 +648,8 @@ def test_wrong_values_of_inria_cameras_are_named(tmp_path: Path, key: str, value
         ("fl_y", {}, "'fl_y' is the object {}, not a number"),
         ("camera_model", 3, "'camera_model' is 3, not a name"),
         ("is_fisheye", "false", "'is_fisheye' is the text \"false\", not true or false"),
-        ("camera_model", "EQUIRECTANGULAR", "EQUIRECTANGULAR, which has no pinhole part.*ns-process-data"),
-        ("camera_model", "VR180_L", "VR180_L, which has no pinhole part"),
+        ("camera_model", "ORTHOPHOTO", "ORTHOPHOTO, which is neither a pinhole .*EQUIRECTANGULAR"),
+        ("camera_model", "VR180_L", "VR180_L, which is neither a pinhole"),
         ("w", -1, "width is -1"),
         ("cx", NAN, "'cx' is nan"),
     ],
@@ -633,6 +665,17 @@ def test_sizes_of_whole_pixels_up_to_rounding_are_read(tmp_path: Path) -> None:
     assert_same(read_cameras(save(tmp_path / "t.json", content)), views(), lambda name: f"images/{name}")
     with pytest.raises(CameraError, match=r"a size of 640\.4 x 480\.0 is not in whole pixels"):
         read_cameras(save(tmp_path / "t.json", content | {"w": 640.4}))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [("w", 0, "width is 0"), ("transform_matrix", (3 * np.eye(4)).tolist(), "is 8 off a rotation")],
+)
+def test_wrong_values_of_panoramas_are_named(tmp_path: Path, key: str, value: Any, message: str) -> None:
+    content = nerfstudio(views()) | {"camera_model": "EQUIRECTANGULAR"}
+    path = save(tmp_path / "transforms.json", change(content, key, value))
+    with pytest.raises(CameraError, match=rf"camera 1 \('images/img_1\.png'\): .*{message}"):
+        read_cameras(path)
 
 
 def test_missing_or_impossible_lenses_are_refused(tmp_path: Path) -> None:
@@ -773,6 +816,15 @@ def test_nerfstudio_cameras_have_nerfstudio_axes() -> None:
     cameras = read_cameras(CAPTURES / "nerfstudio")
     assert_close(cameras, views(), NERFSTUDIO)
     assert {view.lens and view.lens.coefficients[:4] for view in cameras} == {(0.05, -0.01, 0.001, -0.0005)}
+
+
+def test_spherical_cameras_of_metashape_have_its_axes_in_another_order() -> None:
+    """The file is as nerfstudio's `metashape_to_json` writes it: one camera model, and sizes in each frame."""
+    cameras = read_cameras(CAPTURES / "metashape_spherical")
+    order = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+    panoramas = (cube_faces(view.name, 2048, 1024, view.world_to_camera) for view in views())
+    assert_close(cameras, [view for faces in zip(*panoramas, strict=True) for view in faces], order)
+    assert [view.name for view in cameras[:2]] == ["images/img_0.jpg.front", "images/img_1.jpg.front"]
 
 
 def test_nerfstudio_training_cameras_match_the_trained_scene() -> None:
