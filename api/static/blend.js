@@ -2,6 +2,7 @@
 /** Control of a blend of the original with one or two results; the viewer shows it exactly. */
 import { artifactPath, ask } from "./api.js";
 import { announce, h, newId, put } from "./dom.js";
+import { resultName } from "./names.js";
 import { resultFormats } from "./tables.js";
 import { words } from "./words.js";
 
@@ -87,7 +88,7 @@ export class Blend {
 
   /** Name of the blend of one result. */
   get name() {
-    return this.style === 1 ? words.viewer.stylized : say.amount(this.style);
+    return this.style === 1 ? resultName(this.jobs[0]) : say.amount(this.style);
   }
 
   /** Store the blend on the service, and download it. */

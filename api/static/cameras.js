@@ -102,6 +102,18 @@ function byFace(images) {
   return Array.from({ length: most }, (_, i) => images.flatMap((cameras) => cameras[i] ?? [])).flat();
 }
 
+/**
+ * @typedef {{width: number, height: number, fx: number, fy: number, cx: number, cy: number, world_to_camera: number[][]}} RestCamera
+ *   `world_to_camera`: rows of the rotation, each with its element of the translation
+ */
+
+/** Return the camera that a request or an image states. @param {any} stated @returns {JobCamera} */
+export function statedCamera({ fx, fy, width, height, world_to_camera: rows }) {
+  const axes = rows.slice(0, 3).map((/** @type {any} */ row) => row.slice(0, 3).map(Number));
+  const position = axes.map((/** @type {Vector} */ axis, /** @type {number} */ i) => times(axis, -rows[i][3])).reduce(sum);
+  return checked({ name: "", position, axes, fx, fy, width, height });
+}
+
 /** @param {JobCamera} camera @returns {JobCamera} */
 function checked(camera) {
   const { position, axes, fx, fy, width, height } = camera;

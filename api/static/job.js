@@ -4,7 +4,7 @@ import { artifactPath, ask, get, Problem } from "./api.js";
 import { LossChart } from "./chart.js";
 import { deleteButton } from "./fields.js";
 import { announce, h, put } from "./dom.js";
-import { startFrom } from "./stored.js";
+import { baseOf, startFrom } from "./stored.js";
 import { actionsOf, installed, statusTitles, UNFINISHED, WORKING } from "./tables.js";
 import { downloadCard, factsCard, filesCard, JobName, JobProgress, outcomeOf, ShareCard, VideoCard } from "./job_cards.js";
 import { JobStage } from "./job_stage.js";
@@ -29,7 +29,7 @@ const reopen = () => void dispatchEvent(new HashChangeEvent("hashchange"));
 export const badge = (status) => h(`span.badge.${status}${WORKING.has(status) ? ".working" : ""}`, statusTitles[status] ?? status);
 
 export class JobView {
-  /** @param {string} id @param {import("./stage.js").Stage} [before] stage of the form that has created the job */
+  /** @param {string} id @param {import("./stage.js").Stage} [before] stage of the view before, which has shown the job's scene */
   constructor(id, before) {
     this.id = id;
     this.title = words.page.jobs;
@@ -120,7 +120,7 @@ export class JobView {
     } catch (error) {
       if (!(error instanceof Problem) || error.status !== 404) return;
     }
-    this.curve.hidden = !UNFINISHED.has(this.job.status) && !this.chart.points.size;
+    this.curve.hidden = (this.paints || !UNFINISHED.has(this.job.status)) && !this.chart.points.size;
   }
 
   /** Watch the events of the job. The browser reconnects by itself, and sends the id of the last event. */
@@ -189,6 +189,16 @@ export class JobView {
     }
   }
 
+  /** Whether the job paints on a scene: it has neither a style nor a loss. @returns {boolean} */
+  get paints() {
+    return !!this.job.parameters.painted?.length;
+  }
+
+  /** Give the 3D view to that of another job. @param {string} id */
+  handOver(id) {
+    return this.stage.handOver(id);
+  }
+
   update() {
     const { job } = this;
     this.title = nameOf(job);
@@ -198,11 +208,11 @@ export class JobView {
     put(this.badge, badge(job.status));
     this.planTitle.textContent = UNFINISHED.has(job.status) ? words.plan.decided : words.plan.ran;
     const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
-    this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
+    this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.result?.psnr_after && words.paint.fit(job.result.psnr_before, job.result.psnr_after), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
     const outcome = job.status === "succeeded" ? outcomeOf(job.result) : "";
     this.outcome.hidden = !outcome;
     put(this.outcome, h("li", outcome));
-    if (UNFINISHED.has(job.status)) this.curve.hidden = false;
+    if (UNFINISHED.has(job.status)) this.curve.hidden = this.paints;
     this.error.hidden = !job.error;
     if (job.error) put(this.error, h("strong", say.failed), h("p", job.error.message));
     this.showActions();
@@ -215,11 +225,12 @@ export class JobView {
     const button = (/** @type {string} */ name, /** @type {() => any} */ act, kind = "quiet") => h(`button.${kind}`, { type: "button", onclick: () => this.act(act) }, name);
     if (this.shownFor === job.status) return;
     this.shownFor = job.status;
-    const offered = actionsOf(job.status).filter(() => job.status !== "succeeded" || CONTINUABLE.includes(job.result?.stopped));
+    const offered = actionsOf(job.status).filter(({ name }) => (job.status !== "succeeded" || CONTINUABLE.includes(job.result?.stopped)) && !(this.paints && name === "finish"));
     const titleOf = (/** @type {{name: string, title: string}} */ { name, title }) => (name === "retry" && (job.result || job.progress?.step) ? say.goOn : say.actions[name] ?? title);
-    put(this.actions,
+    const base = baseOf(this.id), start = (/** @type {string} */ name, how = {}) => h("button.quiet", { type: "button", onclick: () => startFrom(this.job, how) }, name);
+    put(this.actions, base && h("a.button.quiet", { href: `#/jobs/${base}` }, words.paint.undoAll),
       offered.map((action) => button(titleOf(action), () => ask("POST", `v1/jobs/${this.id}/${action.name}`), UNFINISHED.has(job.status) ? "quiet" : "primary")),
-      UNFINISHED.has(job.status) ? null : [h("button.quiet", { type: "button", onclick: () => startFrom(this.job, { painting: false }) }, say.anotherPainting), h("button.quiet", { type: "button", onclick: () => startFrom(this.job) }, say.changed)]);
+      UNFINISHED.has(job.status) ? null : !this.paints ? [start(say.anotherPainting, { painting: false }), start(say.changed)] : job.status === "succeeded" ? start(words.paint.stylize) : null);
     put(this.deletion, UNFINISHED.has(job.status) ? null : deleteButton(say.remove, async () => {
         await ask("DELETE", `v1/jobs/${this.id}`);
         location.hash = "#/jobs";

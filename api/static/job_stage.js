@@ -3,8 +3,12 @@
 import { artifactPath, get } from "./api.js";
 import { h, put } from "./dom.js";
 import { labels } from "./names.js";
+import { PaintPanel } from "./paint_panel.js";
 import { LIVE, ResultStage } from "./result_stage.js";
 import { Stage } from "./stage.js";
+import { listenToDrops } from "./slots.js";
+import { baseOf, keepBase, storedInputs, storedResult } from "./stored.js";
+import { upName } from "./upright.js";
 import { words } from "./words.js";
 
 const say = words.job;
@@ -15,7 +19,7 @@ export class JobStage {
   /**
    * @param {string} id id of the job
    * @param {AbortSignal} leaving aborted when the view ends
-   * @param {Stage} [before] stage that has shown the scene before the job was created
+   * @param {Stage} [before] stage of the view before, which has shown the scene of the job
    */
   constructor(id, leaving, before) {
     this.id = id;
@@ -23,7 +27,7 @@ export class JobStage {
     this.title = "";
     this.picture = h("figure.preview");
     /** Stage that shows the scene until the job's files are known. @type {Stage | undefined} */
-    this.first = before?.viewer?.sides ? new Stage(before) : undefined;
+    this.first = before && new Stage(before);
     this.element = h("div.show", this.first?.element ?? this.picture);
     /** Name of the shown preview. */
     this.preview = "";
@@ -34,6 +38,18 @@ export class JobStage {
     /** @type {ResultStage | undefined} */
     this.result = undefined;
     this.finishing = false;
+    /** Id of the job that paints on the result. */
+    this.next = "";
+  }
+
+  /**
+   * Give the 3D view to the view of a job that paints on this result, or on whose result this job has painted.
+   *
+   * @param {string} id
+   */
+  handOver(id) {
+    const shown = this.result ?? this.live;
+    return shown?.stage.viewer && (id === this.next || id === baseOf(this.id)) ? shown.handOver(id === this.next) : undefined;
   }
 
   /** @param {string} title title of the job */
@@ -120,6 +136,7 @@ export class JobStage {
   showResult(job, hasSheet, kept) {
     this.result = kept ?? new ResultStage([job], { signal: this.leaving, stage: this.takeFirst() });
     this.result.stage.title = this.title;
+    if (this.result.stage.viewer) this.offerPainting(this.result, job);
     const stage = h("div", this.result.element), sheet = h("figure.sheet", { hidden: true });
     /** @type {[string, HTMLElement][]} */
     const tabs = [[say.threeD, stage]];
@@ -129,6 +146,25 @@ export class JobStage {
     }
     const fillSheet = () => put(sheet, h("a", { href: artifactPath(this.id, "before_after.jpg"), target: "_blank", rel: "noopener" }, h("img", { src: artifactPath(this.id, "before_after.jpg"), alt: say.sheetOf(this.title) })));
     this.showTabs(tabs, (body) => body === sheet && !sheet.firstChild && fillSheet(), this.compareLink(job));
+  }
+
+  /** @param {ResultStage} result @param {any} job */
+  offerPainting(result, job) {
+    const panel = new PaintPanel(result.stage, {
+      side: () => result.own,
+      files: async () => ({ scene: [await storedResult(job)], cameras: storedInputs(job).cameras }),
+      parameters: () => ({ ...job.parameters, ...(job.parameters.orbit ? { up: upName(result.stage.up) } : {}) }),
+      opened: (open) => {
+        result.blend.element.disabled = open;
+        if (!open) result.showSides();
+      },
+      created: ({ id }) => {
+        keepBase(id, this.id);
+        this.next = id;
+        location.hash = `#/jobs/${id}`;
+      },
+    }, this.leaving);
+    listenToDrops(([file]) => file && panel.use(file), this.leaving);
   }
 
   /**

@@ -31,6 +31,9 @@ export function stylesOf(job) {
 /** @param {any} job @returns {string} */
 export const nameOf = (job) => job.name || words.job.unnamed;
 
+/** Return what a view of a job calls its result. @param {any} job */
+export const resultName = ({ parameters }) => (parameters?.painted?.length ? words.viewer.painted : words.viewer.stylized);
+
 /**
  * Return a label for each job, by its styles. Jobs with the same styles also get their names, then their times of
  * creation, then numbers, so that no two labels are equal.

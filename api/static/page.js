@@ -12,7 +12,8 @@ import { forgetDraft, keptDraft } from "./stored.js";
 import { SubmitView } from "./submit.js";
 import { words } from "./words.js";
 
-/** @typedef {{title: string, element: HTMLElement, end: () => void}} View */
+/** @typedef {import("./stage.js").Stage} Stage */
+/** @typedef {{title: string, element: HTMLElement, end: () => void, handOver?: (id: string) => Stage | undefined}} View `handOver`: gives its 3D view to that of a job */
 
 const say = words.page;
 const main = h("main", { id: "main", tabIndex: -1 });
@@ -34,7 +35,7 @@ function viewOf() {
   const known = ids.length > 0 && ids.every((id) => /^job_[0-9a-f]+$/.test(id));
   if (name === "") return new SubmitView();
   if (name === "jobs" && !ids.length) return new JobsView();
-  if (name === "jobs" && known && ids.length === 1) return new JobView(ids[0], view instanceof SubmitView && view.created === ids[0] ? view.stage : undefined);
+  if (name === "jobs" && known && ids.length === 1) return new JobView(ids[0], view?.handOver?.(ids[0]));
   if (name === "compare" && known && ids.length >= 2 && ids.length <= 20) return new CompareView(ids);
   return { title: "", element: h("div.empty", h("h1", say.missing), h("a.button.primary", { href: "#/" }, say.toNew)), end: () => {} };
 }

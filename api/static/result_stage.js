@@ -7,7 +7,7 @@ import { artifactPath, ask, get, Problem } from "./api.js";
 import { readCameras } from "./cameras.js";
 import { Blend } from "./blend.js";
 import { h, put } from "./dom.js";
-import { labels, nameOf } from "./names.js";
+import { labels, nameOf, resultName } from "./names.js";
 import { Stage } from "./stage.js";
 import { directionOf, UPS } from "./upright.js";
 import { requestedRendering } from "./viewer/render_tag.js";
@@ -51,6 +51,7 @@ export class ResultStage {
     this.element = h("div.result-stage", this.pickers, this.stage.element, this.blend.element);
     /** Choices for each side of the wipe. @type {Map<string, {name: string, side: Side}>} */
     this.choices = new Map();
+    if (jobs.length < 2 && jobs[0].parameters.painted?.length) this.stage.share ??= 0; // what was painted may be on either side of a wipe
     if (this.stage.viewer) {
       this.stage.viewer.onReload = () => (this.loading = this.load());
       this.loading = this.load();
@@ -106,16 +107,17 @@ export class ResultStage {
     const { viewer } = this.stage;
     if (!viewer || this.signal.aborted) return;
     const files = this.files(job), own = this.live?.ownScene, path = own ? files.result("live/scene.ply") : files.scene;
-    const shown = viewer.sides?.left.scene, scene = shown && !own ? shown : viewer.open(new URL(path, location.href).href);
-    if (scene !== shown) shown?.end();
-    this.stage.show({ scene, colors: "own" });
+    const shown = viewer.sides?.left, side = shown && !own ? shown : { scene: viewer.open(new URL(path, location.href).href), colors: "own" }, { scene } = side;
+    if (side !== shown) shown?.scene.end();
+    this.stage.show(side);
     try {
       const header = await scene.headerRead;
       header.rendering = requestedRendering(header.rendering, job.parameters);
       scene.ready.then(() => this.standFirst(), (error) => this.tell(error));
       this.original = scene;
-      this.stage.original = { scene, colors: "own" };
-      this.choices.set("original", { name: say.original, side: { scene, colors: "own" } });
+      this.stage.original = side;
+      this.blend.parts[0].colors = side.colors;
+      this.choices.set("original", { name: say.original, side });
     } catch {
       scene.end(); // this format cannot be shown in a browser: only the result is
       viewer.sides = null;
@@ -130,7 +132,7 @@ export class ResultStage {
 
   /** @param {any} job */
   async openRun(job) {
-    const { viewer } = this.stage, name = this.jobs.length > 1 ? labels(this.jobs)[this.jobs.indexOf(job)] : say.stylized;
+    const { viewer } = this.stage, name = this.jobs.length > 1 ? labels(this.jobs)[this.jobs.indexOf(job)] : resultName(job);
     if (!viewer || this.signal.aborted) return;
     const fade = this.live?.ownScene ? 0 : (job.parameters.sh_attenuation ?? 0);
     if (this.live) {
@@ -202,7 +204,7 @@ export class ResultStage {
     } catch {
       return false;
     }
-    this.choices.set(job.id, { name: say.stylized, side: { scene: original, colors: job.id } });
+    this.choices.set(job.id, { name: resultName(job), side: { scene: original, colors: job.id } });
     this.offer();
     return true;
   }
@@ -211,7 +213,7 @@ export class ResultStage {
   offerBlend() {
     const { original, blend, jobs } = this;
     if (!original || this.live || !this.blends || !jobs.every(({ id }) => original.colors.has(id))) return;
-    const side = { scene: original, colors: "own", blend: blend.parts };
+    const side = { scene: original, colors: jobs[0].id, blend: blend.parts };
     this.choices.set(jobs.length > 1 ? "blend" : jobs[0].id, { name: jobs.length > 1 ? words.blend.title : blend.name, side });
     blend.element.hidden = false;
   }
@@ -247,6 +249,25 @@ export class ResultStage {
     if (!left || !right) return;
     if (left === right) this.stage.show(left.side);
     else this.stage.show(left.side, right.side, [left.name, right.name]);
+  }
+
+  /** Return the first run's scene with its own colors; undefined until it is there. @returns {Side | undefined} */
+  get own() {
+    const { scene, colors, fade } = this.choices.get(this.jobs[0].id)?.side ?? {};
+    return scene && colors ? { scene, colors, fade } : undefined;
+  }
+
+  /**
+   * Give the stage to another view.
+   *
+   * @param {boolean} shown whether what is shown is the original of the other view; otherwise all scenes end
+   */
+  handOver(shown) {
+    const { viewer } = this.stage, scene = viewer?.sides?.left.scene, kept = shown && scene;
+    for (const each of new Set([scene, ...[...this.choices.values()].map(({ side }) => side.scene)])) if (each !== kept) each?.end();
+    this.choices.clear();
+    if (viewer && !kept) viewer.sides = null;
+    return this.stage;
   }
 
   /** @param {unknown} error */

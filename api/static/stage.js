@@ -221,7 +221,7 @@ export class Stage {
     if (!viewer) return;
     const middle = viewer.sides?.left.scene.middle ?? null, length = frameSize(this.cameras, middle);
     const shown = this.hasFrames && this.framesShown ? this.cameras.filter((_, i) => i !== this.stood) : [];
-    viewer.lines = Float32Array.of(...cameraLines(shown, length), ...this.outline, ...this.cropped);
+    viewer.lines = viewer.frozen ? new Float32Array(0) : Float32Array.of(...cameraLines(shown, length), ...this.outline, ...this.cropped);
     viewer.draw();
   }
 
@@ -266,12 +266,19 @@ export class Stage {
   }
 
   async save() {
-    if (!this.viewer) return;
-    const url = URL.createObjectURL(await this.viewer.picturePng());
-    const camera = this.cameras[this.stood]?.name.replace(/^.*\/|\.[^.]*$/g, "");
-    const name = [this.title, camera || say.view].map(fileName).filter(Boolean).join("-");
+    if (this.viewer) this.download(await this.viewer.picturePng());
+  }
+
+  /** Let the browser save an image of the view. @param {Blob} png */
+  download(png) {
+    const url = URL.createObjectURL(png), name = [this.title, this.viewName].map(fileName).filter(Boolean).join("-");
     h("a", { href: url, download: `${name}.png` }).click();
     setTimeout(() => URL.revokeObjectURL(url), 10000);
+  }
+
+  /** Name of the camera that the view is that of, without folder and suffix. */
+  get viewName() {
+    return this.cameras[this.stood]?.name.replace(/^.*\/|\.[^.]*$/g, "") || say.view;
   }
 
   full() {

@@ -1,8 +1,8 @@
 // @ts-check
 /** Content that a new job can reuse: inputs of earlier jobs, the draft of the form, and an interrupted upload. */
-import { ask, get } from "./api.js";
+import { artifactPath, ask, get } from "./api.js";
 import { h, put } from "./dom.js";
-import { paintingsOf } from "./names.js";
+import { nameOf, paintingsOf } from "./names.js";
 import { strengthName } from "./options.js";
 import { forgetUnfinished, unfinished } from "./uploads.js";
 import { percent, size, words } from "./words.js";
@@ -60,6 +60,12 @@ export async function allInputs(job) {
   return storedInputs({ id: job.id, inputs });
 }
 
+/** Return the result of a job, as the scene of another one. @param {any} job */
+export async function storedResult(job) {
+  const name = "stylized.ply", { artifacts } = await get(`v1/jobs/${job.id}/artifacts`);
+  return new StoredFile(artifactPath(job.id, name), { ...artifacts.find((/** @type {any} */ file) => file.name === name), name: `${nameOf(job)}.ply` });
+}
+
 /** Return the content of a chosen file. @param {Chosen} file @returns {Promise<Blob>} */
 export const contentOf = async (file) => (file instanceof StoredFile ? (await ask("GET", file.path)).blob() : file);
 
@@ -113,14 +119,15 @@ export function forgetDraft() {
 }
 
 /**
- * Open the form with the inputs and parameters of a job, which replace what was entered before. Inputs that the service
- * has deleted are asked for again.
+ * Open the form with the inputs and parameters of a job, which replace what was entered before; the scene of a job that
+ * has painted is its result. Inputs that the service has deleted are asked for again.
  *
  * @param {any} job
  * @param {{painting?: boolean}} [how] `painting`: whether to keep the job's paintings; those of regions are kept anyway
  */
 export async function startFrom(job, { painting = true } = {}) {
-  const { style_weights: weights, regions, orbit, preset, name: _, ...others } = job.parameters, inputs = await allInputs(job);
+  const { style_weights: weights, regions, orbit, preset, name: _, painted, ...others } = job.parameters, inputs = await allInputs(job);
+  if (painted?.length) inputs.scene = [await storedResult(job)];
   const taken = new Set((regions ?? []).flatMap(paintingsOf)), own = inputs.style.filter(({ name }) => !taken.has(name));
   if (!painting) inputs.style = inputs.style.filter((file) => !own.includes(file));
   const values = Object.fromEntries(Object.entries({ ...others, orbit: orbit && (others.views ?? orbit) }).filter(([, value]) => value !== null));
@@ -133,6 +140,27 @@ export async function startFrom(job, { painting = true } = {}) {
     weights: Object.fromEntries(weights ? own.map(({ name }, i) => [name, String(weights[i])]) : []),
   });
   location.hash = "#/";
+}
+
+/** Start of the names under which this tab remembers the base of each job that paints. */
+const BASE = "sgsst.base.";
+
+/** Remember on whose result a job has painted. @param {string} id @param {string} base */
+export function keepBase(id, base) {
+  try {
+    sessionStorage.setItem(BASE + id, base);
+  } catch {
+    // private windows may have no storage
+  }
+}
+
+/** Return the id of the job on whose result a job has painted, if this tab has created it. @param {string} id @returns {string | null} */
+export function baseOf(id) {
+  try {
+    return sessionStorage.getItem(BASE + id);
+  } catch {
+    return null;
+  }
 }
 
 const say = words.submit;

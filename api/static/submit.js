@@ -11,6 +11,7 @@ import { defaultName } from "./names.js";
 import { optionControl } from "./options.js";
 import { OptionsPart } from "./options_part.js";
 import { costCard } from "./plan.js";
+import { PaintPanel } from "./paint_panel.js";
 import { Refusals } from "./refusals.js";
 import { RegionList } from "./regions.js";
 import { accepted } from "./tables.js";
@@ -54,6 +55,13 @@ export class SubmitView {
     this.selecting = new SelectPanel(this.stage);
     this.regions = new RegionList(() => this.paintingsChanged(), this.stage.viewer ? (row) => this.selectRegion(row) : undefined);
     this.crop = new CropPanel(this.stage, (box) => this.regions.crop(box), () => this.views.showCameras());
+    this.paint = new PaintPanel(this.stage, {
+      side: () => this.stage.viewer?.sides?.left,
+      files: async () => this.sceneFiles(),
+      parameters: () => this.options.parameters(this.views.orbiting),
+      opened: (open) => open && (this.selecting.close(null), this.crop.close()),
+      created: (job) => this.enter([job]),
+    }, this.leaving.signal);
     this.example = new ExamplePart(() => this.startExample());
     this.paintings = new PaintingsPart(this.slots.style, this.regions, () => this.styleChanged(), this.leaving.signal, this.example.offers[1]);
     this.views = new ViewsPart(this.slots, this.stage, this.options, this.crop, () => this.refresh());
@@ -71,6 +79,7 @@ export class SubmitView {
     this.invite = h("label.invite", { htmlFor: slots.scene.input.id }, h("span.plus", icon("plus")), h("strong.pointer", say.drop), h("strong.touch", say.dropTouch), h("span", say.dropMore));
     this.stage.overlay.append(this.invite, this.example.offers[0]);
     this.regionFold = h("details.fold", h("summary", say.regions), h("p.help", say.regionsHint), this.regions.element);
+    this.paint.button.hidden = true;
     this.costButton = h("button.quiet", { type: "button", onclick: () => this.act(true) }, say.cost);
     this.startButton = h("button.primary", { type: "submit" }, say.start);
     this.result = h("div.result", { "aria-live": "polite" });
@@ -117,6 +126,7 @@ export class SubmitView {
 
   /** Let the user select the Gaussians of a region. @param {import("./regions.js").Row} row */
   selectRegion(row) {
+    this.paint.cancel();
     const opened = this.selecting.open(row.value().name, row.mask(), (mask) => {
       if (mask) row.setMask(mask);
       /** @type {HTMLElement} */ (row.element.querySelector(".handmade button")).focus();
@@ -137,6 +147,7 @@ export class SubmitView {
 
   /** @param {File[]} files */
   take(files) {
+    if (this.paint.view) return void this.paint.use(files[0]);
     const found = sorted(files);
     for (const role of /** @type {const} */ (["cameras", "photos", "style", "scene"])) this.slots[role].add(found[role]);
     const names = found.unknown.map(({ name }) => name);
@@ -149,6 +160,8 @@ export class SubmitView {
     this.refresh();
     this.selecting.close(null);
     this.crop.close();
+    this.paint.cancel();
+    this.paint.button.hidden = !file;
     if (file !== this.shown) this.regions.dropMasks();
     this.shown = file;
     if (file && this.earlier && file.name !== this.earlier) this.leaveEarlier();
@@ -263,10 +276,15 @@ export class SubmitView {
     }
   }
 
+  /** Return the files of the scene. */
+  sceneFiles() {
+    return { scene: this.slots.scene.files, cameras: this.views.orbiting ? [] : this.slots.cameras.files };
+  }
+
   /** Send the files, and return the bodies of the jobs. */
   async bodies() {
-    const { scene, style, cameras, photos } = this.slots, { orbiting } = this.views;
-    const files = { scene: scene.files, style: style.files, cameras: orbiting ? [] : cameras.files, photos: orbiting ? [] : photos.files, mask: this.regions.maskFiles() };
+    const { style, photos } = this.slots, { orbiting } = this.views;
+    const files = { ...this.sceneFiles(), style: style.files, photos: orbiting ? [] : photos.files, mask: this.regions.maskFiles() };
     const sent = await this.submission.send(files), regions = this.regions.value(), shares = this.paintings.shareValues();
     const parameters = { ...this.options.parameters(orbiting), ...(regions.length ? { regions } : {}), ...(shares ? { style_weights: shares } : {}) };
     return this.paintings.bodies({ ...sent, scene: sent.scene[0], parameters });
@@ -313,6 +331,11 @@ export class SubmitView {
     this.created = jobs.map(({ id }) => id).join("/");
     forgetDraft();
     location.hash = `#/${jobs.length > 1 ? "compare" : "jobs"}/${this.created}`;
+  }
+
+  /** Give the 3D view to that of the job that was created. @param {string} id */
+  handOver(id) {
+    return id === this.created && this.stage.viewer?.sides ? this.stage : undefined;
   }
 
   /** @param {unknown} error */

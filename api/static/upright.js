@@ -17,6 +17,9 @@ export function directionOf(text = "") {
   return UPS[text] ?? (numbers?.length === 3 ? numbers : undefined);
 }
 
+/** Return the value of the option `up` for a direction; undefined if there is none. @param {Vector} up */
+export const upName = (up) => Object.keys(UPS).find((name) => dot(UPS[name], up) > 0.999);
+
 /**
  * Return the up direction after a quarter turn.
  *

@@ -68,7 +68,7 @@ export const words = {
     lost: "The graphics card was reset. The view will return shortly.",
     name: "3D view", view: "view", instructions: "Arrow keys orbit, W A S D Q E move, with Shift faster and with Ctrl slower, + and - zoom, F turns to what is in the middle or under the pointer, comma and period switch cameras, Space swaps before and after, holding O shows the original, Home shows everything.",
     wipe: "Wipe", wipeAt: (/** @type {string} */ left, /** @type {string} */ right, /** @type {number} */ share) => `${percent(share)} ${left}, the rest ${right}`,
-    original: "Original", stylized: "Stylized", now: "So far", left: "Left", right: "Right",
+    original: "Original", stylized: "Stylized", painted: "Painted", now: "So far", left: "Left", right: "Right",
     toggle: "Swap before and after", orbit: "Orbit", fly: "Fly", movement: "Movement", home: "Show everything", screenshot: "Save image", full: "Full screen", keys: "Keyboard and gestures",
     camera: "Camera", frames: "Show cameras", free: "Free view", cameraOf: (/** @type {number} */ n, /** @type {number} */ all, /** @type {string} */ name) => `${n} of ${all}${name ? ` · ${name}` : ""}`,
     vr: "VR", ar: "AR", headset: "Show in the headset. Sticks move, turn and blend; the trigger teleports; grip with one hand to move the scene, with both to turn and scale it; hold A or X for the original.",
@@ -136,6 +136,12 @@ export const words = {
     isUp: (/** @type {string} */ up) => `${up.toUpperCase().replace("-", "−")} is up`, neither: "None of these",
   },
   crop: { crop: "Crop the scene", help: "Only what is inside the box is painted; the rest keeps its colors. Drag the handles, or use the arrow keys on them.", use: "Crop to this box", remove: "Remove the crop", inside: "inside" },
+  paint: {
+    paint: "Paint", title: "Paint on this view", help: "Paint over the view, and the whole scene takes it over, from all sides. Or save the picture, paint on it in any program, and drop it here again.",
+    frozen: "The view stands still.", color: "Color", size: "Brush size", undo: "Undo stroke", download: "Download picture", use: "Use a painted picture", apply: "Apply", undoAll: "Undo painting", stylize: "Stylize this scene", fit: (/** @type {number} */ before, /** @type {number} */ after) => `painted pixels: ${one.format(before)} dB before, ${one.format(after)} dB after`,
+    notImage: (/** @type {string} */ name) => `${name} is no image that this browser can read. Save it as PNG.`,
+    otherSize: (/** @type {string} */ name, /** @type {number[]} */ [width, height], /** @type {number[]} */ expected) => `${name} has ${width}×${height} pixels, but the view has ${expected.join("×")}. Paint on the downloaded picture, and keep its size.`,
+  },
   painting: {
     edit: (/** @type {string} */ name) => `Rotate or crop ${name}`, help: "Drag over the painting to keep a part of it.", left: "Rotate left", right: "Rotate right", whole: "Whole painting", use: "Use it", edges: ["Left %", "Top %", "Right %", "Bottom %"],
     unreadable: (/** @type {string} */ name) => `${name} can't be edited in this browser. You can still use it as it is.`, tooLarge: "This image is too large to edit in this browser. Use it as it is, or make it smaller first.",
@@ -188,7 +194,7 @@ export const words = {
   },
   job: {
     stages: /** @type {Record<string, string>} */ ({
-      reading: "Reading the files", planning: "Analyzing views", refining: "Choosing Gaussians to split", starting: "Starting to paint", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality", video: "Rendering the video",
+      reading: "Reading the files", planning: "Analyzing views", refining: "Choosing Gaussians to split", starting: "Starting to paint", coarse: "Rough colors", sos: "Adding detail", measuring: "Checking quality", painting: "Painting the scene", video: "Rendering the video",
     }),
     unnamed: "Unnamed job", rename: "Rename", newName: "New name", save: "Save", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`, frame: (/** @type {number} */ n, /** @type {number} */ all) => `frame ${count(n)} of ${count(all)}`,
     left: (/** @type {number} */ s) => (s < 1 ? "almost done" : `about ${seconds(s)} left`), progress: "Progress", remove: "Delete", removeSure: "Delete this job and its results?", keep: "Cancel", deleted: "This job was deleted.", gone: "This job doesn't exist, or was deleted.",

@@ -4,6 +4,7 @@ import { cross, difference, dot, rotated, sum, times, unit } from "./vectors.js"
 
 /** @typedef {import("./vectors.js").Vector} Vector */
 /** @typedef {import("../cameras.js").JobCamera} JobCamera */
+/** @typedef {import("../cameras.js").RestCamera} RestCamera */
 
 /** Focal length of a free view as a multiple of its height: 50 degrees. */
 const FOCAL = 1.07;
@@ -80,6 +81,17 @@ export class ViewCamera {
   pixels(width, height) {
     const frame = this.shape ? Math.min(height, width / this.shape) : Math.min(height, width * 1.2);
     return [this.focal[0] * frame, this.focal[1] * frame];
+  }
+
+  /**
+   * Return the camera of a canvas's image, as jobs take it.
+   *
+   * @param {number[]} size width and height in pixels
+   * @returns {RestCamera}
+   */
+  ofImage([width, height]) {
+    const [fx, fy] = this.pixels(width, height);
+    return { width, height, fx, fy, cx: width / 2, cy: height / 2, world_to_camera: this.axes.map((axis) => [...axis, -dot(axis, this.eye)]) };
   }
 
   /**

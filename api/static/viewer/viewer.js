@@ -38,6 +38,8 @@ export class Viewer {
     this.frames = 0;
     /** GPU times of the last frames in milliseconds. @type {number[]} */
     this.milliseconds = [];
+    /** Width and height of the canvas in pixels while a view is frozen. @type {number[] | null} */
+    this.frozen = null;
     this.lost = false;
     this.ended = false;
     /** The headset that shows the scene instead of the canvas. @type {import("./headset.js").Headset | null} */
@@ -200,6 +202,7 @@ export class Viewer {
 
   /** Return the size of the canvas in pixels. */
   size() {
+    if (this.frozen) return this.frozen;
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     return [Math.max(1, Math.round(this.canvas.clientWidth * ratio)), Math.max(1, Math.round(this.canvas.clientHeight * ratio))];
   }
