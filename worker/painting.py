@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 #: Text chunk of a PNG with the view that it shows, as `PaintedOptions`.
 _CHUNK = "sgsst-view"
 #: Number of other views that tell how well the painted ones show a Gaussian.
-_OTHERS = 8
+_OTHERS = 12
 #: An image that states no view is compared with so many, at this longer side. It is refused if another one than it is
 #: said to show fits better by so many dB. An image less opaque than this on average shows paint, not the view.
 _MOST_COMPARED, _COMPARED_SIDE, _CLEARLY, _OPAQUE = 100, 160, 3.0, 0.5

@@ -122,7 +122,6 @@ class PaintedColors:
     def solve(
         self,
         base: Tensor,
-        start: Tensor | None = None,
         *,
         bounded: bool = True,
         iterations: int = ITERATIONS,
@@ -131,15 +130,14 @@ class PaintedColors:
         """Return the colors that minimize the error on the painted pixels and the distance to other colors.
 
         Args:
-            base: [N, 3], DC colors that Gaussians return to where the pictures say nothing.
-            start: [N, 3], colors of the first iteration; None for `base`.
+            base: [N, 3], DC colors of the first iteration, to which Gaussians return where the pictures say nothing.
             bounded: Whether colors stay within 0..1, or as far outside as they were.
             iterations: Maximum number of iterations.
             show: Callback that receives the number of completed iterations.
         """
         original, own = self.original[self._shown], base[self._shown]
         least, most = original.clamp_max(0), original.clamp_min(1)
-        x = self._unclamped(own if start is None else start[self._shown])
+        x = self._unclamped(own)
         error, passing = self._descent(x, own)
         free = torch.ones_like(x, dtype=torch.bool)
         if bounded:
@@ -245,12 +243,7 @@ def paint(
     for first in range(ITERATIONS, PASSES, ROUND_ITERATIONS):
         change = spreading((solution.colors - original).cpu()).to(original)
         base = torch.clamp(original + change, least, highest)
-        solution = problem.solve(
-            base,
-            solution.colors,
-            iterations=ROUND_ITERATIONS,
-            show=partial(_show_from, first, show),
-        )
+        solution = problem.solve(base, iterations=ROUND_ITERATIONS, show=partial(_show_from, first, show))
     show(PASSES)
     sh_dc = ((solution.colors - COLOR_OFFSET) / SH_C0).cpu().to(torch.float32)
     sh_dc = torch.where(solution.colors.cpu() == original.cpu(), scene.sh_dc, sh_dc)
