@@ -25,7 +25,7 @@ from tests.small_scenes import cameras, wall, write_files
 
 pytestmark = pytest.mark.slow
 
-QUICK = {"steps_coarse": 2, "steps_sos": 2}
+QUICK: dict[str, Any] = {"steps_coarse": 2, "steps_sos": 2}
 TITLE = "Paint on this view"
 
 
