@@ -26,7 +26,7 @@ from sgsst_core.files.formats import format_of_name, read_scene_header, scene_pa
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.sog import INDEX_NAME, META_NAME, SOG, STREAMED_SOG
-from sgsst_core.files.images import Color
+from sgsst_core.files.images import Color, to_image
 from sgsst_core.files.library import TrainerCheckpoint, load_scene
 from sgsst_core.files.scene_file import (
     USD_SUFFIXES,
@@ -49,11 +49,12 @@ from sgsst_core.report.images import Layer, write_frames
 from sgsst_core.scene.camera import Camera, CameraPath, framed, in_path_order
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.rendering import CLASSIC
+from sgsst_core.scene.spherical_harmonics import scene_colors
 from sgsst_core.settings import Settings
 from worker.capture import Capture, about_notes, about_rendering, choose_axes, orbit_request, read_capture
 from worker.inputs import check_something_in_view, cropped, read_job_capture, read_requested
 from worker.job import JobSpec, SceneRequest, check_choice
-from worker.options import DEFAULT_SIDE, VideoOptions
+from worker.options import DEFAULT_SIDE, MOST_VIEWPOINT_NAME, VideoOptions, Viewpoint, Viewpoints
 from worker.outputs import check_folder, check_is_not_input, result_format
 from worker.prepare import describe_scene
 
@@ -201,6 +202,10 @@ def _written(out: Path, *, in_place: bool) -> Iterator[BinaryIO]:
 
 #: Largest relative difference of spherical harmonics that are those of the original times a factor.
 _TOLERANCE = 1e-3
+#: Length of a sum of unit vectors below which it has no direction.
+_NO_DIRECTION = 1e-6
+#: Longer side of the image of a viewpoint in pixels, and quality of its JPEG.
+_POSTER_SIDE, _POSTER_QUALITY = 960, 90
 
 
 def write_page(
@@ -212,6 +217,8 @@ def write_page(
     *,
     background: Color = (0.0, 0.0, 0.0),
     up: list[float] | None = None,
+    cameras: Sequence[Camera] = (),
+    viewpoints: Viewpoints | None = None,
     in_place: bool = False,
 ) -> None:
     """Write a scene as an HTML file, atomically.
@@ -220,7 +227,9 @@ def write_page(
         viewer: Sources of the viewer; see `api.static_files.exported_viewer`.
         original: Scene of the same Gaussians to show beside it, with a wipe and a blend; None for none.
         background: Color behind the scene, in 0..1.
-        up: Up direction; None to estimate it.
+        up: Up direction; None for that of the cameras, or to estimate it.
+        cameras: Cameras of the scene. The page opens at the first one, unless `viewpoints` has a start.
+        viewpoints: Viewpoints of the page; None for none.
         in_place: Whether to write directly to the existing file, because no temporary file can be created beside it.
 
     Raises:
@@ -232,16 +241,59 @@ def write_page(
     data = {name: gzip.compress(viewer[name].encode(), mtime=0) for name in ("page", "worker")}
     data["scene"] = _sog(shown.scene, out)
     data["colors"] = b"" if original is None else gzip.compress(_indexed_colors(stylized.scene, out), mtime=0)
-    upright = up or find_upright_subject(shown.scene, None)[1].direction.tolist()
+    upright = up or _mean_up(cameras) or find_upright_subject(shown.scene, None)[1].direction.tolist()
+    chosen = viewpoints or Viewpoints()
+    start = chosen.start or (viewpoint_of(cameras[0]) if cameras else None)
+    opening = Viewpoints(start=start, named=chosen.named).model_dump(mode="json")
     sizes = {name: len(content) for name, content in data.items()}
     sog = shown.format in (SOG.name, STREAMED_SOG.name)
     facts = {"title": title, "up": upright, "fade": fade, "sog": sog, "background": background, "bytes": sizes}
+    facts["viewpoints"] = opening
     about = json.dumps(facts).replace("<", "\\u003c")
     values = {"title": html.escape(title), "style": viewer["style"], "about": about}
     values |= {name: _base85(content) for name, content in data.items()}
     page = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], viewer["document"])
     with nullcontext(out) if in_place else atomic_path(out) as temporary:
         temporary.write_text(page, encoding="utf-8")
+
+
+def _mean_up(cameras: Sequence[Camera]) -> list[float] | None:
+    """Return the mean up direction of cameras, as the page's `upOf`; None for fewer than two, or if they cancel out."""
+    total = -sum((camera.world_to_camera[1, :3] for camera in cameras), torch.zeros(3, dtype=torch.float64))
+    length = float(total.norm())
+    return (total / length).tolist() if len(cameras) > 1 and length > _NO_DIRECTION else None
+
+
+def viewpoint_of(camera: Camera) -> Viewpoint:
+    """Return the viewpoint of a camera, without its distortion and the offset of its principal point."""
+    name = re.sub(r"[\x00-\x1f\x7f-\x9f]", "_", camera.name)[-MOST_VIEWPOINT_NAME:]
+    axes = camera.world_to_camera[:3, :3].tolist()
+    intrinsics = {side: getattr(camera, side) for side in ("fx", "fy", "width", "height")}
+    return Viewpoint(name=name, position=camera.center.tolist(), axes=axes, **intrinsics)
+
+
+def write_poster(
+    out: Path, original: Scene, stylized: Scene, viewpoint: Viewpoint, *, background: Color, near: float
+) -> None:
+    """Write a JPEG of a viewpoint, whose left half shows the original scene, directly to the existing file.
+
+    Raises:
+        CameraError: If the viewpoint is no camera.
+    """
+    at, width, height = viewpoint, viewpoint.width, viewpoint.height
+    rotation = torch.tensor(at.axes, dtype=torch.float64)
+    pose = torch.cat([rotation, -rotation @ torch.tensor(at.position, dtype=torch.float64)[:, None]], dim=1)
+    intrinsics = [[at.fx, 0.0, width / 2], [0.0, at.fy, height / 2], [0.0, 0.0, 1.0]]
+    camera = framed(Camera.from_matrix(pose, intrinsics, width, height), _POSTER_SIDE, even=False)
+    before, after = (
+        make_rasterizer("cpu", scene, background=background, near=near, memory=0).render(
+            scene_colors(scene, camera), camera
+        )
+        for scene in (original, stylized)
+    )
+    middle = camera.width // 2
+    image = torch.cat([before[:, :middle], after[:, middle:]], dim=1)
+    to_image(image).save(out, format="JPEG", quality=_POSTER_QUALITY)
 
 
 def _fade(stylized: SceneFile, original: SceneFile) -> float:

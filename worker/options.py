@@ -1,11 +1,12 @@
 """Options of a job, declared once for the command line and the API: views, settings, style files and regions.
 
-PyTorch is not imported.
+In addition, the viewpoints of the page that shows its result. PyTorch is not imported.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Ge, Le
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, create_model
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StringConstraints, create_model, field_validator
 
 from sgsst_core.constants import NEAR
 from sgsst_core.errors import SettingsError
@@ -603,3 +604,73 @@ def region_requests(
         raise SettingsError(f"There are {selecting} regions. At most {MOST_REGIONS} are allowed.")
     rest = next((region for region in requests if region.name == REST), None)
     return (*([rest] if rest else []), *(region for region in requests if region.name != REST))
+
+
+#: Maximum numbers of named viewpoints, and of characters of a name.
+MOST_VIEWPOINTS, MOST_VIEWPOINT_NAME = 12, 200
+#: Largest deviation of a viewpoint's axes from a rotation.
+_AXES_TOLERANCE = 1e-3
+_Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+_Focal = Annotated[float, Field(gt=0, le=1e7)]
+_Side = Annotated[int, Field(ge=1, le=65_535)]
+_EXAMPLE: dict[str, Any] = {
+    "name": "front",
+    "position": [0.0, 0.0, -3.0],
+    "axes": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+    "fx": 800.0,
+    "fy": 800.0,
+    "width": 1200,
+    "height": 800,
+}
+
+
+class Viewpoint(BaseModel):
+    """Pose of a page's 3D view: a pinhole camera with its principal point in the middle."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", json_schema_extra={"examples": [_EXAMPLE]})
+
+    name: str = Field("", max_length=MOST_VIEWPOINT_NAME, pattern=NO_CONTROLS)
+    position: _Vector = Field(description="Position in the world.")
+    axes: Annotated[list[_Vector], Field(min_length=3, max_length=3)] = Field(
+        description="Directions of right, down and forward in the world: the rows of a rotation, within 1e-3."
+    )
+    fx: _Focal = Field(description="Focal length in pixels.")
+    fy: _Focal = Field(description="Focal length in pixels.")
+    width: _Side = Field(description="Width in pixels. The page shows the whole frame at its own size.")
+    height: _Side = Field(description="Height in pixels.")
+
+    @field_validator("axes")
+    @classmethod
+    def _check_axes(cls, axes: list[list[float]]) -> list[list[float]]:
+        (a, b, c), (d, e, f), forward = axes
+        products = [sum(map(operator.mul, first, second)) for first in axes for second in axes]
+        across = sum(map(operator.mul, (b * f - c * e, c * d - a * f, a * e - b * d), forward))
+        errors = [abs(value - (at % 4 == 0)) for at, value in enumerate(products)]
+        if not all(error <= _AXES_TOLERANCE for error in (*errors, abs(across - 1))):
+            raise ValueError("must be orthogonal unit vectors: right, down and forward")
+        return axes
+
+
+class Viewpoints(BaseModel):
+    """Viewpoints of the page that shows a result."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", json_schema_extra={"examples": [{"start": None, "named": [_EXAMPLE]}]}
+    )
+
+    start: Viewpoint | None = Field(
+        None, description="Viewpoint at which the page opens. Null: the first camera; without cameras, the whole scene."
+    )
+    named: list[Viewpoint] = Field(
+        default_factory=list,
+        max_length=MOST_VIEWPOINTS,
+        description="Viewpoints to jump to, in the order of their keys and of the path through them.",
+    )
+
+    @field_validator("named")
+    @classmethod
+    def _check_names(cls, named: list[Viewpoint]) -> list[Viewpoint]:
+        names = [viewpoint.name for viewpoint in named]
+        if "" in names or len({*names}) < len(names):
+            raise ValueError("must have names, each of them once")
+        return named

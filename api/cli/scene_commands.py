@@ -37,12 +37,19 @@ from sgsst_core.errors import OutputError, SettingsError
 from sgsst_core.files.formats import RESULT_SUFFIXES
 from sgsst_core.progress import clock, duration
 from sgsst_core.stylizing.progress_bar import job_bar, live_bar
-from worker.options import ESSENTIALS, PaintedFile, StylizeOptions, VideoOptions, ViewOptions
+from worker.options import (
+    ESSENTIALS,
+    MOST_VIEWPOINTS,
+    PaintedFile,
+    StylizeOptions,
+    VideoOptions,
+    ViewOptions,
+    Viewpoints,
+)
 
 if TYPE_CHECKING:
     from api.cli.scene_tools import VariantsRequest
     from sgsst_core.bench.variants import Curve
-    from sgsst_core.files.scene_file import SceneFile
     from worker.derived import VideoRequest
 
 #: Number of frames after which the time of a video is estimated.
@@ -274,24 +281,55 @@ def view(
         path_to_read("Unstylized scene to compare with, by a wipe and a blend.", rich_help_panel=ESSENTIALS),
     ] = None,
     title: Annotated[str | None, typer.Option(help="Title of the page. [default: the name of the scene]")] = None,
+    cameras: Annotated[
+        Path | None, path_to_read("Cameras that --start and --views name. [default: the page shows the whole scene]")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Camera at which the page opens. [default: the first one]")
+    ] = None,
+    views: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,...",
+            help=f"Up to {MOST_VIEWPOINTS} cameras that the page jumps to, by buttons and the keys 1 to 9.",
+        ),
+    ] = "",
     *,
     options: ViewOptions,
 ) -> None:
     """Write a scene as one HTML file, which shows it in 3D in a browser, without a server."""
     from api.static_files import exported_viewer
-    from sgsst_core.files.scene_file import read_scene
-    from worker.derived import write_page
+    from worker.capture import read_capture
+    from worker.derived import viewpoint_of, write_page
+    from worker.inputs import read_requested
+    from worker.job import SceneRequest
+    from worker.painting import camera_named
 
     if out.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{out}: not the name of an HTML file. Give one, such as scene.html.")
-
-    def read(path: Path) -> SceneFile:
-        file = read_scene(path, drop_invalid=options.drop_invalid, spz_axes=options.spz_axes)
-        return file.rendered(options.render_mode, options.eps2d)
-
+    names = [name.strip() for name in views.split(",") if name.strip()]
+    if (start or names) and cameras is None:
+        raise SettingsError("--start and --views name cameras. Add --cameras, or omit them.")
+    if len({*names}) < len(names) or len(names) > MOST_VIEWPOINTS:
+        raise SettingsError(f"--views {views}: must be at most {MOST_VIEWPOINTS} names, each of them once.")
+    source = SceneRequest.of(scene, cameras, options)
     with spinner("Compressing the scene"):
-        before = None if original is None else read(original)
-        write_page(out, exported_viewer(), read(scene), before, title or scene.name.partition(".")[0])
+        file, _ = read_requested(source)
+        before = None if original is None else read_requested(source.model_copy(update={"scene": original}))[0]
+        capture = None if cameras is None else read_capture(source, file.scene)
+        at, *named = (
+            viewpoint_of(camera_named(capture.cameras, name)) if capture and name else None for name in (start, *names)
+        )
+        viewpoints = Viewpoints(start=at, named=[*filter(None, named)])
+        write_page(
+            out,
+            exported_viewer(),
+            file,
+            before,
+            title or scene.name.partition(".")[0],
+            cameras=capture.cameras if capture else (),
+            viewpoints=viewpoints,
+        )
     print_field("page", f"{out}, {out.stat().st_size / 1e6:.1f} MB: open it in a browser")
 
 

@@ -132,16 +132,21 @@ def get_job(job_id: JobId, context: ContextDep, caller: CallerDep, if_none_match
 async def change_job(
     job_id: JobId, context: ContextDep, caller: CallerDep, change: Annotated[JobChange, Depends(json_body(JobChange))]
 ) -> Response:
-    """Rename a job, whatever its status."""
-    return await asyncio.to_thread(_rename, context, caller, job_id, change.name)
+    """Rename a job, whatever its status, or set the viewpoints of a finished one."""
+    job = await asyncio.to_thread(find, context, caller, job_id)
+    if change.viewpoints is not None:
+        if job.status != JobStatus.SUCCEEDED:
+            raise problems.NO_RESULT(job_status=job.status)
+        await context.derived.set_viewpoints(job, change.viewpoints, caller.quotas)
+    if change.name is not None:
+        await asyncio.to_thread(_rename, context, caller, job_id, change.name)
+    return await asyncio.to_thread(_job_response, context, caller, job_id)
 
 
-def _rename(context: Context, caller: Caller, job_id: str, name: str) -> Response:
-    check_id(job_id)
+def _rename(context: Context, caller: Caller, job_id: str, name: str) -> None:
     job, _ = context.store.jobs.detail(job_id, caller.owner)
     regions = JobParameters(**job.row.parameters).region_requests
     context.store.jobs.rename(job_id, caller.owner, name or default_job_name(job.inputs, regions))
-    return _job_response(context, caller, job_id)
 
 
 @router.get("/{job_id}/progress", response_model=ProgressHistory)

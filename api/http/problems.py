@@ -268,6 +268,7 @@ _UNWRITABLE = problems.INVALID_INPUT(
     "stylized.spz: SPZ cannot hold a Gaussian 1e+07 from the origin. Write a PLY, or a .compressed.ply.",
     code=OutputError.code,
 )
+_UNREADABLE = problems.INVALID_INPUT("stylized.ply: the file is incomplete.", code=SceneError.code)
 #: Errors of the core that the inspection of a job's files reports: code, part of the request and example.
 _UNUSABLE = (
     (SceneError.code, "scene", "scene.ply: holds no Gaussians (element vertex 0). Export the scene again."),
@@ -337,6 +338,7 @@ _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
         ),
     ),
     "delete_job": (problems.NOT_ENDED,),
+    "change_job": (*_MAKING, _UNREADABLE, problems.NO_RESULT),
     "get_artifact": (*_MAKING, _UNWRITABLE),
     "get_input": (*_READING, problems.NO_INPUT),
     "create_blend": (
@@ -350,7 +352,7 @@ _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
         ),
     ),
     "make_video": _MAKING,
-    "create_share": (problems.NO_RESULT, problems.TOO_MANY_SHARES),
+    "create_share": (*_MAKING, _UNREADABLE, problems.NO_RESULT, problems.TOO_MANY_SHARES),
     "get_shared_file": (*_READING, problems.NO_SHARED_FILE),
     "create_upload": (
         problems.MALFORMED_BODY,

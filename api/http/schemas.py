@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextvars import ContextVar
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from starlette.types import Scope
 
 from service.files.objects import media_type
@@ -23,6 +23,7 @@ from service.store.tables import ArtifactRow, AttemptRow, Base, JobRow, ShareRow
 from sgsst_core.files.formats import ResultName
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.progress import Progress
+from worker.options import Viewpoints
 
 if TYPE_CHECKING:
     StatusName = str
@@ -201,6 +202,7 @@ class JobView(BaseModel):
         progress=example_of(ProgressView),
         result=None,
         error=None,
+        viewpoints={"start": None, "named": []},
         parameters={"name": "plush", "preset": "standard"},
         inputs=[example_of(InputView), {"role": "style", "name": "style.jpg", "size": 10421, "sha256": SHA256[::-1]}],
         input_counts={"scene": 1, "style": 1},
@@ -225,6 +227,7 @@ class JobView(BaseModel):
         "painted views their PSNR in dB on painted pixels."
     )
     error: ErrorView | None
+    viewpoints: Viewpoints
     parameters: dict[str, Any] = Field(
         description="As `JobParameters`, with defaults for omitted fields; fields of an earlier version are shown as "
         "they were stored."
@@ -428,11 +431,24 @@ class SignIn(BaseModel):
 
 
 class JobChange(BaseModel):
-    """Changes to a job."""
+    """Changes to a job; at least one."""
 
     model_config = _strict(name="plush, at night")
 
-    name: JobName = Field(description="New display name; an empty one restores the names of scene and style.")
+    name: JobName | None = Field(
+        None, description="New display name; an empty one restores the names of scene and style."
+    )
+    viewpoints: Viewpoints | None = Field(
+        None,
+        description="Viewpoints of the page that shows the result, in place of all former ones: on this service, "
+        "behind its shared links, and as a file. Rendering an image of a new `start` takes seconds.",
+    )
+
+    @model_validator(mode="after")
+    def _check_given(self) -> Self:
+        if self.name is None and self.viewpoints is None:
+            raise ValueError("nothing would change: give a name or viewpoints")
+        return self
 
 
 class NewShare(BaseModel):
@@ -499,6 +515,7 @@ class SharedView(BaseModel):
         name="plush",
         expires_at=_NOW,
         parameters={"background": [0.0, 0.0, 0.0], "near": 0.2},
+        viewpoints={"start": None, "named": []},
         cameras=["cameras.json"],
         files=["colors.f16", "stylized.ply"],
     )
@@ -506,6 +523,7 @@ class SharedView(BaseModel):
     name: str
     expires_at: Time
     parameters: dict[str, Any] = Field(description="Parameters of the job that matter for rendering.")
+    viewpoints: Viewpoints
     cameras: list[str] = Field(description="Names of the camera files `cameras:0` and so on.")
     files: list[str] = Field(description="Files of the result.")
 
@@ -564,6 +582,7 @@ def _given_fields(shown: ShownJob) -> dict[str, Any]:
         # The remaining time is that of the last report, and a job that has ended has none.
         "progress": {**job.progress, **({} if job.status in UNFINISHED else {"eta_s": None})} if job.progress else None,
         "error": job.error or None,
+        "viewpoints": job.viewpoints or {},
         "parameters": JobParameters().model_dump(mode="json") | job.parameters,
         "inputs": shown.inputs,
         "input_counts": shown.input_counts,

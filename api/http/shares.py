@@ -21,6 +21,7 @@ from api.http.sending import ConditionsDep, SentFile, file_answers, send_file
 from api.http.static import PAGE_HEADERS, shared_page, shared_policy
 from service import problems
 from service.files.objects import media_type
+from service.inspection.derived import POSTER
 from service.problems import SHARE_ID, SHARE_TOKEN, NoJobError, NoShareError, ServiceError
 from service.store.jobs import Shared
 from service.store.keys import Quotas
@@ -29,8 +30,12 @@ from service.store.tables import ArtifactRow
 router = APIRouter(tags=["shares"])
 
 _DAY = 86_400.0
-#: Results that a share shows, with the names of their artifacts.
-_RESULTS = {"colors.f16": "colors.f16", "stylized.ply": "stylized.ply", "poster": "previews/thumbnail.jpg"}
+#: Results that a share shows, with the names of their artifacts, of which the first one that exists is shown.
+_RESULTS = {
+    "colors.f16": ("colors.f16",),
+    "stylized.ply": ("stylized.ply",),
+    "poster": (POSTER, "previews/thumbnail.jpg"),
+}
 #: Parameters of a job that matter for rendering.
 _RENDERED = ("background", "near", "render_mode", "eps2d", "sh_attenuation")
 #: Media type of shared files.
@@ -85,7 +90,9 @@ async def create_share(
     Whoever has the link sees the scene before and after in 3D, and nothing else, until it expires or is revoked. The
     link also ends with the results of the job, and if the key that created the job is revoked.
     """
-    await asyncio.to_thread(find, context, caller, job_id)
+    job = await asyncio.to_thread(find, context, caller, job_id)
+    if new.poster and job.viewpoints and (start := job.viewpoints["start"]):
+        await context.derived.poster(job, start, caller.quotas)  # a continued job has lost its own
     row, token = await asyncio.to_thread(context.store.shares.create, job_id, caller.owner, new.days * _DAY)
     place = f"/{token}" if new.poster else f"#{token}"
     view = ShareCreated(**share_view(row).model_dump(), url=address(f"/shared{place}"), embed_url=None)
@@ -142,7 +149,7 @@ def _shared_view(context: Context, shared: Shared) -> tuple[SharedView, Artifact
     jobs, job_id = context.store.jobs, shared.job.id
     try:
         job, _ = jobs.detail(job_id, None)
-        files = [name for name, artifact in _RESULTS.items() if jobs.artifact(job_id, artifact)]
+        files = [name for name in _RESULTS if _result(context, job_id, name)]
         plan = jobs.artifact(job_id, "plan.json")
     except NoJobError:
         raise problems.NO_SHARE() from None
@@ -150,10 +157,17 @@ def _shared_view(context: Context, shared: Shared) -> tuple[SharedView, Artifact
         name=job.row.name,
         expires_at=shared.share.expires_at,
         parameters={name: job.row.parameters[name] for name in _RENDERED if name in job.row.parameters},
+        viewpoints=job.row.viewpoints or {},
         cameras=[entry["name"] for entry in job.inputs if entry["role"] == "cameras"],
         files=files,
     )
     return view, plan
+
+
+def _result(context: Context, job_id: str, name: str) -> ArtifactRow | None:
+    """Return the row of a result that a share shows; None if there is none."""
+    rows = (context.store.jobs.artifact(job_id, artifact) for artifact in _RESULTS.get(name, ()))
+    return next(filter(None, rows), None)
 
 
 def _up_direction(context: Context, row: ArtifactRow) -> dict[str, str]:
@@ -180,7 +194,7 @@ async def show_page(request: Request, context: ContextDep, token: ShareToken) ->
 def _preview_tags(request: Request, context: Context, shared: Shared, token: str) -> str:
     """Return the tags of the Open Graph protocol, whose addresses are absolute."""
     tags = {"og:type": "website", "og:title": shared.job.name}
-    if context.store.jobs.artifact(shared.job.id, _RESULTS["poster"]):
+    if _result(context, shared.job.id, "poster"):
         poster = address(f"/v1/shared/{token}/poster")
         tags |= {
             "og:image": f"{request.url.scheme}://{request.url.netloc}{poster}",
@@ -233,7 +247,7 @@ def _find_file(context: Context, shared: Shared, name: str) -> SentFile:
     if entry is not None:
         if blob := context.store.inputs.blobs([entry["sha256"]]).get(entry["sha256"]):
             return input_file(context, shared.job.owner, blob, name, _KIND)
-    elif row := context.store.jobs.artifact(shared.job.id, _RESULTS.get(name, name)):
+    elif row := _result(context, shared.job.id, name):
         kind = media_type(row.name) if name == "poster" else _KIND
         return replace(artifact_file(context, shared.job.owner, row, name, kind), policy=INPUT_POLICY)
     raise problems.NO_SHARED_FILE(name=name)

@@ -11,6 +11,7 @@ import { labels, nameOf, resultName } from "./names.js";
 import { Stage } from "./stage.js";
 import { directionOf, UPS } from "./upright.js";
 import { requestedRendering } from "./viewer/render_tag.js";
+import { ViewpointsPanel } from "./viewpoints.js";
 import { words } from "./words.js";
 
 /** @typedef {import("./viewer/viewer.js").Side} Side */
@@ -48,7 +49,8 @@ export class ResultStage {
     /** Whether the up direction that the plan has found was read. */
     this.upright = false;
     this.blends = blend && jobs.length <= 2;
-    this.element = h("div.result-stage", this.pickers, this.stage.element, this.blend.element);
+    this.viewpoints = new ViewpointsPanel(this.stage, jobs[0].viewpoints, jobs.length === 1 && blend && !live ? jobs[0].id : "");
+    this.element = h("div.result-stage", this.pickers, this.stage.element, this.viewpoints.element, this.blend.element);
     /** Choices for each side of the wipe. @type {Map<string, {name: string, side: Side}>} */
     this.choices = new Map();
     if (jobs.length < 2 && jobs[0].parameters.painted?.length) this.stage.share ??= 0; // what was painted may be on either side of a wipe
@@ -76,6 +78,7 @@ export class ResultStage {
     this.stage.message(words.page.loading);
     this.stage.up = directionOf(first.parameters.up) ?? this.stage.up;
     await Promise.all([this.loadCameras(), first.status === "succeeded" && this.standUp()]);
+    this.stage.open();
     await this.openOriginal(first);
     for (const job of this.jobs) await this.openRun(job).catch((error) => this.tell(error));
     if (this.signal.aborted) return;
@@ -113,7 +116,7 @@ export class ResultStage {
     try {
       const header = await scene.headerRead;
       header.rendering = requestedRendering(header.rendering, job.parameters);
-      scene.ready.then(() => this.standFirst(), (error) => this.tell(error));
+      scene.ready.then(() => this.stage.open(), (error) => this.tell(error));
       this.original = scene;
       this.stage.original = side;
       this.blend.parts[0].colors = side.colors;
@@ -122,12 +125,6 @@ export class ResultStage {
       scene.end(); // this format cannot be shown in a browser: only the result is
       viewer.sides = null;
     }
-  }
-
-  /** Move to the current camera again once the scene's center is known, since its target depends on that. */
-  standFirst() {
-    const { viewer, stood } = this.stage;
-    if (viewer && stood >= 0 && !viewer.touched) this.stage.stand(stood, false);
   }
 
   /** @param {any} job */
@@ -197,6 +194,7 @@ export class ResultStage {
     const { original, live } = this;
     if (!original || live?.ownScene || job.parameters.sh_attenuation) return false;
     this.live = undefined;
+    this.viewpoints.offer(job.id);
     this.standUp();
     await this.fetching; // older colors would replace the final ones
     try {

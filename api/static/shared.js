@@ -26,7 +26,7 @@ async function show() {
   const { signal } = leaving, at = inPath ? `../v1/shared/${inPath}` : `v1/shared/${encodeURIComponent(location.hash.slice(1))}`;
   try {
     const view = await get(at, signal);
-    const job = { id: "shared", name: view.name, parameters: view.parameters, inputs: [{ role: "scene", sha256: "shared" }] };
+    const job = { id: "shared", name: view.name, parameters: view.parameters, viewpoints: view.viewpoints, inputs: [{ role: "scene", sha256: "shared" }] };
     const cameras = () => Promise.all(view.cameras.map(async (/** @type {string} */ name, /** @type {number} */ i) => ({ name, blob: await (await ask("GET", `${at}/cameras:${i}`, { signal })).blob() })));
     stage = new ResultStage([job], { signal, blend: false, files: () => ({ scene: `${at}/scene`, result: (name) => `${at}/${name}`, cameras }) });
     stage.stage.title = view.name;

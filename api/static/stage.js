@@ -33,6 +33,8 @@ export class Stage {
     /** @type {JobCamera[]} */
     this.cameras = [];
     this.stood = -1;
+    /** Viewpoint at which the view opens, instead of the first camera. @type {JobCamera | null} */
+    this.start = null;
     /** @type {[string, string] | null} */
     this.names = null;
     /** Side that is shown while a key is held. @type {Side | null} */
@@ -240,6 +242,32 @@ export class Stage {
     if (aloud) viewer.moved();
     this.drawFrames();
     if (aloud) announce(say.cameraOf(this.stood + 1, cameras.length, cameras[this.stood].name));
+  }
+
+  /** Move to the start again, or to the first camera, unless the user has moved; its target depends on the scene. */
+  open() {
+    const { viewer, start, stood } = this;
+    if (!viewer || viewer.touched || (!start && stood < 0)) return;
+    if (!start) return this.stand(stood, false);
+    this.leaveCamera();
+    viewer.camera.up = this.up;
+    viewer.camera.stand(start, viewer.sides?.left.scene.middle ?? null);
+    viewer.draw();
+  }
+
+  /** Return the present view as a viewpoint. @param {string} name @returns {JobCamera} */
+  viewpoint(name) {
+    const { canvas } = this, { camera } = /** @type {Viewer} */ (this.viewer), { clientWidth: width, clientHeight: height } = canvas;
+    const [fx, fy] = camera.pixels(width, height);
+    return { name, position: camera.eye, axes: camera.axes, fx, fy, width, height };
+  }
+
+  /** Move smoothly through viewpoints. @param {JobCamera[]} viewpoints */
+  fly(viewpoints) {
+    if (!this.viewer) return;
+    this.leaveCamera();
+    this.viewer.camera.up = this.up;
+    this.controls?.motion.fly(viewpoints);
   }
 
   leaveCamera() {

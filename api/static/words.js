@@ -66,7 +66,7 @@ export const words = {
     noWebGL: "The 3D view needs WebGL 2, which this browser doesn't support. Everything else works.",
     noPicture: "Couldn't save the image.",
     lost: "The graphics card was reset. The view will return shortly.",
-    name: "3D view", view: "view", instructions: "Arrow keys orbit, W A S D Q E move, with Shift faster and with Ctrl slower, + and - zoom, F turns to what is in the middle or under the pointer, comma and period switch cameras, Space swaps before and after, holding O shows the original, Home shows everything.",
+    name: "3D view", view: "view", instructions: "Arrow keys orbit, W A S D Q E move, with Shift faster and with Ctrl slower, + and - zoom, F turns to what is in the middle or under the pointer, comma and period switch cameras, 1 to 9 go to the named views, Space swaps before and after, holding O shows the original, Home shows everything.",
     wipe: "Wipe", wipeAt: (/** @type {string} */ left, /** @type {string} */ right, /** @type {number} */ share) => `${percent(share)} ${left}, the rest ${right}`,
     original: "Original", stylized: "Stylized", painted: "Painted", now: "So far", left: "Left", right: "Right",
     toggle: "Swap before and after", orbit: "Orbit", fly: "Fly", movement: "Movement", home: "Show everything", screenshot: "Save image", full: "Full screen", keys: "Keyboard and gestures",
@@ -78,7 +78,7 @@ export const words = {
     flyHelp: [["Drag, or arrow keys", "look around"], ["Wheel, pinch, or + −", "forward, back"]],
     help: [
       ["Right or middle drag, or two fingers", "pan"], ["W A S D", "move"], ["Q E", "down, up"], ["Shift, Ctrl while moving", "faster, slower"], ["Double click, or F", "turn to what is there"], ["Home", "show everything"],
-      [", .", "previous and next camera"], ["Space", "swap before and after"], ["Hold O", "show the original"],
+      [", .", "previous and next camera"], ["1 to 9", "named views"], ["Space", "swap before and after"], ["Hold O", "show the original"],
     ],
   },
   blend: {
@@ -234,6 +234,10 @@ export const words = {
   share: {
     title: "Share", help: "Anyone with the link can see this result in 3D, before and after, but nothing else.", create: "Create a link", lifetime: "Link expires after", days: (/** @type {number} */ n) => several(n, "day"),
     link: "Link to this result", copy: "Copy", copied: "Copied.", once: "Copy it now; it won't be shown again.", poster: "Show an image where the link is posted", frame: "HTML for your web page", iframe: (/** @type {string} */ url) => `<iframe src="${url}" title="3D scene" width="800" height="450" style="border: 0" loading="lazy" allow="fullscreen; xr-spatial-tracking"></iframe>`, until: (/** @type {string} */ at) => `Works until ${at}`, revoke: "Revoke", revokeOf: (/** @type {string} */ at) => `Revoke the link until ${at}`, revoked: "The link no longer works.",
+  },
+  viewpoints: {
+    title: "Views", path: "Fly through them", start: "Start here", usual: "Start at the usual place", name: "Name of the view", add: "Add view", numbered: (/** @type {number} */ n) => `View ${n}`, remove: (/** @type {string} */ name) => `Remove ${name}`,
+    saving: "Saving…", started: "The result, its links and its page open here.", reset: "The result opens at its usual place.", added: (/** @type {string} */ name) => `“${name}” was added.`, removed: "The view was removed.",
   },
   shared: { title: "Shared result", until: (/** @type {string} */ at) => `Shared until ${at}`, gone: "This link doesn't work" },
   signIn: { title: "Sign in", heading: "Sign in", lead: "This service requires an API key.", expired: "Your session has expired, or you signed out in another tab. Sign in to continue where you were.", where: "Enter your API key. Ask your administrator for one.", key: "API key", go: "Sign in", wrong: "That key isn't valid.", out: "You signed out." },

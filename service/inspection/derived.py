@@ -38,7 +38,7 @@ from service.store.keys import Quotas
 from service.store.tables import ArtifactRow, JobRow
 from sgsst_core.files.formats import result_name
 from sgsst_core.files.formats.scene_format import SceneFormat
-from worker.options import DEFAULT_SIDE, JobVideo
+from worker.options import DEFAULT_SIDE, JobVideo, Viewpoints
 
 #: Additional CPU seconds per byte of results, for reading, sorting, compressing, and rendering them several times.
 #: Actual use is less than a fifth.
@@ -47,12 +47,13 @@ _SECONDS_PER_BYTE = 600 / 1e9
 _HEADER_BYTES = 1 << 20
 #: Largest size of a blend relative to the result; a PLY with 8-bit values may become one with float32 values.
 _BLEND_SIZE = 4
-#: Largest size of a page relative to the result: geometry and two color sets, in base 85.
-_PAGE_SIZE = 2
+#: Largest size of a page relative to the result: geometry and two color sets, in base 85. Then that of a viewpoint's
+#: image in bytes, which is below 3 per pixel even for noise.
+_PAGE_SIZE, _POSTER_BYTES = 2, 3 << 20
 #: Maximum number of blends that are stored with a job.
 MOST_BLENDS = 20
-#: Names of the HTML page that shows the result, and of the video, among a job's artifacts.
-PAGE, VIDEO = result_name(RESULT, "html"), "video.mp4"
+#: Names among a job's artifacts: the HTML page that shows the result, the video, and the image of the page's start.
+PAGE, VIDEO, POSTER = result_name(RESULT, "html"), "video.mp4", "previews/start.jpg"
 #: Limits per frame of a video: CPU seconds per byte of the result and per pixel, of which a fifth is needed, and bytes
 #: of the file per pixel, which H.264 does not reach even for noise. Videos take an eighth of them at most.
 _VIDEO_SECONDS_PER_BYTE, _VIDEO_SECONDS_PER_PIXEL, _VIDEO_BYTES_PER_PIXEL, _USUAL_BYTES = 4e-8, 1e-6, 1.5, 1 / 8
@@ -92,7 +93,7 @@ class _Making:
         watchers: Callbacks that receive the progress.
     """
 
-    options: JobVideo | None
+    options: JobVideo | dict[str, Any] | None
     watchers: list[Show] = field(default_factory=list)
     task: asyncio.Task[None] | None = None
 
@@ -153,9 +154,38 @@ class DerivedFiles:
         Args:
             viewer: Sources of the page; see `worker.derived`.
         """
+        options = {"viewer": viewer, "title": job.name, "viewpoints": job.viewpoints or {}}
         return await self._existing(job, PAGE) or await self._derived(
-            job, PAGE, lambda: self._write_page(job, viewer, quotas)
+            job, PAGE, lambda: self._write_shown(job, "page", PAGE, options, quotas)
         )
+
+    async def poster(self, job: JobRow, start: dict[str, Any], quotas: Quotas) -> ArtifactRow:
+        """Return the image of a job's result at the viewpoint where its page starts; the left half is unstylized.
+
+        Args:
+            start: Viewpoint as JSON. If it is not the job's, the image is rendered and replaces the job's.
+
+        Raises:
+            BUSY: If the image of another viewpoint is in progress.
+        """
+        row = await self._existing(job, POSTER)
+        if row is not None and job.viewpoints and job.viewpoints["start"] == start:
+            return row
+        options = {"viewpoint": start}
+        return await self._derived(
+            job, POSTER, lambda: self._write_shown(job, "poster", POSTER, options, quotas), options
+        )
+
+    async def set_viewpoints(self, job: JobRow, viewpoints: Viewpoints, quotas: Quotas) -> None:
+        """Set the viewpoints of the page that shows a job's result, once there is an image of its start."""
+        chosen, outdated = viewpoints.model_dump(mode="json"), [PAGE]
+        if chosen["start"] is None:
+            outdated.append(POSTER)
+        else:
+            await self.poster(job, chosen["start"], quotas)
+        unused = await asyncio.to_thread(self._store.jobs.set_viewpoints, job.id, chosen, outdated)
+        for location in unused:
+            await self._threads.run(job.owner, self._artifacts.objects.remove, location)
 
     async def video(self, job: JobRow, options: JobVideo, quotas: Quotas, show: Show = lambda now: None) -> ArtifactRow:
         """Render a video of a job's result, which replaces an earlier one, and return it.
@@ -178,7 +208,7 @@ class DerivedFiles:
         job: JobRow,
         name: str,
         make: Callable[[], Coroutine[Any, Any, None]],
-        options: JobVideo | None = None,
+        options: JobVideo | dict[str, Any] | None = None,
         show: Show = lambda now: None,
     ) -> ArtifactRow:
         """Return the database row of a file after `make` has made it, in a task that later requests share."""
@@ -189,7 +219,7 @@ class DerivedFiles:
             making.task = asyncio.create_task(make())
             making.task.add_done_callback(lambda task: self._end(key, task))
         elif making.options != options:
-            raise problems.BUSY("Another video of this job is being rendered. Try again when it is done.")
+            raise problems.BUSY(f"Another {name} of this job is being rendered. Try again when it is done.")
         assert making.task is not None
         making.watchers.append(show)
         try:
@@ -262,25 +292,26 @@ class DerivedFiles:
             files = {blend.name: folder / request.output_file}
             await self._threads.run(job.owner, self._publish, job, result, files, quotas, size=most)
 
-    async def _write_page(self, job: JobRow, viewer: dict[str, str], quotas: Quotas) -> None:
-        """Write the page, store it, and make it visible."""
+    async def _write_shown(self, job: JobRow, work: str, name: str, options: dict[str, Any], quotas: Quotas) -> None:
+        """Write a page or an image of the result, store it, and make it visible."""
         async with self._turn("file", job) as (process, folder, result):
             scene = await asyncio.to_thread(self._store.jobs.input, job.id, "scene", 0)
             size = result.size + (scene["size"] if scene else 0)
-            most = _PAGE_SIZE * result.size + _HEADER_BYTES
+            most = _PAGE_SIZE * result.size + _POSTER_BYTES
             await self._threads.run(job.owner, self._blobs.ensure_space, size + most)
             request = self._request(
-                "page",
+                work,
                 folder,
                 job,
                 await self._stage(folder, job, [result]),
                 seconds=_SECONDS_PER_BYTE * size,
                 memory=MEMORY_PER_BYTE * size,
-                output=(PAGE, most),
-                options={"result": RESULT, "viewer": viewer, "title": job.name},
+                output=(work, most),
+                options={"result": RESULT, **options},
             )
             findings_of(await process.ask(request))
-            await self._threads.run(job.owner, self._publish, job, result, {PAGE: folder / PAGE}, quotas, size=most)
+            publish = partial(self._publish, replace=True)
+            await self._threads.run(job.owner, publish, job, result, {name: folder / work}, quotas, size=most)
 
     async def _render(self, job: JobRow, options: JobVideo, quotas: Quotas) -> None:
         """Render the video, store it and make it visible."""

@@ -42,7 +42,7 @@ from sgsst_core.features import kernels as feature_kernels  # noqa: F401  # see 
 from sgsst_core.features.network_weights import list_network_weights
 from sgsst_core.features.weight_files import cache_folder
 from sgsst_core.files.images import image_size
-from sgsst_core.files.scene_file import read_scene, write_scene
+from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from sgsst_core.orbit import find_upright_subject
 from sgsst_core.paintings import STARRY_NIGHT
 from sgsst_core.planning.survey import OTHER_FRAME
@@ -54,10 +54,10 @@ from sgsst_core.scene.gaussians import Scene
 from sgsst_core.stylizing.checkpoint import versions
 from sgsst_core.stylizing.planner import estimate
 from worker.capture import choose_axes, orbit_request
-from worker.derived import VideoRequest, blend, convert, render_video, write_page
-from worker.inputs import Inputs, cropped, errors_of, read_inputs
+from worker.derived import VideoRequest, blend, convert, render_video, write_page, write_poster
+from worker.inputs import Inputs, cropped, errors_of, read_inputs, read_job_capture
 from worker.job import SceneRequest, check_steps
-from worker.options import JobVideo
+from worker.options import JobVideo, Viewpoint, Viewpoints
 from worker.painting import PaintInputs, read_paintings
 from worker.prepare import dry_run
 from worker.processes import die_with_parent, process_start
@@ -229,24 +229,50 @@ def _blend(request: WorkRequest, _send: _Send) -> dict[str, Any]:
     return {}
 
 
+def _read_both(request: WorkRequest) -> tuple[SceneFile, SceneFile]:
+    """Read a job's scene and its result, to be drawn in the same mode."""
+    source = request.source
+    axes, _ = choose_axes(source, request.staged.photos)
+    original = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
+    stylized = read_scene(Path(request.options["result"]))
+    return original.rendered(source.render_mode, source.eps2d), stylized.rendered(source.render_mode, source.eps2d)
+
+
 def _page(request: WorkRequest, _send: _Send) -> dict[str, Any]:
     """Write a result as an HTML page, beside the job's scene if that has the same Gaussians and harmonics."""
     source, options = request.source, request.options
-    axes, _ = choose_axes(source, request.staged.photos)
-    original = read_scene(source.scene, drop_invalid=source.drop_invalid, spz_axes=axes)
-    both = read_scene(Path(options["result"])), original
-    stylized, before = (file.rendered(source.render_mode, source.eps2d) for file in both)
+    original, stylized = _read_both(request)
     job = job_spec(request.staged, request.parameters)
-    remaining = cropped(job.regions, original, source.near)
-    upright = find_upright_subject(original.scene, orbit_request(source).up, remaining)[1].direction.tolist()
-    background = job.settings.background
+    cameras, upright = [], None
+    if source.cameras is None:
+        remaining = cropped(job.regions, original, source.near)
+        upright = find_upright_subject(original.scene, orbit_request(source).up, remaining)[1].direction.tolist()
+    else:
+        cameras = read_job_capture(job, original).cameras
     write = partial(
-        write_page, request.output_file, options["viewer"], stylized, background=background, up=upright, in_place=True
+        write_page,
+        request.output_file,
+        options["viewer"],
+        stylized,
+        background=job.settings.background,
+        up=upright,
+        cameras=cameras,
+        viewpoints=Viewpoints(**options.get("viewpoints", {})),
+        in_place=True,
     )
     try:
-        write(before, options["title"])
+        write(original, options["title"])
     except SceneError:  # Gaussians were split, for example
         write(None, options["title"])
+    return {}
+
+
+def _poster(request: WorkRequest, _send: _Send) -> dict[str, Any]:
+    """Write an image of a result at a viewpoint, beside the job's scene."""
+    original, stylized = (file.scene for file in _read_both(request))
+    viewpoint, background = Viewpoint(**request.options["viewpoint"]), request.parameters.settings().background
+    near = request.source.near
+    write_poster(request.output_file, original, stylized, viewpoint, background=background, near=near)
     return {}
 
 
@@ -281,6 +307,7 @@ WORK: dict[str, tuple[Callable[[WorkRequest, _Send], dict[str, Any]], str]] = {
     "compress": (_compress, "Compressing the result"),
     "blend": (_blend, "Blending the results"),
     "page": (_page, "Writing the page"),
+    "poster": (_poster, "Rendering the viewpoint"),
     "video": (_video, "Rendering the video"),
 }
 

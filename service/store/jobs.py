@@ -20,7 +20,20 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from sqlalchemy import Connection, Float, String, TextClause, bindparam, delete, func, insert, select, text, tuple_
+from sqlalchemy import (
+    Connection,
+    Float,
+    String,
+    TextClause,
+    and_,
+    bindparam,
+    delete,
+    func,
+    insert,
+    select,
+    text,
+    tuple_,
+)
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -398,7 +411,7 @@ class Jobs:
                 if known is not None:
                     return known, False
             _check_queue(session, new.owner, limit)
-            count_job(session, new.owner, quotas, now)
+            count_job(session, new.owner, quotas, now, sum(entry["size"] for entry in new.inputs))
             values = new.row(now)
             session.execute(insert(_JOBS), values)
             job = JobRow(**values)
@@ -543,6 +556,29 @@ class Jobs:
         """Change the display name of a job."""
         with self._database.writing() as session:
             job_of_owner(session, job_id, owner, lock=True).name = name
+
+    def set_viewpoints(self, job_id: str, viewpoints: dict[str, Any], outdated: Sequence[str]) -> list[str]:
+        """Set the viewpoints of a result's page, and withdraw the files that show others.
+
+        Args:
+            viewpoints: `worker.options.Viewpoints` as JSON.
+            outdated: Names of these files.
+
+        Returns:
+            Locations of these files.
+
+        Raises:
+            NO_RESULT: If the job has no result.
+        """
+        files = and_(ArtifactRow.job_id == job_id, ArtifactRow.name.in_(outdated))
+        with self._database.writing() as session:
+            job = job_of_owner(session, job_id, None, lock=True)
+            if job.status != JobStatus.SUCCEEDED:
+                raise problems.NO_RESULT(job_status=job.status)
+            job.viewpoints = viewpoints
+            locations = list(session.scalars(select(ArtifactRow.location).where(files)))
+            session.execute(delete(ArtifactRow).where(files))
+        return locations
 
     def delete(self, job_id: str, owner: str | None) -> list[str]:
         """Delete an ended job and release its inputs; the caller removes its results afterwards.

@@ -60,6 +60,7 @@ class JobRow(Base):
     error: Mapped[dict[str, Any] | None]
     webhook: Mapped[str | None] = mapped_column(Text)
     webhook_events: Mapped[list[Any] | None]
+    viewpoints: Mapped[dict[str, Any] | None]
     lease_epoch: Mapped[int] = mapped_column(Integer, default=0)
     lease_owner: Mapped[str | None] = mapped_column(String(120))
     lease_expires_at: Mapped[float | None] = mapped_column(Float)

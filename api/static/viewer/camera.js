@@ -8,6 +8,8 @@ import { cross, difference, dot, rotated, sum, times, unit } from "./vectors.js"
 
 /** Focal length of a free view as a multiple of its height: 50 degrees. */
 const FOCAL = 1.07;
+/** Ratio of height to width of the frame of a free view on a canvas that is narrower. */
+const NARROW = 1.2;
 
 export class ViewCamera {
   constructor() {
@@ -51,6 +53,31 @@ export class ViewCamera {
     this.lookAt(center);
   }
 
+  /** Return the present pose. @returns {ViewCamera} */
+  copy() {
+    return Object.assign(new ViewCamera(), this);
+  }
+
+  /**
+   * Move to a pose between two, on an arc about the point between their targets.
+   *
+   * @param {ViewCamera} from
+   * @param {ViewCamera} to
+   * @param {number} share 0 for the first pose, 1 for the second
+   */
+  between(from, to, share) {
+    const mixed = (/** @type {Vector} */ a, /** @type {Vector} */ b) => sum(times(a, 1 - share), times(b, share));
+    // the rotation from one pose to the other by its axis, which half a turn leaves open
+    const turn = from.axes.map((axis, i) => cross(axis, to.axes[i])).reduce(sum), about = Math.hypot(...turn) > 1e-6 ? unit(turn) : this.up;
+    const trace = from.axes.reduce((total, axis, i) => total + dot(axis, to.axes[i]), 0), angle = Math.acos(Math.max(-1, Math.min(1, (trace - 1) / 2)));
+    this.axes = share === 1 ? to.axes : from.axes.map((axis) => rotated(axis, about, share * angle));
+    this.target = mixed(from.target, to.target);
+    this.eye = share === 1 ? to.eye : difference(this.target, times(this.axes[2], from.distance ** (1 - share) * to.distance ** share));
+    this.focal = mixed(from.focal, to.focal);
+    [this.shape] = mixed([from.shape || 1 / NARROW], [to.shape]);
+    this.number++;
+  }
+
   /** @param {Vector} target */
   lookAt(target) {
     this.target = target;
@@ -79,7 +106,7 @@ export class ViewCamera {
    * @param {number} height
    */
   pixels(width, height) {
-    const frame = this.shape ? Math.min(height, width / this.shape) : Math.min(height, width * 1.2);
+    const frame = this.shape ? Math.min(height, width / this.shape) : Math.min(height, width * NARROW);
     return [this.focal[0] * frame, this.focal[1] * frame];
   }
 

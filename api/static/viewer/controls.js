@@ -7,7 +7,8 @@
 import { difference, sum, times } from "./vectors.js";
 
 /** @typedef {import("./viewer.js").Viewer} Viewer */
-/** @typedef {{moved?: () => void, toggle?: () => void, camera?: (by: number) => void, home?: () => void, hold?: (held: boolean) => void}} Actions `moved` is called when the camera leaves its place, `hold` when O is pressed and released */
+/** @typedef {import("../cameras.js").JobCamera} JobCamera */
+/** @typedef {{moved?: () => void, toggle?: () => void, camera?: (by: number) => void, viewpoint?: (index: number) => void, home?: () => void, hold?: (held: boolean) => void}} Actions `moved` is called when the camera leaves its place, `hold` when O is pressed and released */
 
 /** Milliseconds after the last movement of a pointer during which its release lets the scene glide. */
 const THROWN = 60;
@@ -149,6 +150,7 @@ export class Controls {
     else if (key === "Home") this.keys.home?.();
     else if (key === "f") this.focusPointer();
     else if (key === "," || key === ".") this.keys.camera?.(key === "," ? -1 : 1);
+    else if (/^[1-9]$/.test(key)) this.keys.viewpoint?.(Number(key) - 1);
     else return;
     event.preventDefault();
   }
@@ -175,6 +177,7 @@ export class Controls {
 }
 
 /** @typedef {import("./vectors.js").Vector} Vector */
+/** @typedef {import("./camera.js").ViewCamera} ViewCamera */
 
 /** Turns by keys, in directions to the side and over. @type {Record<string, [number, number]>} */
 const TURNS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
@@ -186,6 +189,8 @@ const TURN_SPEED = 1.5, SPIN_SPEED = 0.2, STEP_SPEED = 0.8, FAST = 4, SLOW = 0.2
 const PIXELS_PER_RADIAN = 180;
 /** Milliseconds in which a glide loses two thirds of its speed, and speed in CSS pixels per millisecond where it ends. */
 const GLIDE = 130, END = 0.02;
+/** Milliseconds of a flight from one viewpoint to the next. */
+const FLIGHT = 1500;
 /** Milliseconds of turning to a point; shortest and longest time between frames, so that each press moves a little. */
 const TURNING = 300, MIN_FRAME = 8, MAX_FRAME = 50;
 
@@ -202,6 +207,8 @@ export class Motion {
     this.speed = null;
     /** @type {{from: Vector, to: Vector, left: number} | null} */
     this.turning = null;
+    /** Flight through viewpoints: where its part starts and ends, and the viewpoints that follow. @type {{from: ViewCamera, to: ViewCamera, next: JobCamera[], left: number} | null} */
+    this.flight = null;
     /** Whether the camera rotates about the scene by itself. */
     this.spinning = false;
     this.requested = 0;
@@ -215,7 +222,7 @@ export class Motion {
 
   /** @param {string} key */
   press(key) {
-    this.turning = null;
+    this.turning = this.flight = null;
     if (this.held.has(key)) return;
     this.held.add(key);
     this.start();
@@ -252,6 +259,25 @@ export class Motion {
     this.start();
   }
 
+  /**
+   * Move through viewpoints, and stay at the last one. Without animations, the camera jumps: at once to a single one.
+   *
+   * @param {JobCamera[]} viewpoints
+   */
+  fly(viewpoints) {
+    this.stop();
+    this.flyTo(viewpoints, stillness() && viewpoints.length < 2 ? 0 : FLIGHT);
+    this.start();
+    this.viewer.moved();
+  }
+
+  /** @param {JobCamera[]} viewpoints @param {number} left milliseconds until the first one is reached */
+  flyTo([first, ...next], left) {
+    const { camera, sides } = this.viewer, to = camera.copy();
+    to.stand(first, sides?.left.scene.middle ?? null);
+    this.flight = { from: camera.copy(), to, next, left };
+  }
+
   /** Rotate about the scene until `stop`. */
   spin() {
     this.spinning = !stillness();
@@ -260,7 +286,7 @@ export class Motion {
 
   stop() {
     this.held.clear();
-    this.speed = this.turning = null;
+    this.speed = this.turning = this.flight = null;
     this.spinning = false;
   }
 
@@ -275,7 +301,7 @@ export class Motion {
     this.requested = 0;
     const milliseconds = Math.min(MAX_FRAME, Math.max(MIN_FRAME, now - this.last));
     this.last = now;
-    if (this.viewer.ended || (!this.held.size && !this.speed && !this.turning && !this.spinning)) return;
+    if (this.viewer.ended || (!this.held.size && !this.speed && !this.turning && !this.flight && !this.spinning)) return;
     this.advance(milliseconds);
     this.viewer.moved();
     this.requested = requestAnimationFrame((next) => this.step(next));
@@ -283,7 +309,7 @@ export class Motion {
 
   /** @param {number} milliseconds */
   advance(milliseconds) {
-    const { camera } = this.viewer, { speed, turning } = this, seconds = (milliseconds / 1000) * this.factor;
+    const { camera } = this.viewer, { speed, turning, flight } = this, seconds = (milliseconds / 1000) * this.factor;
     for (const key of this.held) {
       if (TURNS[key]) camera.turn(TURNS[key][0] * TURN_SPEED * seconds, TURNS[key][1] * TURN_SPEED * seconds, this.orbit);
       else camera.move(times(STEPS[key], STEP_SPEED * camera.size * seconds));
@@ -294,6 +320,13 @@ export class Motion {
       const rest = Math.exp(-milliseconds / GLIDE);
       [speed.x, speed.y] = [speed.x * rest, speed.y * rest];
       if (Math.hypot(speed.x, speed.y) < END) this.speed = null;
+    }
+    if (flight) {
+      flight.left = Math.max(0, flight.left - milliseconds);
+      const even = 1 - flight.left / FLIGHT;
+      camera.between(flight.from, flight.to, stillness() ? Math.floor(even) : even * even * (3 - 2 * even));
+      if (!flight.left && flight.next.length) this.flyTo(flight.next, FLIGHT);
+      else if (!flight.left) this.flight = null;
     }
     if (turning) {
       turning.left = Math.max(0, turning.left - milliseconds);

@@ -87,6 +87,7 @@ def test_link_shows_the_result_and_nothing_else(
         "name": "my wall",
         "expires_at": view["expires_at"],
         "parameters": {"background": [1.0, 1.0, 1.0]},
+        "viewpoints": {"start": None, "named": []},
         "cameras": ["cameras.json"],
         "files": ["colors.f16", "stylized.ply", "poster"],
     }
@@ -139,6 +140,50 @@ def test_link_with_poster_names_its_image(
     assert (revoked.status_code, "og:" in revoked.text, "shared.js" in revoked.text) == (404, False, True)
     assert_missing(visitor.get(f"/v1/shared/{token}/poster"))
     assert token not in service.log.read_text()
+
+
+def viewpoint(name: str, **changed: Any) -> dict[str, Any]:
+    axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    known = {"position": [0.0, 0.0, 0.5], "axes": axes, "fx": 80.0, "fy": 80.0, "width": 120, "height": 80}
+    return {"name": name, **known, **changed}
+
+
+def test_link_shows_the_named_viewpoints(
+    service: Service, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path]
+) -> None:
+    job_id = finished(me, service, files)
+    _, token = share(me, job_id)
+    here, named = f"/v1/jobs/{job_id}", [viewpoint("front"), viewpoint("left", position=[-1.0, 0.0, 0.5])]
+    changed = me.patch(here, json={"viewpoints": {"named": named}})
+    assert changed.json()["viewpoints"] == {"start": None, "named": named}
+    assert changed.json()["name"] == "my wall"
+    assert visitor.get(f"/v1/shared/{token}").json()["viewpoints"] == me.get(here).json()["viewpoints"]
+    for wrong, reason in (
+        ({"named": named * 7}, "at most 12"),
+        ({"named": [viewpoint("front"), viewpoint("front", fx=90.0)]}, "each of them once"),
+        ({"named": [viewpoint("")]}, "must have names"),
+        ({"named": [viewpoint("a", axes=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])]}, "orthogonal unit vectors"),
+        ({"named": [viewpoint("a", axes=[[2, 0, 0], [0, 1, 0], [0, 0, 1]])]}, "orthogonal unit vectors"),
+        ({"named": [viewpoint("a", fx=0)]}, "greater than 0"),
+        ({"named": [viewpoint("a", width=10**9)]}, "65535"),
+        ({"named": [viewpoint("a", up=[0, 1, 0])]}, "up"),
+        ({"begin": None}, "begin"),
+    ):
+        answer = me.patch(here, json={"viewpoints": wrong})
+        assert (answer.status_code, answer.json()["code"]) == (422, "invalid-request"), answer.text
+        assert reason in answer.json()["detail"]
+        check_documented(answer)
+    unreadable = me.patch(here, json={"viewpoints": {"start": viewpoint("")}})  # the result is no PLY
+    assert unreadable.status_code == 422
+    check_documented(unreadable)
+    nothing = me.patch(here, json={})
+    assert nothing.status_code == 422
+    assert "give a name or viewpoints" in nothing.json()["detail"]
+    assert me.get(here).json()["viewpoints"] == {"start": None, "named": named}, "nothing else was stored"
+    queued = me.post("/v1/jobs", files={role: (path.name, path.read_bytes()) for role, path in files.items()}).json()
+    early = me.patch(queued["links"]["self"], json={"viewpoints": {"named": named}})
+    assert early.status_code == 409
+    check_documented(early)
 
 
 def test_only_permitted_sites_may_frame_a_link(

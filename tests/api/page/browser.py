@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +122,20 @@ def rendered(scene: Path, camera: Camera) -> NDArray[np.float64]:
     colors = view_colors(loaded.sh_dc, rest_colors(loaded.sh_rest, loaded.means, camera))
     image = make_rasterizer("cpu", loaded).render(colors, camera)
     return (image.double().clamp(0, 1) * 255).round().numpy()
+
+
+def in_frame(camera: Camera, width: int, height: int) -> Camera:
+    """Return the camera of an image of this size, in the middle of which lies the whole frame of a camera."""
+    scale = min(height / camera.height, width / camera.width)
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * scale,
+        fy=camera.fy * scale,
+        cx=width / 2,
+        cy=height / 2,
+    )
 
 
 def psnr(actual: NDArray[np.float64], wanted: NDArray[np.float64]) -> float:

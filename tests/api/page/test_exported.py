@@ -12,9 +12,10 @@ import torch
 from api.cli.main import main
 from sgsst_core.constants import SH_C0
 from sgsst_core.files.scene_file import write_scene
+from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from tests.api.page.browser import Watched
-from tests.small_scenes import wall
+from tests.api.page.browser import Watched, in_frame, psnr, rendered
+from tests.small_scenes import cameras, wall, write_files
 
 
 def painted(red: float, green: float, blue: float, *, harmonics: float = 0.0) -> Scene:
@@ -63,6 +64,57 @@ def test_exported_page_of_one_scene(tmp_path: Path, browser: Any) -> None:
     assert not page.page.get_by_label("Wipe", exact=True).is_visible()
     page.check()
     page.context.close()
+
+
+@pytest.mark.slow
+def test_exported_page_opens_at_the_chosen_camera_and_jumps_to_others(tmp_path: Path, browser: Any) -> None:
+    scene, views = wall(sh_degree=1), cameras(4, 96, 72)  # each looks at it slantwise, so that depths differ
+    write_files(tmp_path, scene, views)
+    given = ["--cameras", str(tmp_path / "cameras.json"), "--start", "view_2", "--views", "view_0,view_1"]
+    assert export(tmp_path, scene, None, *given) == 0
+    page = Watched(browser, (tmp_path / "page.html").as_uri(), width=900, reduced_motion="reduce")
+    page.page.goto(page.url)
+
+    def assert_shown(camera: Camera) -> None:
+        pixels = page.pixels()
+        assert psnr(pixels, rendered(tmp_path / "scene.ply", in_frame(camera, *pixels.shape[1::-1]))) > 35  # SOG
+
+    assert_shown(views[2])
+    buttons = page.page.get_by_role("list", name="Views").get_by_role("button")
+    assert buttons.all_inner_texts() == ["1 · view_0", "2 · view_1"]
+    buttons.nth(1).click()
+    assert_shown(views[1])
+    page.page.locator("canvas.view").focus()
+    page.page.keyboard.press("1")
+    assert_shown(views[0])
+    page.page.keyboard.press("3")
+    assert_shown(views[0])
+    assert page.page.locator("form").count() == 0, "its viewers change nothing"
+    page.check()
+    page.context.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--start", "view_0"], "Add --cameras"),
+        (["--views", "view_0", "--cameras", "cameras.json", "--start", "front"], "No view is called front"),
+        (["--views", "view_0,view_0", "--cameras", "cameras.json"], "each of them once"),
+        (["--views", ",".join(map(str, range(13))), "--cameras", "cameras.json"], "at most 12"),
+    ],
+)
+def test_unusable_names_of_cameras_are_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    problem: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_files(tmp_path)
+    assert export(tmp_path, wall(), None, *options) == 2
+    assert problem in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
 
 
 def test_attenuated_harmonics_are_those_of_the_original(tmp_path: Path) -> None:

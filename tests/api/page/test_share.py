@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterator
 from functools import partial
@@ -10,10 +11,12 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from tests.api.page.actions import STEPS, Visit, done, submit
-from tests.api.page.browser import Watched
+from tests.api.page.browser import Watched, in_frame, psnr, rendered
 from tests.api.service import Service
 from tests.small_scenes import cameras, wall, write_files
 
@@ -71,6 +74,64 @@ def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: S
     other.page.reload()
     other.page.get_by_role("heading", name="This link doesn't work").wait_for()
     other.check("404")
+    watched.check()
+
+
+def test_result_opens_where_its_maker_stood(
+    visit: Visit, browser: Any, service: Service, job_id: str, tmp_path: Path
+) -> None:
+    views = cameras(3, 96, 72)
+    watched = visit(f"/#/jobs/{job_id}", width=1100, height=800, reduced_motion="reduce")
+    page, panel = watched.page, watched.page.get_by_role("region", name="Views", exact=True)
+    page.get_by_label("Wipe", exact=True).wait_for()
+    watched.settled()
+    page.get_by_label("Camera", exact=True).select_option("2")
+    watched.settled()
+    panel.get_by_role("button", name="Start here").click()
+    panel.get_by_text("The result, its links and its page open here.").wait_for()
+    page.get_by_label("Camera", exact=True).select_option("0")
+    panel.get_by_label("Name of the view").fill("the left")
+    panel.get_by_role("button", name="Add view").click()
+    panel.get_by_text("“the left” was added.").wait_for()
+    page.get_by_label("Camera", exact=True).select_option("1")
+    panel.get_by_role("button", name="Add view").click()
+    panel.get_by_role("button", name="2 · View 2").wait_for()
+    with service.client() as client:
+        link = client.post(f"/v1/jobs/{job_id}/shares", json={"poster": True}).json()["url"]
+        poster = client.get(f"/v1/shared/{link.rpartition('/')[2]}/poster")
+        exported = client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply?format=html")
+        job = client.get(f"/v1/jobs/{job_id}").json()
+    viewpoints = job["viewpoints"]
+    assert viewpoints["start"]["position"] == pytest.approx(views[2].center.tolist())
+    assert [each["name"] for each in viewpoints["named"]] == ["the left", "View 2"]
+    start = viewpoints["start"]
+    scene, _, _ = write_files(tmp_path, wall(sh_degree=1), views)
+    with Image.open(io.BytesIO(poster.content)) as image:
+        shown = np.asarray(image.convert("RGB"), dtype=np.float64)
+        height, width, _ = shown.shape
+        assert width / height == pytest.approx(start["width"] / start["height"], abs=0.01)
+    wanted = rendered(scene, in_frame(views[2], width, height))
+    left = np.s_[:, : width // 2]
+    assert psnr(shown[left], wanted[left]) > 25, "a JPEG of the start"
+
+    file = tmp_path / "page.html"
+    file.write_bytes(exported.content)
+    for url in (f"{service.url}{link}", file.as_uri()):
+        other = Watched(browser, url.partition("/shared")[0], width=900, height=700, reduced_motion="reduce")
+        other.page.goto(url)
+        other.wipe("End")
+        pixels = other.pixels()
+        assert psnr(pixels, rendered(scene, in_frame(views[2], *pixels.shape[1::-1]))) > 35  # the file has a SOG
+        other.page.get_by_role("button", name="1 · the left").click()
+        pixels = other.pixels()
+        assert psnr(pixels, rendered(scene, in_frame(views[0], *pixels.shape[1::-1]))) > 35
+        assert other.page.locator("form").count() == 0, "others change nothing"
+        other.check()
+        other.context.close()
+    panel.get_by_role("button", name="Start at the usual place").click()
+    panel.get_by_text("The result opens at its usual place.").wait_for()
+    panel.get_by_role("button", name="Remove the left").click()
+    panel.get_by_role("button", name="1 · View 2").wait_for()
     watched.check()
 
 

@@ -401,6 +401,34 @@ def test_order_is_right_from_every_side(visit: Visit, tmp_path: Path) -> None:
         assert back < 1e-5
 
 
+def test_flight_between_viewpoints_leads_around_the_scene(visit: Visit, tmp_path: Path) -> None:
+    """The viewpoints lie opposite of each other, and then a quarter of a turn apart, with another zoom."""
+    write_files(tmp_path, wall())
+    steps = """async (viewer, source, picture, base) => {
+      const { Motion } = await import(`${base}/viewer/controls.js`), { camera } = viewer, { center } = source.middle;
+      const motion = new Motion(viewer), from = (turn, fx) => {
+        const s = Math.sin(turn), c = Math.cos(turn);
+        const position = [center[0] - 3 * s, center[1], center[2] - 3 * c], axes = [[c, 0, -s], [0, 1, 0], [s, 0, c]];
+        return { name: "", position, axes, fx, fy: fx, width: 3, height: 2 };
+      };
+      const away = () => Math.hypot(...camera.eye.map((value, i) => value - center[i])), distances = [];
+      const viewpoints = [from(0, 2), from(Math.PI, 2), from(Math.PI / 2, 4)], reached = [];
+      camera.stand(viewpoints[0], source.middle);
+      motion.flyTo(viewpoints.slice(1), 1500);
+      for (let i = 1; i <= 60; i++) {
+        motion.advance(50);
+        distances.push(away());
+        if (i % 30 === 0) reached.push([camera.eye, camera.axes, camera.focal[0]]);
+      }
+      const wanted = viewpoints.slice(1).map(({ position, axes, fx }) => [position, axes, fx / 2]);
+      return [distances, reached, wanted, motion.flight];
+    }"""
+    distances, reached, wanted, flight = shown(visit("/#/jobs"), tmp_path, "view_1", (64, 48), steps)
+    assert np.allclose(distances, 3, atol=1e-9)
+    assert reached == wanted
+    assert flight is None
+
+
 def test_lost_graphics_device_comes_back(visit: Visit, tmp_path: Path) -> None:
     write_files(tmp_path, wall(sh_degree=1))
     steps = """async (viewer, source, picture) => {

@@ -8,13 +8,14 @@ import json
 import re
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import av
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from api.static_files import exported_viewer
@@ -32,17 +33,19 @@ from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.keys import NO_QUOTAS, Quotas
 from service.store.tables import JobRow
+from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.formats import by_name
 from sgsst_core.files.formats.ply import PLY
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.rasterizer import make_rasterizer
+from sgsst_core.scene.camera import resized
 from sgsst_core.scene.spherical_harmonics import scene_colors
 from tests.api.service import PATIENCE
 from tests.raised import raises_problem
 from tests.service.store.helpers import usage_of
 from tests.sgsst_core.objects import figure, joined, moved
-from tests.small_scenes import wall, write_files
-from worker.derived import video_cameras
+from tests.small_scenes import cameras, wall, write_files
+from worker.derived import video_cameras, viewpoint_of
 from worker.inputs import read_job_capture
 from worker.options import JobVideo
 
@@ -170,6 +173,61 @@ def test_page_shows_the_result_alone_if_the_scene_has_other_gaussians(
     assert '"up": [1.0, 0.0, 0.0]' in text
     assert '"sog": false' in text
     assert '"background": [1.0, 1.0, 1.0]' in text
+
+
+def test_poster_shows_a_viewpoint_before_and_after(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    _, file, _ = write_files(tmp_path, wall(), cameras(3, 96, 72))
+    result = replace(wall(), sh_dc=-wall().sh_dc)
+    write_scene(Path(RESULT), result)
+    camera = read_cameras(file)[2]
+    options = {"result": RESULT, "viewpoint": viewpoint_of(camera).model_dump()}
+    request = WorkRequest(
+        work="poster",
+        folder=tmp_path,
+        staged=Staged(scene=Path("scene.ply"), styles=(), cameras=Path("cameras.json"), photos=None),
+        parameters=JobParameters.model_validate({"background": [1.0, 1.0, 1.0]}),
+        seconds=0,
+        memory=0,
+        options=options,
+        output=("poster.jpg", 0),
+    )
+    WORK["poster"][0](request, lambda response: None)
+    with Image.open("poster.jpg") as image:
+        shown = np.asarray(image.convert("RGB"), dtype=np.float64)
+    assert shown.shape == (720, 960, 3)
+    larger = resized(camera, 960)
+    for scene, part in ((wall(), np.s_[:, :480]), (result, np.s_[:, 480:])):
+        rendered = make_rasterizer("cpu", scene, background=(1.0, 1.0, 1.0)).render(scene_colors(scene, larger), larger)
+        wanted = 255 * rendered.double().clamp(0, 1).numpy()
+        assert np.abs(shown[part] - wanted[part]).mean() < 5  # JPEG
+
+
+@pytest.mark.parametrize("chosen", [True, False])
+def test_page_opens_at_its_start_or_at_the_first_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chosen: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _, file, _ = write_files(tmp_path, wall(), cameras(3, 96, 72))
+    Path(RESULT).write_bytes(Path("scene.ply").read_bytes())
+    first, second, _ = (viewpoint_of(camera).model_dump() for camera in read_cameras(file))
+    viewpoints = {"start": second if chosen else None, "named": [first]}
+    request = WorkRequest(
+        work="page",
+        folder=tmp_path,
+        staged=Staged(scene=Path("scene.ply"), styles=(), cameras=Path("cameras.json"), photos=None),
+        parameters=JobParameters(),
+        seconds=0,
+        memory=0,
+        options={"result": RESULT, "viewer": exported_viewer(), "title": "wall", "viewpoints": viewpoints},
+        output=("page.html", 0),
+    )
+    WORK["page"][0](request, lambda response: None)
+    match = re.search(r'id="about">(.*)</script>', Path("page.html").read_text(encoding="utf-8"))
+    assert match
+    about = json.loads(match[1])
+    assert about["viewpoints"] == {"start": second if chosen else first, "named": [first]}
+    assert about["up"] == pytest.approx([0, -1, 0], abs=1e-6), "that of the cameras"
 
 
 def test_page_shows_what_a_crop_leaves_upright(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
