@@ -56,6 +56,13 @@ class JobParameters(StylizeOptions):
     name: Annotated[JobName, Option(default="the names of scene and style")] = Field(
         "", description="Display name; need not be unique."
     )
+    retention_days: Annotated[float | None, Option(unit="days", metavar="N", default="the service's")] = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="Days after the job's end until its results are deleted; at most the service's. Its record is "
+        "deleted after as many more.",
+    )
     style_weights: Annotated[
         list[Annotated[float, Field(gt=0, allow_inf_nan=False)]] | None, Option(instead="--style FILE:WEIGHT")
     ] = Field(

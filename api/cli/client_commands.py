@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from rich.progress import BarColumn, ProgressColumn, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from api.cli import INTERRUPTED
 from api.cli.console import (
@@ -342,6 +342,38 @@ def jobs(
         name = _shortened(job.data["name"], widths["name"])
         table.add_row(job.id, name, _short_status(job), f"{created:%m-%d %H:%M}")
     console.print(table)
+
+
+def usage(
+    since: Annotated[str | None, typer.Option(metavar="DAY", help="First day (UTC). [default: 30 days]")] = None,
+    until: Annotated[str | None, typer.Option(metavar="DAY", help="Last day. [default: today]")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Read the database of this data folder, instead of asking a service.")
+    ] = None,
+    as_json: JsonOption = False,
+    url: UrlOption = None,
+    key: KeyOption = None,
+) -> None:
+    """Show jobs, seconds and bytes by day and key.
+
+    A key shows its own usage, an operator's key or --data that of all keys.
+    """
+    if data is None:
+        with open_client(url, key) as client:
+            rows = client.usage(since, until)
+    else:
+        from api.cli.machine_commands import usage_of_all
+
+        rows = usage_of_all(data, since, until)
+    if as_json:
+        out_console.print(json.dumps(rows))
+        return
+    numeric = (Column(name, justify="right") for name in ("jobs", "GPU s", "CPU s", "MB"))
+    table = Table("day", Column("key", min_width=35), "name", *numeric, box=None, pad_edge=False)
+    for row in rows:
+        numbers = row["jobs"], row["gpu_seconds"], row["cpu_seconds"], row["bytes"] / 1e6
+        table.add_row(row["day"], row["key"], row["name"], *(f"{number:,.0f}" for number in numbers))
+    PlainConsole().print(table)
 
 
 def mcp(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import asdict
+from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.table import Table
@@ -134,15 +135,9 @@ def fsck(
 
     Exit code: 0 if nothing was found, else the sum of 4 (missing files), 8 (damaged) and 16 (orphaned).
     """
-    from sqlalchemy.engine import make_url
-
     from service.scheduling.housekeeping import FileCheck
-    from sgsst_core.errors import SettingsError
 
-    url = make_url(_service_settings(data).database_url)
-    if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():  # which opening would create
-        raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
-    store = _open_store(data)
+    store = _open_existing_store(data)
     check, findings = FileCheck(_service_settings(data), store), []
     for finding in check.findings(mend=mend):
         findings.append(finding)
@@ -176,6 +171,7 @@ def create_key(
     requests_a_second: Annotated[
         float | None, typer.Option(min=0.001, help="Quota of requests per second. [default: the service's]")
     ] = None,
+    operator: Annotated[bool, typer.Option("--operator", help="Let the key see the usage of all keys.")] = False,
     data: DataOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -183,7 +179,7 @@ def create_key(
     from service.store.keys import Quotas
 
     quotas = Quotas(jobs_a_day, gpu_seconds_a_day, stored_bytes, requests_a_second)
-    row, text = _open_store(data).keys.create(name, priority, quotas)
+    row, text = _open_store(data).keys.create(name, priority, quotas, operator=operator)
     if as_json:
         out_console.print(json.dumps({"id": row.id, "name": row.name, "priority": row.priority, "key": text}))
         return
@@ -197,13 +193,16 @@ def list_keys(data: DataOption = None, as_json: JsonOption = False) -> None:
     rows = _open_store(data).keys.all()
     if as_json:
         shown = [
-            {"id": row.id, "name": row.name, "priority": row.priority, "revoked": bool(row.revoked_at)} for row in rows
+            {name: getattr(row, name) for name in ("id", "name", "priority", "operator")}
+            | {"revoked": bool(row.revoked_at)}
+            for row in rows
         ]
         out_console.print(json.dumps(shown))
         return
     table = Table("id", "name", "priority", "state")
     for row in rows:
-        table.add_row(row.id, row.name, str(row.priority), "revoked" if row.revoked_at else "valid")
+        state = "revoked" if row.revoked_at else "operator" if row.operator else "valid"
+        table.add_row(row.id, row.name, str(row.priority), state)
     PlainConsole().print(table)
 
 
@@ -217,6 +216,22 @@ def revoke_key(
     """Revoke an API key."""
     row = _open_store(data).keys.revoke(key_id)
     error_console.print(f"Revoked key {row.id} of {row.name!r}.")
+
+
+def usage_of_all(data: Path, since: str | None, until: str | None) -> list[dict[str, Any]]:
+    """Return the usage of all keys in a service's data folder, as `GET /v1/usage` does.
+
+    Raises:
+        SettingsError: If there is no database, or a text is no day.
+    """
+    from sgsst_core.errors import SettingsError
+
+    try:
+        first, last = (None if day is None else date.fromisoformat(day) for day in (since, until))
+    except ValueError as error:
+        raise SettingsError(f"--since, --until: {error}. Give a day such as 2026-11-21.") from error
+    rows = _open_existing_store(data).keys.usage(first, last, None)
+    return [asdict(row) | {"day": row.day.isoformat()} for row in rows]
 
 
 def _service_settings(data: Path | None) -> ServiceSettings:
@@ -233,6 +248,22 @@ def _service_settings(data: Path | None) -> ServiceSettings:
     if data is not None:
         os.environ["SGSST_DATA"] = str(data.absolute())
     return read_settings()
+
+
+def _open_existing_store(data: Path | None) -> Store:
+    """Open the store of a service that has run.
+
+    Raises:
+        SettingsError: If there is no database.
+    """
+    from sqlalchemy.engine import make_url
+
+    from sgsst_core.errors import SettingsError
+
+    url = make_url(_service_settings(data).database_url)
+    if url.get_backend_name() == "sqlite" and not Path(url.database or "").is_file():  # which opening would create
+        raise SettingsError(f"{url.database}: no database of the service. Give its folder by --data or SGSST_DATA.")
+    return _open_store(data)
 
 
 def _open_store(data: Path | None) -> Store:

@@ -68,6 +68,7 @@ _SUMMARIES: dict[str, dict[str, str]] = {
         "share": "Create a read-only link to a result, for people without a key.",
         "delete": "Delete a finished job and its results.",
         "jobs": "List jobs, newest first.",
+        "usage": "Show jobs, seconds and bytes by day and key.",
         "mcp": "Serve the tools of a language model on standard input and output, by the Model Context Protocol.",
     },
 }

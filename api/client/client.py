@@ -282,6 +282,17 @@ class AsyncClient:
         """Change the display name of a job; an empty name restores the names of scene and style."""
         return Job.of((await self._transport.call("PATCH", _job_path(job_id), json={"name": name})).json())
 
+    async def usage(self, since: str | None = None, until: str | None = None) -> list[dict[str, Any]]:
+        """Return the usage of the key by day; with an operator's key, or without keys, that of all keys.
+
+        Args:
+            since: First day (UTC), such as "2026-11-01"; None for the 30 days up to `until`.
+            until: Last day; None for today.
+        """
+        days = {name: day for name, day in (("since", since), ("until", until)) if day is not None}
+        usage: list[dict[str, Any]] = (await self._transport.call("GET", "/v1/usage", params=days)).json()["usage"]
+        return usage
+
     async def act(self, job_id: str, action: str) -> Job:
         """Request an action on a job by its name in `service.states.ACTIONS`."""
         return Job.of((await self._transport.call("POST", f"{_job_path(job_id)}/{action}")).json())
@@ -437,6 +448,7 @@ class Client:
     blend = _blocking(AsyncClient.blend)
     video = _blocking(AsyncClient.video)
     rename = _blocking(AsyncClient.rename)
+    usage = _blocking(AsyncClient.usage)
     act = _blocking(AsyncClient.act)
     finish = _blocking(AsyncClient.finish)
     cancel = _blocking(AsyncClient.cancel)

@@ -83,11 +83,16 @@ class Context:
 
 @dataclass(frozen=True)
 class Caller:
-    """Client that sends a request. It can only access what it has created itself."""
+    """Client that sends a request. It can only access what it has created itself.
+
+    Attributes:
+        operator: Whether it sees the usage of all keys too.
+    """
 
     owner: str
     priority: int
     quotas: Quotas = NO_QUOTAS
+    operator: bool = False
 
 
 async def get_context(request: Request) -> Context:
@@ -139,14 +144,14 @@ async def get_caller(
             raise problems.UNAUTHORIZED("The session has ended. Sign in again with an API key.")
         raise problems.UNAUTHORIZED()
     check_site(request, context.settings)
-    return Caller(LOCAL_OWNER, 0)
+    return Caller(LOCAL_OWNER, 0, operator=True)
 
 
 def _caller(context: Context, key: KeyRow) -> Caller:
     """Count a request against the key's rate limit, and return its caller."""
     quotas = Quotas.of_settings(context.settings).with_own(key.quotas)
     context.rates.take(key.id, quotas.requests_a_second)
-    return Caller(key.id, key.priority, quotas)
+    return Caller(key.id, key.priority, quotas, operator=key.operator)
 
 
 CallerDep = Annotated[Caller, Depends(get_caller)]

@@ -1,24 +1,27 @@
-"""`/livez`, `/readyz`, `/metrics`: health checks that return even if one hangs, and Prometheus metrics."""
+"""`/livez`, `/readyz`, `/metrics`, `/v1/usage`: health checks that return even if one hangs, metrics, usage of keys."""
 
 from __future__ import annotations
 
 import asyncio
+import re
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from datetime import date
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Query, Response
 from fastapi.responses import JSONResponse, PlainTextResponse
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
+from pydantic import BeforeValidator
 
-from api.http.context import ContextDep
+from api.http.context import CallerDep, ContextDep
 from api.http.problems import headers
-from api.http.schemas import Health
+from api.http.schemas import Health, UsageList, UsageView
 from service.states import AttemptOutcome, Cause, JobStatus
 from service.store import Store
 from service.store.database import BUCKETS
@@ -229,6 +232,30 @@ async def readyz(context: ContextDep) -> Response:
         return JSONResponse(Health(status="unavailable", checks=checks).model_dump(), 503, {"Retry-After": "5"})
     view = Health(status="ok" if alive else "waiting", checks=checks)
     return JSONResponse(view.model_dump())
+
+
+def _day(text: object) -> object:
+    """Return the day of a text; `date` would accept numbers of seconds too."""
+    if not isinstance(text, str) or not re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}", text):
+        raise ValueError("must be a day such as 2026-11-21")
+    return date.fromisoformat(text)
+
+
+_Day = Annotated[date, BeforeValidator(_day)]
+
+
+@router.get("/v1/usage", response_model=UsageList)
+def get_usage(
+    context: ContextDep,
+    caller: CallerDep,
+    since: Annotated[
+        _Day | None, Query(description="First day (UTC). Default: 30 days up to the last.", examples=["2026-11-01"])
+    ] = None,
+    until: Annotated[_Day | None, Query(description="Last day. Default: today.", examples=["2026-11-30"])] = None,
+) -> UsageList:
+    """Get the usage of this key by day, or with an operator's key that of all keys, for at most 92 days."""
+    rows = context.store.keys.usage(since, until, None if caller.operator else caller.owner)
+    return UsageList(usage=[UsageView(**vars(row)) for row in rows])
 
 
 @router.get(

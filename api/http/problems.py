@@ -374,6 +374,11 @@ _OF_OPERATIONS: dict[str, tuple[ProblemType | ServiceError, ...]] = {
         problems.NO_SPACE,
         problems.STORE_UNAVAILABLE,
     ),
+    "get_usage": (
+        problems.INVALID_REQUEST(
+            "since, until: 120 days, but must be between 1 and 92 days, with both ends included.", input="since"
+        ),
+    ),
     "sign_in": (problems.UNKNOWN_KEY, problems.TOO_MANY_TRIES),
     "sign_out": (problems.CROSS_ORIGIN,),
 }

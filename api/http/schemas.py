@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextvars import ContextVar
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -526,6 +526,39 @@ class SharedView(BaseModel):
     viewpoints: Viewpoints
     cameras: list[str] = Field(description="Names of the camera files `cameras:0` and so on.")
     files: list[str] = Field(description="Files of the result.")
+
+
+class UsageView(BaseModel):
+    """Usage of a key on one day (UTC)."""
+
+    model_config = _with_example(
+        day="2026-11-21",
+        key="key_1a1fe701a104f943e9d4d8cce5b818c",
+        name="alice",
+        jobs=12,
+        gpu_seconds=840.5,
+        cpu_seconds=0.0,
+        bytes=734003200,
+    )
+
+    day: date
+    key: str = Field(description="ID of the key; `local` without keys.")
+    name: str = Field(description="Name of the key; empty without keys.")
+    jobs: int = Field(description="Accepted jobs and retries.")
+    gpu_seconds: float = Field(
+        description="Seconds of attempts times their GPUs, counted at the end of an attempt. Attempts that were lost "
+        "with their machine do not count."
+    )
+    cpu_seconds: float = Field(description="Seconds of attempts without a GPU, counted in the same way.")
+    bytes: int = Field(description="Bytes of the inputs and results of jobs, including those that were deleted since.")
+
+
+class UsageList(BaseModel):
+    """Usage by day and key; days without usage are left out."""
+
+    model_config = _with_example(usage=[example_of(UsageView)])
+
+    usage: list[UsageView]
 
 
 class SessionView(BaseModel):

@@ -257,6 +257,11 @@ def _find_inputs(
         fetched: SHA-256 of each input by URL, and of each result by its path; missing ones are entries without a blob.
     """
     check_weights()
+    most = context.settings.retention_days
+    if parameters.retention_days is not None and parameters.retention_days > most:
+        raise problems.INVALID_REQUEST(
+            f"retention_days: must be at most {most:g}, as long as this service keeps results.", input="retention_days"
+        )
     inputs, rows = _resolve_inputs(context, caller, received, fetched)
     if (count := sum(entry["role"] == "painted" for entry in inputs)) or parameters.painted:
         parameters.check_painted(count)

@@ -208,7 +208,7 @@ export class JobView {
     put(this.badge, badge(job.status));
     this.planTitle.textContent = UNFINISHED.has(job.status) ? words.plan.decided : words.plan.ran;
     const took = job.started_at && job.finished_at ? (Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000 : 0;
-    this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.result?.psnr_after && words.paint.fit(job.result.psnr_before, job.result.psnr_after), job.attempt > 1 && say.attempt(job.attempt), job.expires_at && say.expires(time(job.expires_at))].filter(Boolean).join(" · ");
+    this.meta.textContent = [say.made(time(job.created_at)), took && say.took(took), job.result?.psnr_after && words.paint.fit(job.result.psnr_before, job.result.psnr_after), job.attempt > 1 && say.attempt(job.attempt), job.expires_at ? say.expires(time(job.expires_at)) : job.parameters.retention_days && say.kept(job.parameters.retention_days)].filter(Boolean).join(" · ");
     const outcome = job.status === "succeeded" ? outcomeOf(job.result) : "";
     this.outcome.hidden = !outcome;
     put(this.outcome, h("li", outcome));

@@ -59,7 +59,7 @@ export class OptionsPart {
     }
     this.makePresets(schema.preset);
     const { Essentials, Views, Look, Expert } = this.groups;
-    for (const [place, names] of /** @type {[HTMLElement, string[]][]} */ ([[this.main, Essentials], [this.ring, Views], [this.look, Look], [this.expert, Expert]])) {
+    for (const [place, names] of /** @type {[HTMLElement, string[]][]} */ ([[this.main, Essentials], [this.ring, Views], [this.look, Look], [this.expert, [...Expert, "retention_days"]]])) {
       put(place, names.map((name) => this.controls.get(name)?.element));
     }
     const followStrength = addPictures(/** @type {Control} */ (this.controls.get("content_weight")));

@@ -164,7 +164,7 @@ export const words = {
       feature_scale: "Layer weighting", style_loss: "Style comparison", position_weights: "Ignore empty background", precision: "Precision", training_background: "Background while painting",
       scales: "Scale weights", scale_sampling: "Fine details in one visit of", seed: "Random seed", memory_limit: "Memory limit", coarsest_side: "Smallest view size", warm_start: "Start from the painting's colors",
       clamp_aware_gradient: "Recover clamped colors", bounded: "Keep colors displayable", early_stop: "Stop when nothing changes", target_loss: "Stop at this loss", cached_weights: "Cached blend weights",
-      views_per_step: "Views per step", measure: "Quality check", backbone: "Feature network", pad_sh: "PLY for Unity plugins", workers: "Workers",
+      views_per_step: "Views per step", measure: "Quality check", backbone: "Feature network", pad_sh: "PLY for Unity plugins", workers: "Workers", retention_days: "Keep the results for",
     }),
     help: /** @type {Record<string, string>} */ ({
       content_weight: "The strength as a number: lower values give more style, higher ones keep more of the original.",
@@ -173,12 +173,12 @@ export const words = {
       preserve_colors: "match: the painting takes on the scene's colors. luminance: only brightness changes.", background: "black, white, or R,G,B from 0 to 255, such as 40,40,48.",
       style_background: "black, white, or R,G,B from 0 to 255.", refine: "Splits large Gaussians, up to this many times as many in total. 1 is off; auto splits those too large for strokes.",
       orbit: "auto: as many as the scene needs.", up: "auto: estimated from the scene.", elevation: "One ring at this height. Otherwise, as many rings as the scene needs.", radius: "From the scene's center.",
-      sh_attenuation: "0 keeps highlights that move with the view, 1 removes them.", unseen: "neighbors: painted like what is around them. freeze: left as they are.",
+      retention_days: "After this time, or that of the service if it is shorter, they are deleted.", sh_attenuation: "0 keeps highlights that move with the view, 1 removes them.", unseen: "neighbors: painted like what is around them. freeze: left as they are.",
     }),
     units: /** @type {Record<string, string>} */ ({ content_weight: "", resolution: "", views: "", within: "minutes", style_scale: "×", refine: "×", sh_attenuation: "" }),
     /** Units of the service for one of `units`. */
     factors: /** @type {Record<string, number>} */ ({ within: 60 }),
-    defaults: /** @type {Record<string, string>} */ ({ content_weight: "strong", orbit: "auto", radius: "automatic" }),
+    defaults: /** @type {Record<string, string>} */ ({ content_weight: "strong", orbit: "auto", radius: "automatic", retention_days: "as long as the service does" }),
   },
   uploads: {
     waiting: () => "waiting", paused: (/** @type {number} */ share) => `paused at ${percent(share)}`, offline: (/** @type {number} */ share) => `no connection; ${percent(share)} uploaded`,
@@ -199,7 +199,7 @@ export const words = {
     unnamed: "Unnamed job", rename: "Rename", newName: "New name", save: "Save", next: "Next in queue", queue: (/** @type {number} */ n) => `${ordinal(n)} in queue`, step: (/** @type {number} */ n, /** @type {number} */ all) => `step ${count(n)} of ${count(all)}`, view: (/** @type {number} */ n, /** @type {number} */ all) => `view ${count(n)} of ${count(all)}`, frame: (/** @type {number} */ n, /** @type {number} */ all) => `frame ${count(n)} of ${count(all)}`,
     left: (/** @type {number} */ s) => (s < 1 ? "almost done" : `about ${seconds(s)} left`), progress: "Progress", remove: "Delete", removeSure: "Delete this job and its results?", keep: "Cancel", deleted: "This job was deleted.", gone: "This job doesn't exist, or was deleted.",
     actions: /** @type {Record<string, string>} */ ({ finish: "Stop here and keep it" }), goOn: "Continue", lost: "Connection lost. Reconnecting…", back: "Reconnected.", loss: "Loss", noLoss: "The chart appears once painting starts.", preview: "Latest preview", noPreview: "The first preview will appear shortly.",
-    made: (/** @type {string} */ at) => `Created ${at}`, took: (/** @type {number} */ s) => `took ${seconds(s)}`, attempt: (/** @type {number} */ n) => `attempt ${n}`, expires: (/** @type {string} */ at) => `kept until ${at}`,
+    made: (/** @type {string} */ at) => `Created ${at}`, took: (/** @type {number} */ s) => `took ${seconds(s)}`, attempt: (/** @type {number} */ n) => `attempt ${n}`, expires: (/** @type {string} */ at) => `kept until ${at}`, kept: (/** @type {number} */ n) => `to be kept for ${several(n, "day")} after its end`,
     steps: (/** @type {number} */ n, /** @type {number} */ all) => (n < all ? `${count(n)} of ${several(all, "step")}` : several(n, "step")),
     lossLeft: (/** @type {number} */ left) => (left > 1 ? `the loss is ${percent(left - 1)} above that of the original` : `${percent(left)} of the loss is left`),
     early: /** @type {Record<string, string>} */ ({ within: "Its time was used up", "on-request": "This job was stopped early", converged: "The loss no longer fell", "target-loss": "The target loss was reached" }),

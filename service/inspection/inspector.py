@@ -410,7 +410,7 @@ def _key(
 ) -> str:
     """Return the key of a finding. It includes the owner, so that no finding shows what others have inspected."""
     files = sorted((entry["role"], entry["name"], entry["sha256"]) for entry in inputs)
-    values = parameters.model_dump(mode="json", exclude={"name", "workers", "seed"})
+    values = parameters.model_dump(mode="json", exclude={"name", "retention_days", "workers", "seed"})
     # style weights are matched to styles by their order, and views to painted files
     ordered = [entry["name"] for entry in inputs if entry["role"] in ("style", "painted")]
     order = ordered if len(ordered) > 1 else []

@@ -138,7 +138,7 @@ def _impatient_connection(seconds: float) -> Any:
 Clock = Callable[[], float]
 
 #: Version of the newest migration; a database with this version is opened without loading the migrations.
-SCHEMA = "0012"
+SCHEMA = "0013"
 #: Version of the first migration; databases of earlier development versions cannot be migrated.
 _FIRST = "0010"
 MIGRATIONS = Path(__file__).with_name("migrations")

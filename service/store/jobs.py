@@ -51,7 +51,7 @@ from service.states import (
 )
 from service.store.database import Database, count, idempotency_row, new_id, upsert
 from service.store.files import close_receipt, release_blobs
-from service.store.keys import NO_QUOTAS, Quotas, check_bytes, count_job, digest, lock_owner
+from service.store.keys import NO_QUOTAS, Quotas, add_usage, check_bytes, count_job, digest, lock_owner
 from service.store.tables import (
     ArtifactRow,
     AttemptRow,
@@ -103,16 +103,22 @@ def end(session: Session, job: JobRow, transition: Transition, now: float, reten
     """End a job.
 
     Args:
-        retention: Time in seconds until its results expire.
+        retention: Most seconds until its results expire; see `retention_of`.
     """
     status = next_status(job.status, transition)
-    job.finished_at, job.expires_at = now, now + retention
+    job.finished_at, job.expires_at = now, now + retention_of(job, retention)
     job.lease_owner = job.lease_expires_at = None
     move(session, job, transition, now)
     count(session, "sgsst_jobs_finished_total", f'status="{status}"')
     for waiting in session.scalars(_WAITING_PROGRESS, {"job_id": job.id}) if job.webhook_events else ():
         session.delete(waiting)
     send_webhook(session, job, "completed", status, now)
+
+
+def retention_of(job: JobRow, most: float) -> float:
+    """Return the seconds until a job's results expire: as its user has requested, but at most `most`."""
+    days = job.parameters.get("retention_days")
+    return most if days is None else min(most, days * 86_400.0)
 
 
 def send_webhook(session: Session, job: JobRow, event: WebhookEvent, kind: str, now: float, **more: Any) -> None:
@@ -645,7 +651,9 @@ class Jobs:
                     session.delete(existing)
                     session.flush()
                 values = {"name": file.name, "location": file.location, "size": file.size, "sha256": file.sha256}
-                session.add(ArtifactRow(job_id=source.job_id, created_at=self._database.clock(), **values))
+                now = self._database.clock()
+                session.add(ArtifactRow(job_id=source.job_id, created_at=now, **values))
+                add_usage(session, owner, now, bytes=file.size)
             if receipt is not None:
                 close_receipt(session, receipt)
             session.flush()

@@ -9,6 +9,7 @@ import hashlib
 import secrets
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from datetime import date, timedelta
 from typing import Any, Self
 
 from sqlalchemy import BindParameter, String, bindparam, delete, func, or_, select, text, union
@@ -68,6 +69,28 @@ class Quotas:
 NO_QUOTAS = Quotas()
 
 
+@dataclass(frozen=True)
+class Usage:
+    """Usage of one key on one day; see `UsageRow`.
+
+    Attributes:
+        name: Name of the key; empty without a key.
+        key: Owner of the jobs: the id of the key.
+    """
+
+    day: date
+    name: str
+    key: str
+    jobs: int
+    gpu_seconds: float
+    cpu_seconds: float
+    bytes: int
+
+
+#: Day 0, maximum number of days of a report of usage, and their number by default.
+_FIRST_DAY, MOST_USAGE_DAYS, _USUAL_DAYS = date(1970, 1, 1), 92, 30
+
+
 def day_of(now: float) -> int:
     """Return the number of the day since 1970."""
     return int(now // _DAY)
@@ -83,15 +106,26 @@ def lock_owner(session: Session, owner: str) -> None:
         session.execute(_LOCK_OWNER, {"owner": f"sgsst-owner:{owner}"})
 
 
-def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
+def add_usage(session: Session, owner: str, now: float, **amounts: float) -> tuple[int, float]:
+    """Add amounts to an owner's usage of the day, by column; return its jobs and GPU seconds of the day."""
+    zeros = dict.fromkeys(("jobs", "gpu_seconds", "cpu_seconds", "bytes"), 0)
+    insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), **(zeros | amounts))
+    added = {name: _USAGE.c[name] + insert.excluded[name] for name in amounts}
+    counted = insert.on_conflict_do_update(index_elements=["owner", "day"], set_=added)
+    jobs, seconds = session.execute(counted.returning(_USAGE.c.jobs, _USAGE.c.gpu_seconds)).one()
+    return jobs, seconds
+
+
+def count_job(session: Session, owner: str, quotas: Quotas, now: float, size: int = 0) -> None:
     """Count a new job, within the transaction that creates it.
+
+    Args:
+        size: Bytes of its inputs; 0 for a retry.
 
     Raises:
         QUOTA_EXCEEDED: If the job exceeds the daily number of jobs, or today's GPU seconds are used up.
     """
-    insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=1, gpu_seconds=0.0)
-    counted = insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"jobs": _USAGE.c.jobs + 1})
-    jobs, seconds = session.execute(counted.returning(_USAGE.c.jobs, _USAGE.c.gpu_seconds)).one()
+    jobs, seconds = add_usage(session, owner, now, jobs=1, bytes=size)
     tomorrow = _DAY - int(now % _DAY)
     if quotas.jobs_a_day is not None and jobs > quotas.jobs_a_day:
         raise problems.QUOTA_EXCEEDED(
@@ -107,13 +141,6 @@ def count_job(session: Session, owner: str, quotas: Quotas, now: float) -> None:
             limit=quotas.gpu_seconds_a_day,
             retry_after=tomorrow,
         )
-
-
-def count_gpu_seconds(session: Session, owner: str, seconds: float, now: float) -> None:
-    """Add an attempt's GPU seconds to its owner's usage of the day."""
-    insert = upsert(session)(_USAGE).values(owner=owner, day=day_of(now), jobs=0, gpu_seconds=seconds)
-    added = _USAGE.c.gpu_seconds + insert.excluded.gpu_seconds
-    session.execute(insert.on_conflict_do_update(index_elements=["owner", "day"], set_={"gpu_seconds": added}))
 
 
 def check_bytes(session: Session, owner: str, quotas: Quotas) -> None:
@@ -177,17 +204,20 @@ class Keys:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def create(self, name: str, priority: int = 0, quotas: Quotas = NO_QUOTAS) -> tuple[KeyRow, str]:
+    def create(
+        self, name: str, priority: int = 0, quotas: Quotas = NO_QUOTAS, *, operator: bool = False
+    ) -> tuple[KeyRow, str]:
         """Create a key; return its row and the only copy of its text.
 
         Args:
             quotas: Quotas of the key; the service's defaults apply where they are None.
+            operator: Whether the key sees the usage of all keys.
         """
         text = KEY_PREFIX + secrets.token_urlsafe(32)
         now = self._database.clock()
         with self._database.writing() as session:
             row = KeyRow(id=new_id("key", now), name=name, sha256=digest(text), priority=priority, created_at=now)
-            row.quotas = quotas.given() or None
+            row.quotas, row.operator = quotas.given() or None, operator
             session.add(row)
         return row, text
 
@@ -208,6 +238,33 @@ class Keys:
                 raise problems.NOT_FOUND(f"There is no key {key_id}. `sgsst keys list` shows their ids.")
             row.revoked_at = row.revoked_at or self._database.clock()
             return row
+
+    def usage(self, since: date | None, until: date | None, owner: str | None) -> list[Usage]:
+        """Return the usage of each day (UTC), oldest first, by owner; days without usage are left out.
+
+        Args:
+            since: First day; None for the 30 days up to `until`.
+            until: Last day; None for today.
+            owner: Owner; None for all.
+
+        Raises:
+            INVALID_REQUEST: If the last day precedes the first one, or there are more than `MOST_USAGE_DAYS`.
+        """
+        last = day_of(self._database.clock()) if until is None else (until - _FIRST_DAY).days
+        first = last - _USUAL_DAYS + 1 if since is None else (since - _FIRST_DAY).days
+        if not 0 <= last - first < MOST_USAGE_DAYS:
+            count = f"{last - first + 1:,} days" if last >= first else "no day"
+            raise problems.INVALID_REQUEST(
+                f"since, until: {count}, but must be between 1 and {MOST_USAGE_DAYS} days, with both ends included.",
+                input="since",
+            )
+        query = select(_USAGE, KeyRow.name).outerjoin(KeyRow, KeyRow.id == _USAGE.c.owner)
+        query = query.where(_USAGE.c.day.between(first, last)).order_by(_USAGE.c.day, _USAGE.c.owner)
+        if owner is not None:
+            query = query.where(_USAGE.c.owner == owner)
+        with self._database.reading_rows() as connection:
+            rows = connection.execute(query).all()
+        return [Usage(_FIRST_DAY + timedelta(day), name or "", owner, *amounts) for owner, day, *amounts, name in rows]
 
     def find(self, text: str) -> KeyRow | None:
         """Return the key with this text; None if it is unknown or revoked."""

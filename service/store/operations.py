@@ -26,7 +26,7 @@ from sqlalchemy import (
 from service import problems
 from service.states import FINISHED, JobStatus, Transition
 from service.store.database import IDEMPOTENCY_SECONDS, Database, upsert
-from service.store.jobs import forget, holder_name, move
+from service.store.jobs import forget, holder_name, move, retention_of
 from service.store.tables import (
     ArtifactRow,
     Base,
@@ -212,8 +212,8 @@ class Retention:
     """Housekeeping of the store, which any dispatcher may do.
 
     Args:
-        retention: Time in seconds until results expire; the record of an expired job is deleted after another such
-            period.
+        retention: Most seconds until results expire (`retention_of`); the record of an expired job is deleted after
+            another such period.
     """
 
     def __init__(self, database: Database, retention: float) -> None:
@@ -234,7 +234,7 @@ class Retention:
                 if job.status == JobStatus.EXPIRED:
                     forget(session, job)
                     continue
-                job.expires_at = now + self._retention
+                job.expires_at = now + retention_of(job, self._retention)
                 session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id))
                 # blobs without other holders are collected later
                 session.execute(delete(BlobUseRow).where(BlobUseRow.holder == holder_name(job.id)))

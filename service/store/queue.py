@@ -43,7 +43,7 @@ from service.problems import ServiceError
 from service.states import ACTIVE, AttemptOutcome, Cause, JobStatus, Published, Transition
 from service.store.database import Database, count, observe, upsert
 from service.store.jobs import add_event, add_point, end, move, send_webhook
-from service.store.keys import count_gpu_seconds
+from service.store.keys import add_usage
 from service.store.tables import ArtifactRow, AttemptRow, DispatcherRow, EventRow, JobRow, ProgressPointRow, TurnRow
 from sgsst_core.errors import InfrastructureError
 from sgsst_core.progress import Progress
@@ -395,6 +395,9 @@ class Leases:
             prefixes = (LIVE,) if result.get("stopped") in CONTINUABLE else (".", LIVE)
             obsolete = or_(*(ArtifactRow.name.startswith(prefix, autoescape=True) for prefix in prefixes))
             session.execute(delete(ArtifactRow).where(ArtifactRow.job_id == job.id, obsolete))
+            visible = ~ArtifactRow.name.startswith(".", autoescape=True)
+            size = select(func.sum(ArtifactRow.size)).where(ArtifactRow.job_id == job.id, visible)
+            add_usage(session, job.owner, now, bytes=int(session.scalar(size) or 0))
             job.result, job.error = result, None
             _close_attempt(session, job, AttemptOutcome.SUCCEEDED, None, now)
             observe(session, "sgsst_job_seconds", max(0.0, now - (job.started_at or now)))
@@ -541,7 +544,7 @@ def _causes(session: Session, job: JobRow) -> list[Cause]:
 
 def _count_gpus(session: Session, job: JobRow, attempt: AttemptRow, now: float) -> None:
     if attempt.gpus and attempt.gpus_since is not None:
-        count_gpu_seconds(session, job.owner, attempt.gpus * max(0.0, now - attempt.gpus_since), now)
+        add_usage(session, job.owner, now, gpu_seconds=attempt.gpus * max(0.0, now - attempt.gpus_since))
 
 
 def _close_attempt(
@@ -552,4 +555,6 @@ def _close_attempt(
         attempt.finished_at, attempt.outcome, attempt.error = now, outcome, error
         if outcome != AttemptOutcome.LOST:  # its working time is unknown, and the loss is not the owner's fault
             _count_gpus(session, job, attempt, now)
+            if not attempt.gpus:
+                add_usage(session, job.owner, now, cpu_seconds=max(0.0, now - attempt.started_at))
     count(session, "sgsst_attempts_ended_total", f'outcome="{outcome}"')

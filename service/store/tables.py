@@ -205,7 +205,7 @@ class UploadPartRow(Base):
 
 
 class KeyRow(Base):
-    """API key; only its SHA-256 is stored."""
+    """API key; only its SHA-256 is stored. The key of an operator sees the usage of all keys."""
 
     __tablename__ = "api_keys"
 
@@ -213,13 +213,17 @@ class KeyRow(Base):
     name: Mapped[str] = mapped_column(String(100))
     sha256: Mapped[str] = mapped_column(String(64), unique=True)
     priority: Mapped[int] = mapped_column(Integer, default=0)
+    operator: Mapped[bool] = mapped_column(Boolean, default=False)
     created_at: Mapped[float] = mapped_column(Float)
     revoked_at: Mapped[float | None] = mapped_column(Float)
     quotas: Mapped[dict[str, Any] | None]
 
 
 class UsageRow(Base):
-    """Usage of an owner on one day; `day` is the number of days since 1970 (UTC)."""
+    """Usage of an owner on one day; `day` is the number of days since 1970 (UTC).
+
+    `cpu_seconds` are those of attempts without a GPU, and `bytes` those of the inputs and results of jobs.
+    """
 
     __tablename__ = "usage"
 
@@ -227,6 +231,8 @@ class UsageRow(Base):
     day: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
     jobs: Mapped[int] = mapped_column(Integer, default=0)
     gpu_seconds: Mapped[float] = mapped_column(Float, default=0.0)
+    cpu_seconds: Mapped[float] = mapped_column(Float, default=0.0)
+    bytes: Mapped[int] = mapped_column(BigInteger, default=0)
 
 
 class SessionRow(Base):

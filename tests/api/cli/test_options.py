@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[3]
 OPTIONS = declared(StylizeOptions)
 #: Options that the API lacks, and parameters that `sgsst stylize` lacks, with the reason.
 OPERATORS = {"resume", "checkpoint_seconds", "rank_timeout"}  # the service's operator sets these for all jobs
-SERVICES = {"name"}  # for users who read a list of jobs
+SERVICES = {"name", "retention_days"}  # a service lists jobs, and stores results
 
 
 def shown(command: str) -> dict[str, str]:

@@ -102,6 +102,14 @@ def test_unknown_parameter_gets_no_distant_suggestion(client: httpx2.Client, fil
     assert refused(answer, 422, "invalid-request")["detail"] == "video: is not a parameter."
 
 
+def test_results_are_kept_at_most_as_long_as_the_service_does(client: httpx2.Client, files: dict[str, bytes]) -> None:
+    for days, detail in ((30.5, "must be at most 30, as long as this service"), (0, "greater than 0")):
+        answer = client.post("/v1/jobs", files=form(files), data={"parameters": json.dumps({"retention_days": days})})
+        problem = refused(answer, 422, "invalid-request")
+        assert problem["detail"].startswith("retention_days: ")
+        assert detail in problem["detail"]
+
+
 def test_invalid_query_is_named_as_it_was_sent(client: httpx2.Client) -> None:
     problem = refused(client.get("/v1/jobs", params={"limit": "many"}), 422, "invalid-request")
     assert problem["detail"].startswith("limit: ")

@@ -14,6 +14,7 @@ from typing import Any
 import httpx2
 import pytest
 
+from api.cli.main import main
 from api.http.context import Rates
 from service import problems
 from service.problems import ServiceError
@@ -114,6 +115,43 @@ def test_quotas_of_jobs_bytes_and_requests(service: Service, files: dict[str, by
         answer = client.get("/v1/jobs")
         refused(answer, 429, "rate-limited")
         assert 1 <= int(answer.headers["retry-after"]) <= 10
+
+
+def test_usage_of_own_key_and_of_all_keys(
+    service: Service, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    used = {}
+    for _ in range(2):
+        owner, text = owner_and_key(service, Quotas())
+        with service.client(text) as client:
+            inputs = client.post("/v1/jobs", files=form(files)).json()["inputs"]
+            used[owner] = {"key": owner, "name": "someone", "jobs": 1, "gpu_seconds": 0.0, "cpu_seconds": 0.0}
+            used[owner]["bytes"] = sum(entry["size"] for entry in inputs)
+            (row,) = client.get("/v1/usage").json()["usage"]
+            assert row == {"day": row["day"], **used[owner]}
+            assert client.get(f"/v1/usage?since={row['day']}&until={row['day']}").json()["usage"] == [row]
+            for days in ("since=2026-02-30", "since=20260201", "since=1", "until=tomorrow", "until="):
+                refused(client.get(f"/v1/usage?{days}"), 422, "invalid-request")
+            for days in ("since=2026-01-01&until=2025-12-31", "since=2026-01-01&until=2026-04-03", "since=0001-01-01"):
+                problem = refused(client.get(f"/v1/usage?{days}"), 422, "invalid-request")
+                assert "must be between 1 and 92 days" in problem["detail"]
+            assert client.get("/v1/usage?since=2026-01-01&until=2026-04-02").json() == {"usage": []}
+    with service.client() as client:
+        refused(client.get("/v1/usage"), 401, "unauthorized")
+    for name in ("SGSST_DATA", "SGSST_KEY", "SGSST_URL"):
+        monkeypatch.setenv(name, "")
+    assert main(["keys", "create", "operator", "--operator", "--data", str(service.data)]) == 0
+    operators = capsys.readouterr().out.strip()
+    for command in (["--data", str(service.data)], ["--url", service.url, "--key", operators]):
+        assert main(["usage", "--json", *command]) == 0
+        rows = json.loads(capsys.readouterr().out)
+        assert {row["key"]: row for row in rows}.items() >= {
+            owner: {"day": rows[-1]["day"], **row} for owner, row in used.items()
+        }.items()
+        assert main(["usage", *command]) == 0
+        assert next(iter(used)) in capsys.readouterr().out
+        assert main(["usage", "--since", "monday", *command]) == 2
+        assert "2026-11-21" in capsys.readouterr().err
 
 
 def test_connections_are_limited(service: Service) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
+from datetime import datetime, timedelta
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -34,7 +35,7 @@ def job_id(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return the id of a finished job."""
     ply, file, style = write_files(tmp_path_factory.mktemp("files"), wall(sh_degree=1), cameras(3, 96, 72))
     files = {"scene": ply, "cameras": file, "style": style}
-    return done(service, submit(service, files, **(STEPS | {"steps_sos": 2}), name="my wall"))
+    return done(service, submit(service, files, **(STEPS | {"steps_sos": 2}), name="my wall", retention_days=2))
 
 
 def test_link_shows_viewer_and_wipe_until_it_is_revoked(visit: Visit, service: Service, job_id: str) -> None:
@@ -102,6 +103,9 @@ def test_result_opens_where_its_maker_stood(
         exported = client.get(f"/v1/jobs/{job_id}/artifacts/stylized.ply?format=html")
         job = client.get(f"/v1/jobs/{job_id}").json()
     viewpoints = job["viewpoints"]
+    finished_at, expires_at = (datetime.fromisoformat(job[name]) for name in ("finished_at", "expires_at"))
+    assert expires_at - finished_at == timedelta(days=2)
+    page.get_by_text(re.compile("kept until")).wait_for()
     assert viewpoints["start"]["position"] == pytest.approx(views[2].center.tolist())
     assert [each["name"] for each in viewpoints["named"]] == ["the left", "View 2"]
     start = viewpoints["start"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from datetime import date
 
 import pytest
 
@@ -13,7 +14,7 @@ from service.settings import ServiceSettings
 from service.states import Published
 from service.store import Store
 from service.store.files import GRACE_SECONDS
-from service.store.keys import NO_QUOTAS, Quotas
+from service.store.keys import NO_QUOTAS, Quotas, Usage
 from tests.raised import raises_problem
 from tests.service.store.helpers import LEASE, SHA, Clock, Used, lease, new_job, queue, usage_of
 
@@ -82,6 +83,34 @@ def test_lost_attempt_charges_no_gpu_seconds(store: Store, clock: Clock) -> None
     clock.now += LEASE + 1
     lease(store, "two")
     assert usage_of(store, "local").gpu_seconds == 0
+
+
+def test_usage_is_reported_by_day_and_key(store: Store, clock: Clock) -> None:
+    clock.now = 100.5 * DAY  # 1970-04-11
+    key, _ = store.keys.create("alice", operator=True)
+    job_id = submit(store, NO_QUOTAS, key.id)
+    held = lease(store)
+    store.leases.hold_gpus(held, 2)
+    clock.now += 10
+    files = [Published("stylized.ply", "x/1", 4, SHA), Published(".checkpoint", "x/2", 50, SHA)]
+    store.leases.succeed(held, files, {})
+    clock.now += DAY
+    queue(store)
+    on_cpu = lease(store)
+    clock.now += 7
+    store.leases.fail(on_cpu, {"code": "x", "message": "x"}, permanent=True)
+    store.jobs.delete(job_id, key.id)  # which changes nothing of what was used
+    first = Usage(date(1970, 4, 11), "alice", key.id, 1, 20.0, 0.0, 7)
+    second = Usage(date(1970, 4, 12), "", "local", 1, 0.0, 7.0, 3)
+    assert store.keys.usage(None, None, None) == [first, second]
+    assert store.keys.usage(None, None, key.id) == [first]
+    assert store.keys.usage(date(1970, 4, 12), None, None) == [second]
+    assert store.keys.usage(None, date(1970, 4, 11), None) == [first]
+    assert store.keys.usage(date(1970, 4, 1), date(1970, 4, 10), None) == []
+    assert store.keys.usage(date.min, date(1, 1, 31), None) == []
+    for since, until in ((date(1970, 4, 12), date(1970, 4, 11)), (date(1970, 1, 1), date(1970, 4, 3))):
+        with raises_problem(problems.INVALID_REQUEST):
+            store.keys.usage(since, until, None)
 
 
 def test_stored_bytes_count_uploads_inputs_and_results(store: Store, clock: Clock) -> None:

@@ -509,6 +509,22 @@ def test_expired_job_is_deleted_after_its_results(store: Store, clock: Clock) ->
         store.jobs.get(job_id, "local")
 
 
+@pytest.mark.parametrize(("requested", "seconds"), [(RETENTION / 4, RETENTION / 4), (3 * RETENTION, RETENTION)])
+def test_job_is_kept_as_long_as_requested_at_most_as_the_service_keeps_it(
+    store: Store, clock: Clock, requested: float, seconds: float
+) -> None:
+    new = replace(new_job(), parameters={"retention_days": requested / 86_400})
+    job_id = store.jobs.create(new, limit=100)[0].id
+    store.leases.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {})
+    for status in ("expired", None):
+        clock.now += seconds - 1
+        assert store.retention.expire() == []
+        clock.now += 2
+        assert store.retention.expire() == [job_id]
+        shown = store.jobs.page("local")
+        assert [job.row.status for job in shown] == ([status] if status else [])
+
+
 def test_revoked_key_is_rejected(store: Store) -> None:
     row, text = store.keys.create("me")
     assert store.keys.find(text) is not None
