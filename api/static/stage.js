@@ -262,9 +262,9 @@ export class Stage {
     return { name, position: camera.eye, axes: camera.axes, fx, fy, width, height };
   }
 
-  /** Move smoothly through viewpoints. @param {JobCamera[]} viewpoints */
+  /** Move smoothly through viewpoints, unless the view is frozen. @param {JobCamera[]} viewpoints */
   fly(viewpoints) {
-    if (!this.viewer) return;
+    if (!this.viewer || this.viewer.frozen) return;
     this.leaveCamera();
     this.viewer.camera.up = this.up;
     this.controls?.motion.fly(viewpoints);
