@@ -295,11 +295,13 @@ def run_painting(request: JobSpec, listener: Listener, options: WorkerOptions) -
     file, now = inputs.scene_file, Progress(stage="painting", total=PASSES)
     lines = [(line.item, f"{line.decision}: {line.reason}") for line in inputs.decisions]
     listener.prepared(Prepared([("scene", describe_scene(file)), *lines], 0, PASSES))
-    first = time.perf_counter()
+    first: tuple[int, float] | None = None  # what comes before the passes says nothing about their pace
 
     def show(done: int) -> None:
-        nonlocal now
-        left = (time.perf_counter() - first) / done * (PASSES - done) if done else inputs.seconds
+        nonlocal now, first
+        begun, since = first = first or (done, time.perf_counter())
+        pace = (time.perf_counter() - since) / (done - begun) if done > begun else inputs.seconds / PASSES
+        left = pace * (PASSES - done)
         now = Progress(stage="painting", step=done, total=PASSES, eta_s=left)
         listener.progress(now)
         if listener.stop():
