@@ -13,7 +13,7 @@ const service = createClient<paths>({
   redirect: "error", // the key is for this address alone
   headers: key ? { Authorization: `Bearer ${key}` } : {},
 });
-const parameters: Partial<components["schemas"]["JobParameters"]> = view ? { orbit: 24, painted: [{ view }] } : { preset: "preview", orbit: 24 };
+const parameters: Partial<components["schemas"]["JobParameters"]> = view ? { orbit: 24, painted: [{ view, camera: null }] } : { preset: "preview", orbit: 24 };
 const form = new FormData();
 form.append("scene", new Blob([await readFile(scene)]), basename(scene));
 form.append(view ? "painted" : "style", new Blob([await readFile(image)]), basename(image));
