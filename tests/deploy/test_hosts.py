@@ -46,10 +46,11 @@ def problem() -> str | None:
 
 
 def run(command: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    """Run a script of `deploy/`, and wait for its end.
+    """Run a script of `deploy/`, and wait for its end. It gets no settings of a local Ray of this process.
 
     If the tests are interrupted, the script receives SIGTERM instead of SIGKILL, so that it can remove its hosts.
     """
+    environment = {name: value for name, value in environment.items() if not name.startswith("RAY_")}
     held = ["setpriv", "--pdeathsig", "TERM", *command]
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(held, env=environment, cwd=ROOT, **pipes) as process:
