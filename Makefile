@@ -16,7 +16,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 \
 
 SPELLED := api benchmarks deploy docs service sgsst_core tests worker *.md Makefile mkdocs.yml pyproject.toml
 
-.PHONY: demo test test-all test-slow stability coverage lint lint-page docs clean
+.PHONY: benchmarks demo test test-all test-slow stability coverage lint lint-page docs clean
 
 # Stylize the built-in scene and print where the results are.
 demo: $(VENV)/installed
@@ -42,6 +42,11 @@ test-slow: $(VENV)/installed-dev
 stability: $(VENV)/installed
 	$(BIN)/sgsst weights fetch vgg16
 	$(BIN)/python -m benchmarks.stability
+
+# Run the benchmarks that need no GPU on a quiet machine, given a folder with scenes/ and styles/; a second call goes on.
+benchmarks: $(VENV)/installed-dev
+	$(BIN)/sgsst weights fetch vgg16
+	$(BIN)/python -m benchmarks $(DATA)
 
 # Run the fast tests, and list the lines that none of them executes, in any process.
 coverage: $(VENV)/installed-dev

@@ -46,7 +46,7 @@ from typing import Any
 
 import httpx2
 
-from benchmarks.common import write_result
+from benchmarks.common import parse, write_result
 from benchmarks.service_kills import FINISHED, Attacked
 from tests.api.service import undisturbed
 from tests.networks import install_tiny_weights
@@ -368,7 +368,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--logs", type=Path, help="folder that the hosts' logs are copied to")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     if reason := missing():
         raise SystemExit(reason)
     folder = Path(tempfile.mkdtemp(prefix="sgsst-c-", dir="/tmp"))

@@ -6,9 +6,16 @@ import argparse
 import json
 import os
 import platform
+import re
+import shlex
 import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,20 +25,59 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sgsst_core.files.atomic import atomic_path
+from sgsst_core.files.atomic import write_json
 from sgsst_core.files.camera_files import read_cameras
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.orbit import orbit
 from sgsst_core.scene.camera import Camera, resized, spread
 from sgsst_core.scene.gaussians import Scene
+from sgsst_core.settings import PresetName, make_settings
 
 RESULTS = Path(__file__).parent / "results"
+#: Checkout, and what is measured in it.
+_ROOT, _CODE = RESULTS.parents[1], ("sgsst_core", "worker", "service", "api", "benchmarks/*.py")
 _PACKAGES = ("torch", "numpy", "numba")
+#: Load per core above which other programs distort what is measured, and seconds in which it may fall.
+_MOST_LOAD, _SECONDS_TO_FALL = 0.65, 180
+#: Names of files and modules of this project in command lines.
+_PROGRAM = re.compile(r"sgsst.*|pytest|api\..*|worker\..*|service\..*|benchmarks\..*")
+_LOAD_BEFORE = [round(load, 2) for load in psutil.getloadavg()]
+
+
+def parse(parser: argparse.ArgumentParser, arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Parse a benchmark's command line, with the option --loaded, and check that nothing else runs on the machine.
+
+    Of a benchmark with several ways of calling it, only `run` measures.
+
+    Raises:
+        SystemExit: If other programs run, and the option is not given.
+    """
+    parser.add_argument("--loaded", action="store_true", help="measure beside other programs; the result says so")
+    parsed = parser.parse_args(arguments)
+    if not parsed.loaded and getattr(parsed, "way", "run") == "run" and (reason := _busy()):
+        sys.exit(f"{reason}, which distorts what is measured: wait for its end, or give --loaded.")
+    return parsed
+
+
+def _busy() -> str | None:
+    """Return what keeps the machine busy. The load of an earlier benchmark is given time to fall."""
+    own = psutil.Process()
+    family = {own.pid, *(each.pid for each in [*own.parents(), *own.children(recursive=True)])}
+    for process in psutil.process_iter(["cmdline"]):
+        words = [Path(word).name for word in (process.info["cmdline"] or [])[:3]]
+        if process.pid not in family and any(_PROGRAM.fullmatch(word) for word in words):
+            return f"Process {process.pid} ({' '.join(words)[:60]}) runs"
+    most = _MOST_LOAD * (os.cpu_count() or 1)
+    for _ in range(_SECONDS_TO_FALL):
+        if psutil.getloadavg()[0] <= most:
+            return None
+        time.sleep(1)
+    return f"The load is {psutil.getloadavg()[0]:.1f}, above {most:.1f}"
 
 
 def describe_machine() -> dict[str, Any]:
-    """Describe processor, memory, GPU, software versions and current load of this machine."""
+    """Describe processor, memory, GPU and software versions of this machine, and its load before and now."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {
         "processor": _processor(),
@@ -42,27 +88,82 @@ def describe_machine() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "python": platform.python_version(),
         "packages": {name: version(name) for name in _PACKAGES},
-        "load_average": [round(load, 2) for load in psutil.getloadavg()],
+        "load_before": _LOAD_BEFORE,
+        "load_after": [round(load, 2) for load in psutil.getloadavg()],
     }
 
 
-def write_result(name: str, figures: dict[str, Any], folder: Path = RESULTS) -> Path:
-    """Write figures, machine and date to `NAME.json` in `folder`, and return the path."""
-    folder.mkdir(parents=True, exist_ok=True)
+def provenance(presets: Sequence[PresetName] = (), scenes: Mapping[str, Path] | None = None) -> dict[str, Any]:
+    """Return what figures were measured with: date, commit, command, machine, settings of presets, hashes of scenes.
+
+    Folders of files in the command are left out but the last one.
+    """
+    command = re.sub(r"(?<![^\s=:])/(?:[^/\s:=]+/)*([^/\s:=]+/[^/\s:=]+)", r"\1", shlex.join(sys.orig_argv[1:]))
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": _commit(),
+        "command": f"python {command}",
+        "loaded": "--loaded" in sys.argv,
+        "machine": describe_machine(),
+        "presets": {name: make_settings(name).model_dump(mode="json") for name in presets},
+        "scenes": {name: sha256(path.read_bytes()).hexdigest() for name, path in (scenes or {}).items()},
+    }
+
+
+def _commit() -> str | None:
+    """Return the commit of the code, with a plus sign if the code differs from it; None without Git."""
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=_ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    commit = head.stdout.decode().strip()
+    return commit + "+" * (not is_of_this_code(commit)) if commit else None
+
+
+def is_of_this_code(commit: str) -> bool:
+    """Return whether the measured code is that of a commit."""
+    compared = ["git", "diff", "--quiet", commit, "--", *_CODE]
+    return subprocess.run(compared, cwd=_ROOT, stderr=subprocess.DEVNULL).returncode == 0
+
+
+def write_result(
+    name: str,
+    figures: dict[str, Any],
+    folder: Path = RESULTS,
+    *,
+    presets: Sequence[PresetName] = (),
+    scenes: Mapping[str, Path] | None = None,
+) -> Path:
+    """Write figures with their `provenance` to `NAME.json` in `folder`, and return the path.
+
+    Args:
+        name: Name of the result.
+        figures: What was measured.
+        folder: Folder of the file.
+        presets: Presets whose settings the figures depend on.
+        scenes: Files of the scenes.
+    """
     path = folder / f"{name}.json"
-    content = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "machine": describe_machine(), **figures}
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_json(path, provenance(presets, scenes) | figures)
     return path
 
 
-def add_pair(name: str, pair: str, description: dict[str, Any], rows: dict[str, Any]) -> None:
-    """Add rows to the results of one pair of scene and style in `NAME.json`; other rows and pairs stay."""
+def add_pair(
+    name: str,
+    pair: str,
+    description: dict[str, Any],
+    rows: dict[str, Any],
+    *,
+    presets: Sequence[PresetName] = (),
+    scenes: Mapping[str, Path] | None = None,
+) -> Path:
+    """Add rows with their `provenance` to one pair of scene and style, or another part, in `NAME.json`.
+
+    Other rows and pairs stay. Returns the path.
+    """
     path = RESULTS / f"{name}.json"
     pairs = json.loads(path.read_text(encoding="utf-8"))["pairs"] if path.exists() else {}
     earlier = pairs.get(pair, {}).get("rows", {})
-    pairs[pair] = {**description, "rows": {**earlier, **rows}}
-    write_result(name, {"pairs": pairs})
+    pairs[pair] = {**provenance(presets, scenes), **description, "rows": {**earlier, **rows}}
+    write_json(path, {"pairs": pairs})
+    return path
 
 
 def free_address() -> str:

@@ -36,7 +36,7 @@ from typing import Any
 import torch
 
 from api.cli.scene_tools import build_demo
-from benchmarks.common import RESULTS, add_pair, describe_machine, read_views
+from benchmarks.common import RESULTS, add_pair, parse, read_views
 from benchmarks.equal_steps import UNSTYLIZED, judged
 from sgsst_core import Stylizer, load_cameras, load_image, load_scene, make_settings
 from sgsst_core.quality.judge import Judge, Lpips
@@ -121,7 +121,7 @@ def main() -> None:
     running.add_argument("--settings", default="{}", help="JSON, of all runs")
     running.add_argument("--workers", type=int, default=1)
     running.add_argument("--seconds", type=float, default=math.inf)
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     if arguments.way == "run" and (unknown := set(arguments.pairs) - set(PAIRS)):
         parser.error(f"unknown pairs: {', '.join(sorted(unknown))}. Choose some of: {'; '.join(PAIRS)}")
     if arguments.way == "run":
@@ -142,9 +142,7 @@ def run_all(arguments: argparse.Namespace) -> None:
         for name in arguments.candidates:
             if name in CANDIDATES and (name not in SCANS_ONLY or pair.startswith(SCANS)):
                 tasks.append(Task(arguments.data, pair, name, base | CANDIDATES[name], arguments.resolution))
-    machine = describe_machine()
     description = {"steps": arguments.steps, "resolution": arguments.resolution, "settings": base}
-    description |= {name: machine[name] for name in ("processor", "gpu", "packages")}
     end = time.monotonic() + arguments.seconds
     threads = max(1, (os.cpu_count() or 1) // arguments.workers)
     context = multiprocessing.get_context("spawn")
@@ -154,7 +152,7 @@ def run_all(arguments: argparse.Namespace) -> None:
             task, rows = futures[future], future.result()
             if rows:
                 name = f"{task.pair}, {arguments.steps} steps at {arguments.resolution} pixels"
-                add_pair("cross_validation", name, {"pair": task.pair, **description}, rows)
+                add_pair("cross_validation", name, {"pair": task.pair, **description}, rows, presets=["standard"])
                 print(f"{task.pair:40} {task.candidate:12}", *_cells(list(rows.values())[-1]), flush=True)
 
 

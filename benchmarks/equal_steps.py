@@ -35,7 +35,7 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from benchmarks.common import add_pair, input_parser, read_inputs, read_views
+from benchmarks.common import add_pair, input_parser, parse, read_inputs, read_views
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.bench.variants import judged_row
 from sgsst_core.constants import NEAR
@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--settings", default="{}", help="JSON, of all rows")
     parser.add_argument("--region", help="SPEC of a region, as in `sgsst stylize --region NAME:SPEC`")
     parser.add_argument("--out", type=Path, help="folder for a contact sheet")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     scene, cameras, style = read_inputs(arguments, arguments.views, arguments.resolution)
     region = JudgedRegion(read_scene(arguments.scene), arguments.region) if arguments.region else None
     if region:
@@ -133,7 +133,14 @@ def main() -> None:
             results.append(figures)
         judgments[row] = _mean(results)
         _print_row(row, judgments[row])
-        add_pair("equal_steps", arguments.name, description, judgments)
+        add_pair(
+            "equal_steps",
+            arguments.name,
+            description,
+            judgments,
+            presets=["standard"],
+            scenes={description["scene"]: arguments.scene},
+        )
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)
         sheet = [judged_row(judge, row, sh_dc) for row, sh_dc in colors.items()]

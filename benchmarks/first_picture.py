@@ -20,7 +20,7 @@ from typing import Any
 
 import httpx2
 
-from benchmarks.common import add_pair
+from benchmarks.common import add_pair, parse
 from tests.api.page.browser import Watched, chromium, open_browser
 from tests.api.service import SETTINGS, Service
 
@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=Path)
     parser.add_argument("--command-within", type=float, default=90)
     parser.add_argument("--page-within", type=float, default=600)
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     if chromium() is None:
         raise SystemExit("there is no Chromium: apt-get install chromium, or name one by SGSST_CHROMIUM")
     figures: dict[str, dict[str, float]] = {}
@@ -104,7 +104,8 @@ def main() -> None:
             aim = _AIMS.get(what, 1.1 * times["budget"])
             if what in times:
                 print(f"{name:10}{what:10}{times[what]:9.1f}{aim:9.1f}")
-    add_pair("first_picture", arguments.scene.stem, {}, figures)
+    name = arguments.scene.stem
+    add_pair("first_picture", name, {}, figures, presets=["standard"], scenes={name: arguments.scene})
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import itertools
 import json
 import math
 import multiprocessing
-import os
 import tempfile
 import time
 from collections import Counter
@@ -24,9 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import httpx2
-import psutil
 
-from benchmarks.common import write_result
+from benchmarks.common import parse, write_result
 from benchmarks.service_load import spread
 from service.settings import ServiceSettings
 from service.store import open_store
@@ -187,13 +185,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parallel", type=int, default=16)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--result", default="hostile_key", help="name of the result's file")
-    arguments = parser.parse_args()
-    load = [round(value, 2) for value in psutil.getloadavg()]  # load from other programs
+    arguments = parse(parser)
     with tempfile.TemporaryDirectory(prefix="sgsst-hostile-") as folder:
         figures = measure(Path(folder), arguments.parallel, arguments.seconds)
-    measured = {"processors": os.cpu_count(), "load_average_at_start": load, "parallel": arguments.parallel, **figures}
-    print(write_result(arguments.result, measured))
+    print(write_result("hostile_key", {"parallel": arguments.parallel, **figures}))
 
 
 if __name__ == "__main__":

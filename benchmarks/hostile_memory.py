@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from benchmarks.common import write_result
+from benchmarks.common import parse, write_result
 from tests.api.service import Service, wait_for
 
 MB = 1_000_000
@@ -193,7 +193,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--attacks", nargs="+", choices=ATTACKS, default=list(ATTACKS))
     parser.add_argument("--name", default="hostile_memory", help="name of the result file")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     results = {}
     print(f"{'attack':<12} {'growth':>9} {'time':>8}  answers")
     for name in arguments.attacks:

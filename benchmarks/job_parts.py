@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from statistics import median
 
-from benchmarks.common import write_result
+from benchmarks.common import parse, write_result
 from benchmarks.large_scene import multiplied
 from sgsst_core.files.scene_file import read_scene, write_scene
 
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--views", default="24")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("options", nargs="*", help="of `sgsst stylize`, after --")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     scene = read_scene(arguments.scene).scene
     starts = {name: median(_seconds([name]) for _ in range(arguments.rounds)) for name in STARTS}
     jobs = {}
@@ -52,7 +52,8 @@ def main() -> None:
         print(
             name, *(f"  {part:<16}{seconds:8.2f} s {seconds / total:6.1%}" for part, seconds in parts.items()), sep="\n"
         )
-    write_result("job_parts", {"views": arguments.views, "options": arguments.options, "starts": starts, "jobs": jobs})
+    figures = {"views": arguments.views, "options": arguments.options, "starts": starts, "jobs": jobs}
+    write_result("job_parts", figures, presets=["standard"], scenes={arguments.scene.parent.name: arguments.scene})
 
 
 def _seconds(command: list[str]) -> float:

@@ -17,14 +17,14 @@ import math
 import multiprocessing
 import statistics
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from scipy.spatial import cKDTree
 
-from benchmarks.common import write_result
-from benchmarks.rasterizer import DATA, timed
+from benchmarks.common import parse, write_result
 from sgsst_core.bench.device_checks import surface_scene, texture
 from sgsst_core.budget import peak_memory
 from sgsst_core.devices import Timer
@@ -45,12 +45,20 @@ from sgsst_core.stylizing.job import JobInputs
 from sgsst_core.stylizing.planner import plan_job
 from sgsst_core.stylizing.stylizer import NEIGHBORS, Stylizer, neighbors_change
 
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scenes"
 PARTS = ("reading", "harmonics", "survey", "first step", "unseen")
 _PLUSH = DATA / "snowmiku_plush"
 #: Number of Gaussians on which the slow reference of spherical harmonics is timed.
 _HARMONICS_SAMPLE = 200_000
 #: Longer side in pixels of a job's views.
 _RESOLUTION = 990
+
+
+def timed(action: Callable[[], object]) -> float:
+    """Return the seconds of one call."""
+    started = time.perf_counter()
+    action()
+    return time.perf_counter() - started
 
 
 def multiplied(scene: Scene, count: int) -> Scene:
@@ -182,7 +190,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--write", type=Path, metavar="FOLDER", help="keep the files that reading is measured on")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     sizes = []
     for millions in arguments.millions:
         # Spawned, not forked, so that the process has its own memory peak and threads.

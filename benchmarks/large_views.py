@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.common import RESULTS, input_parser, read_inputs, with_size, write_result
+from benchmarks.common import RESULTS, input_parser, parse, read_inputs, with_size, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import peak_memory
 
@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"))
     parser.add_argument("--seconds", type=float, default=None, help="for each size; no limit unless given")
     parser.add_argument("--size", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     if arguments.size:
         _measure(arguments)
         return
@@ -39,7 +39,12 @@ def main() -> None:
         for row in _in_a_process(size, arguments.seconds):
             _print(row)
             rows = [other for other in _stored() if _key(other) != _key(row)]
-            write_result("large_views", {"sizes": [*rows, row]})
+            write_result(
+                "large_views",
+                {"sizes": [*rows, row]},
+                presets=["standard"],
+                scenes={arguments.scene.parent.name: arguments.scene},
+            )
 
 
 def _stored() -> list[dict[str, Any]]:

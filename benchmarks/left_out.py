@@ -1,13 +1,14 @@
 """Savings from each component that a plan leaves out because the scene does not need it, and from our own mechanisms.
 
-python -m benchmarks.left_out NAME=SCENE.ply:CAMERAS ... --style STYLE [--resolution 640] [--views 4] [--rounds 3]
+python -m benchmarks.left_out NAME=SCENE[*GAUSSIANS]:CAMERAS ... --style STYLE [--resolution 480] [--views 4]
 
-CAMERAS is a camera file, or orbit:N. The first configuration leaves out all components that the scene does not need;
-each of the next ones keeps one of them, and one keeps all; the others do without one of the mechanisms by which we want
-to gain time or quality. Every job runs in a process of its own, so that it has its own memory peak, and all of them run
-once in each round. Other work on a machine only makes steps slower, so each step, and what comes before and after the
-steps, counts with its least seconds over the rounds; the range is that of the rounds, each compared with the lean job
-of its round. Results are stored after each scene, beside those of others.
+CAMERAS is a camera file, or orbit:N; with *GAUSSIANS, the scene is so many copies of its Gaussians. The first
+configuration leaves out all components that the scene does not need; each of the next ones keeps one of them, and one
+keeps all; the others do without one of the mechanisms by which we want to gain time or quality. Every job runs in a
+process of its own, so that it has its own memory peak, and all of them run once in each round. Other work on a machine
+only makes steps slower, so each step, and what comes before and after the steps, counts with its least seconds over the
+rounds; the range is that of the rounds, each compared with the lean job of its round. Results are stored after each
+scene, beside those of others.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.common import add_pair, read_views
+from benchmarks.common import add_pair, parse, read_views
+from benchmarks.large_scene import multiplied
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import Cache, peak_memory
 from sgsst_core.features import layers
@@ -67,14 +69,14 @@ REPLACED: dict[str, tuple[Any, str, Callable[..., Any]]] = {
 def main() -> None:
     """Measure, print and store all configurations; with --keep, run one job and print its figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE.ply:CAMERAS")
+    parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE[*GAUSSIANS]:CAMERAS")
     parser.add_argument("--style", type=Path, required=True)
-    parser.add_argument("--resolution", type=int, default=640)
+    parser.add_argument("--resolution", type=int, default=480)
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--steps", type=int, default=12)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--keep", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     if arguments.keep is not None:
         print(json.dumps(_measure(arguments)))
         return
@@ -85,7 +87,14 @@ def main() -> None:
         rows = {label: _summary(label, rounds, arguments.views) for label in labels}
         _print(name, rows)
         job = {"style": arguments.style.name, "resolution": arguments.resolution, "views": arguments.views}
-        add_pair("left_out", name, job | {"steps": arguments.steps, "rounds": arguments.rounds}, rows)
+        add_pair(
+            "left_out",
+            name,
+            job | {"steps": arguments.steps, "rounds": arguments.rounds},
+            rows,
+            presets=["standard"],
+            scenes={name: _files(text)[0]},
+        )
 
 
 def with_components(
@@ -133,15 +142,23 @@ class _Whole(Divider):
 
 def _in_a_process(scene: str, label: str) -> dict[str, Any]:
     options = [argument for argument in sys.argv[1:] if "=" not in argument or argument.startswith("--")]
-    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", label]
+    command = [sys.executable, "-m", "benchmarks.left_out", scene, *options, "--keep", label, "--loaded"]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     return dict[str, Any](json.loads(done.stdout.splitlines()[-1]))
 
 
+def _files(text: str) -> tuple[Path, int, str]:
+    """Return the scene, the number of Gaussians to copy it to (0 for none) and the cameras of an argument."""
+    path, _, cameras = text.partition("=")[2].partition(":")
+    path, _, copied = path.partition("*")
+    return Path(path), int(copied or 0), cameras
+
+
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Run a job of the configuration of `--keep`; return the seconds of its parts, its memory peak and its loss."""
-    ply, _, cameras = arguments.scenes[0].partition("=")[2].partition(":")
-    scene = read_scene(Path(ply)).scene
+    path, copied, cameras = _files(arguments.scenes[0])
+    scene = read_scene(path).scene
+    scene = multiplied(scene, copied) if copied else scene
     views = read_views(cameras, scene, arguments.views, arguments.resolution)
     label: str = arguments.keep
     added = EVERYTHING if label == "everything" else tuple({label} & {*EVERYTHING})

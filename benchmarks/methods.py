@@ -30,7 +30,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.common import RESULTS, add_pair, read_views
+from benchmarks.common import RESULTS, add_pair, parse, read_views
 from benchmarks.cross_validation import DEMO, SCENES, inputs
 from benchmarks.equal_steps import UNSTYLIZED, judged
 from sgsst_core import Stylizer, load_image, make_settings
@@ -86,6 +86,9 @@ COLUMNS = {
     "seconds": ("CPU s", 0),
 }
 
+#: Presets whose settings the figures depend on.
+PRESETS: tuple[PresetName, ...] = ("preview", "standard", "paper")
+
 Rows = dict[str, dict[str, float]]
 
 
@@ -97,12 +100,12 @@ def main() -> None:
     running.add_argument("data", type=Path, help="folder with scenes/ and styles/")
     running.add_argument("--resolution", type=int, default=192)
     ways.add_parser("show").add_argument("--pairs", action="store_true", help="also a table of each pair")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     if arguments.way == "run":
         for pair in PAIRS:
             if pair not in stored():
                 rows = run(arguments.data, pair, arguments.resolution)
-                add_pair("methods", pair, {"resolution": arguments.resolution}, rows)
+                add_pair("methods", pair, {"resolution": arguments.resolution}, rows, presets=PRESETS)
                 print(f"## {pair}\n\n{table([rows])}\n", flush=True)
     print(table(list(stored().values())))
     for pair, rows in stored().items() if arguments.way == "show" and arguments.pairs else ():

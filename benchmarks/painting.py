@@ -14,12 +14,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from benchmarks.common import read_views, write_result
+from benchmarks.common import parse, read_views, write_result
 from sgsst_core.constants import COLOR_OFFSET, SH_C0
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.painting.solver import PaintedColors, PaintedView, paint
@@ -61,17 +62,19 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", metavar="NAME=SCENE:CAMERAS")
     parser.add_argument("--resolution", type=int, default=480)
     parser.add_argument("--views", type=int, default=24)
-    arguments = parser.parse_args()
-    results = {}
+    arguments = parse(parser)
+    results, files = {}, {}
     for text in arguments.scenes:
         name, _, rest = text.partition("=")
         path, _, cameras = rest.partition(":")
-        scene = read_scene(Path(path)).scene
+        files[name] = Path(path)
+        scene = read_scene(files[name]).scene
         views = read_views(cameras, scene, arguments.views, arguments.resolution)
         results[name] = {edit: _measure(scene, views, change) for edit, change in EDITS.items()}
         for edit, figures in results[name].items():
             print(f"{name:10} {edit:10}", *(f"{key} {value:.1f}" for key, value in figures.items()), flush=True)
-    write_result("painting", {"resolution": arguments.resolution, "views": arguments.views, "scenes": results})
+    content: dict[str, Any] = {"resolution": arguments.resolution, "views": arguments.views, "scenes": results}
+    write_result("painting", content, scenes=files)
 
 
 def _measure(scene: Scene, views: list[Camera], change: Callable[[Scene, Tensor], Tensor]) -> dict[str, float]:

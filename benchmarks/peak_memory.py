@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from benchmarks.common import grainy_photo, write_result
+from benchmarks.common import grainy_photo, parse, write_result
 from sgsst_core.budget import device_peak, forget_device_peak, peak_memory
 from sgsst_core.devices import Timer
 from sgsst_core.features.network_weights import load_network_weights
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=5187)
     parser.add_argument("--height", type=int, default=3361)
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     use_whole_float32()
     size = (arguments.height, arguments.width)
     network = FeatureNetwork(load_network_weights("auto"), device=arguments.device)

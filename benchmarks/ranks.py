@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.common import free_address, input_parser, read_inputs, with_size, write_result
+from benchmarks.common import free_address, input_parser, parse, read_inputs, with_size, write_result
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import peak_memory
 from sgsst_core.features.partition import Rectangle, computed_twice
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--name", default="ranks", help="of the results file")
     parser.add_argument("--memory", type=float, default=16.0, help="GB to plan with")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     address = free_address()
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=run_rank, args=(rank, address, arguments)) for rank in range(1, arguments.ranks)]
@@ -64,7 +64,9 @@ def run_rank(rank: int, address: str, arguments: argparse.Namespace) -> None:
                 results.append({"view": size, **figures})
                 print(describe(results[-1]), flush=True)
     if rank == 0:
-        write_result(arguments.name, {"scene": arguments.scene.parent.name, "views": results})
+        name = arguments.scene.parent.name
+        figures = {"scene": name, "views": results}
+        write_result(arguments.name, figures, presets=["standard"], scenes={name: arguments.scene})
 
 
 def make(collectives: Collectives, scene: Any, view: Camera, style: Any, arguments: argparse.Namespace) -> Stylizer:

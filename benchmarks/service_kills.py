@@ -28,7 +28,7 @@ from typing import Any
 
 import httpx2
 
-from benchmarks.common import write_result
+from benchmarks.common import parse, write_result
 from sgsst_core.files.scene_file import read_scene
 from tests.api.service import Service, undisturbed
 from tests.small_scenes import wall, write_files
@@ -273,7 +273,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--rank-kills", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     chance = random.Random(arguments.seed)
     with tempfile.TemporaryDirectory(prefix="sgsst-kills-") as name:
         folder = Path(name)

@@ -33,7 +33,7 @@ import httpx2
 import psutil
 import uvloop
 
-from benchmarks.common import write_result
+from benchmarks.common import add_pair, parse
 from tests.api.service import Service
 from tests.postgres import fresh_database, server
 from tests.small_scenes import wall, write_files
@@ -372,8 +372,7 @@ def main() -> None:
     parser.add_argument("--watchers", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--postgresql", action="store_true", help="two API processes on a PostgreSQL server")
-    arguments = parser.parse_args()
-    load = [round(value, 2) for value in psutil.getloadavg()]  # load from other programs
+    arguments = parse(parser)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sgsst-load-")))
         (folder / "inputs").mkdir()
@@ -390,8 +389,7 @@ def main() -> None:
         services = [stack.enter_context(each) for each in _services(folder, stack, arguments.postgresql)]
         files = {"scene": ply, "cameras": cameras, "style": style}
         figures = uvloop.run(measure(services, files, arguments, large))
-    measured = {"processors": os.cpu_count(), "load_average_at_start": load, **figures}
-    print(write_result("service_load_postgresql" if arguments.postgresql else "service_load", measured))
+    print(add_pair("service_load", "postgresql" if arguments.postgresql else "sqlite", {}, figures))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from benchmarks.common import grainy_photo, write_result
+from benchmarks.common import grainy_photo, parse, write_result
 from sgsst_core.features.network_weights import load_network_weights
 from sgsst_core.features.partition import PartitionTile, Rectangle
 from sgsst_core.features.statistics import layer_statistics, merge
@@ -39,7 +39,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=2048)
     parser.add_argument("--repeats", type=int, default=3)
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     size = arguments.size
     image, content = grainy_photo("astronaut", size, size), grainy_photo("coffee", size, size)
     style_image = grainy_photo("immunohistochemistry", size, size)

@@ -15,7 +15,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.common import RESULTS, write_result
+from benchmarks.common import RESULTS, parse, write_result
 from benchmarks.stability import Case, Measurement, all_cases, measure
 
 #: Width in characters of the table, which a narrower terminal would truncate.
@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="only cases whose name contains TEXT, or group TEXT")
     parser.add_argument("--quick", action="store_true", help="smaller sizes; minutes faster")
     parser.add_argument("--out", type=Path, default=RESULTS / "stability.json", help="JSON file to write")
-    chosen = parser.parse_args(arguments)
+    chosen = parse(parser, arguments)
     cases = [case for case in all_cases() if chosen.only in case.name or chosen.only == case.group]
     if not cases:
         parser.error(f"no case or group is called {chosen.only!r}, or contains it in its name")

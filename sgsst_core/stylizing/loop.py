@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, cast
 
+import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
@@ -40,6 +41,8 @@ from sgsst_core.stylizing.views import PhotoLoader
 _LATEST, _KNOWN = 30, 10
 #: Number of steps between two choices of how many remain of a time budget, and number of steps before the first.
 _STEERED, _FIRST_STEERED = 5, 4
+#: Fraction of its threads' time that a job spends on a processor when nothing else runs there.
+_BUSY = 0.8
 
 
 @dataclass
@@ -132,6 +135,7 @@ class _Pace:
     def __init__(self, stylizer: Stylizer) -> None:
         self._stylizer, self._estimate, self._first = stylizer, estimate(stylizer.job), len(stylizer.history)
         self._earlier, self._beside = stylizer.seconds, 0.0
+        self._started = time.perf_counter(), time.process_time()
         stylizer.job.team.expect(self._estimate.seconds)
 
     def add_beside(self, seconds: float) -> None:
@@ -157,7 +161,16 @@ class _Pace:
         """Return the seconds from the last step to the last file, with the measurements."""
         work = self._stylizer.job.plan.work
         measuring = work.measuring / work.sos * self.step_seconds() if work.sos else 0.0
-        return measuring + ending_seconds(len(self._stylizer.job.scene))
+        return measuring + self._slowdown() * ending_seconds(len(self._stylizer.job.scene))
+
+    def _slowdown(self) -> float:
+        """Return how many times other processes lengthen this one's work: by the processor time that it gets."""
+        if self._stylizer.job.network.device.type != "cpu":
+            return 1.0
+        seconds, of_processor = (
+            now - then for now, then in zip((time.perf_counter(), time.process_time()), self._started, strict=True)
+        )
+        return max(1.0, _BUSY * torch.get_num_threads() * seconds / max(of_processor, 1e-9))
 
     def left(self) -> float:
         """Return the remaining seconds of the job."""
