@@ -135,7 +135,7 @@ def write_result(
 
     Args:
         name: Name of the result.
-        figures: What was measured.
+        figures: Measured values.
         folder: Folder of the file.
         presets: Presets whose settings the figures depend on.
         scenes: Files of the scenes.

@@ -4,11 +4,11 @@ python -m benchmarks.left_out NAME=SCENE[*GAUSSIANS]:CAMERAS ... --style STYLE [
 
 CAMERAS is a camera file, or orbit:N; with *GAUSSIANS, the scene is so many copies of its Gaussians. The first
 configuration leaves out all components that the scene does not need; each of the next ones keeps one of them, and one
-keeps all; the others do without one of the mechanisms by which we want to gain time or quality. Every job runs in a
-process of its own, so that it has its own memory peak, and all of them run once in each round. Other work on a machine
-only makes steps slower, so each step, and what comes before and after the steps, counts with its least seconds over the
-rounds; the range is that of the rounds, each compared with the lean job of its round. Results are stored after each
-scene, beside those of others.
+keeps all; others do without one of the mechanisms by which we want to gain time or quality. The last one is the first
+one again, to see what chance changes. Every job runs in a process of its own, so that it has its own memory peak, and
+all of them run once in each round. Other work on a machine only makes steps slower, so each step, and what comes before
+and after the steps, counts with its least seconds over the rounds; the range is that of the rounds, each compared with
+the lean job of its round. Results are stored after each scene, beside those of others.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.common import add_pair, parse, read_views
+from benchmarks.common import RESULTS, add_pair, parse, read_views
 from benchmarks.large_scene import multiplied
 from sgsst_core import Stylizer, make_settings
 from sgsst_core.budget import Cache, peak_memory
@@ -38,10 +38,8 @@ from sgsst_core.features.partition import Rectangle
 from sgsst_core.files.images import load_image
 from sgsst_core.files.scene_file import read_scene
 from sgsst_core.parallel.division import Divider, Division, Size, Tiling
-from sgsst_core.scene import spherical_harmonics
 from sgsst_core.scene.camera import Camera
 from sgsst_core.scene.gaussians import Scene
-from sgsst_core.scene.spherical_harmonics import reference_rest_colors
 from sgsst_core.settings import Settings
 from sgsst_core.style import Style
 from sgsst_core.stylizing.job import JobInputs, prepare_job
@@ -58,12 +56,20 @@ WITHOUT: dict[str, dict[str, Any]] = {
 #: Functions that replace compiled ones by PyTorch's operations, with their modules and names.
 REPLACED: dict[str, tuple[Any, str, Callable[..., Any]]] = {
     "no pooling kernel": (layers, "_is_compiled_for", lambda values: False),
-    "no harmonics kernel": (
-        spherical_harmonics,
-        "_compiled_rest_colors",
-        lambda rest, means, camera, degree: reference_rest_colors(rest, means, camera, degree),
-    ),
 }
+#: Names of configurations in the table, where they differ.
+_TITLES = {
+    "unseen": "unseen Gaussians",
+    "uncovered": "uncovered pixels",
+    "activations": "second forward pass",
+    "content": "content features again",
+    "everything": "all four",
+    "no Winograd": "float32 convolutions",
+    "no pooling kernel": "pooling by PyTorch",
+    "again": "the same job",
+}
+#: Configurations of each scene.
+LABELS = ("lean", *EVERYTHING, "everything", *WITHOUT, *REPLACED, "again")
 
 
 def main() -> None:
@@ -80,11 +86,10 @@ def main() -> None:
     if arguments.keep is not None:
         print(json.dumps(_measure(arguments)))
         return
-    labels = ["lean", *EVERYTHING, "everything", *WITHOUT, *REPLACED]
     for text in arguments.scenes:
         name = text.partition("=")[0]
-        rounds = [{label: _in_a_process(text, label) for label in labels} for _ in range(arguments.rounds)]
-        rows = {label: _summary(label, rounds, arguments.views) for label in labels}
+        rounds = [{label: _in_a_process(text, label) for label in LABELS} for _ in range(arguments.rounds)]
+        rows = {label: _summary(label, rounds, arguments.views) for label in LABELS}
         _print(name, rows)
         job = {"style": arguments.style.name, "resolution": arguments.resolution, "views": arguments.views}
         add_pair(
@@ -95,6 +100,21 @@ def main() -> None:
             presets=["standard"],
             scenes={name: _files(text)[0]},
         )
+    print(table(json.loads((RESULTS / "left_out.json").read_text(encoding="utf-8"))["pairs"]))
+
+
+def table(scenes: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a Markdown table of stored scenes: how much more a step and a whole job take with each configuration."""
+    names = [_TITLES.get(label, label.replace("no ", "without ", 1)) for label in LABELS[1:]]
+    lines = [["", *scenes, "job: median, range"], ["---"] * (len(scenes) + 2)]
+    lean = [scene["rows"]["lean"] for scene in scenes.values()]
+    lines.append(["seconds", *(f"{row['step']['seconds']:.2f}, {row['job']['seconds']:.1f}" for row in lean), ""])
+    for label, name in zip(LABELS[1:], names, strict=True):
+        rows = [scene["rows"][label] for scene in scenes.values()]
+        more = [row["job"]["more"] for row in rows]
+        cells = [f"{row['step']['more']:+.0%}, {row['job']['more']:+.0%}" for row in rows]
+        lines.append([name, *cells, f"{median(more):+.0%}, {min(more):+.0%} to {max(more):+.0%}"])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def with_components(

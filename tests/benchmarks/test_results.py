@@ -6,11 +6,12 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
 
-from benchmarks import common
+from benchmarks import common, left_out
 from sgsst_core import make_settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -74,6 +75,14 @@ def test_marked_figures_are_those_of_their_file(path: Path) -> None:
         unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
         exact = float(value) * float(factor or 1)
         assert float(stated.replace(",", "")) == pytest.approx(exact, abs=0.51 * unit), match[0]
+
+
+def test_what_leaving_out_saves_is_what_was_measured() -> None:
+    scenes = FILES["left_out.json"]["pairs"]
+    assert left_out.table(scenes) in (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    more = [scene["rows"]["everything"]["job"]["more"] for scene in scenes.values()]
+    stated = f"{median(more):.0%} longer ({min(more):.0%} to {max(more):.0%} on {len(more)} scenes)"
+    assert stated in " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
 
 
 def test_results_store_what_they_were_measured_with(tmp_path: Path) -> None:
