@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, cast
 
-import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
@@ -41,8 +40,6 @@ from sgsst_core.stylizing.views import PhotoLoader
 _LATEST, _KNOWN = 30, 10
 #: Number of steps between two choices of how many remain of a time budget, and number of steps before the first.
 _STEERED, _FIRST_STEERED = 5, 4
-#: Fraction of its threads' time that a job spends on a processor when nothing else runs there.
-_BUSY = 0.8
 
 
 @dataclass
@@ -164,13 +161,13 @@ class _Pace:
         return measuring + self._slowdown() * ending_seconds(len(self._stylizer.job.scene))
 
     def _slowdown(self) -> float:
-        """Return how many times other processes lengthen this one's work: by the processor time that it gets."""
+        """Return how many times other processes lengthen the ending, which runs on one core: if this one gets less."""
         if self._stylizer.job.network.device.type != "cpu":
             return 1.0
         seconds, of_processor = (
             now - then for now, then in zip((time.perf_counter(), time.process_time()), self._started, strict=True)
         )
-        return max(1.0, _BUSY * torch.get_num_threads() * seconds / max(of_processor, 1e-9))
+        return max(1.0, seconds / max(of_processor, 1e-9))
 
     def left(self) -> float:
         """Return the remaining seconds of the job."""
