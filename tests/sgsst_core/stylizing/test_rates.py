@@ -75,7 +75,7 @@ def test_remaining_time_follows_the_estimate_then_the_own_pace(cache: Path, tiny
     run(stylizer, Callbacks(progress=seen.append, progress_seconds=0))
     left = [progress.eta_s or 0.0 for progress in seen]
     steps = [13 - progress.step for progress in seen]
-    assert left[:9] == pytest.approx([each * expected.seconds + expected.ending for each in steps[:9]], rel=1e-6)
+    assert left[:9] == pytest.approx([each * expected.seconds + expected.ending for each in steps[:9]], rel=0.02)
     assert all(0 < each < 0.1 * expected.seconds for each in left[9:])
     (remembered,) = json.loads(cache.read_text()).values()
     assert all(rate > 1 for rate in remembered.values()), "this job's rate is merged"
