@@ -1,7 +1,5 @@
 """Substitute for a full disk, which only root can make."""
 
-from __future__ import annotations
-
 import resource
 import sys
 from collections.abc import Iterator

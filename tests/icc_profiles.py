@@ -1,7 +1,5 @@
 """Color profiles for tests, built from published primaries, white points and tone curves (ICC.1:2001-04 format)."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 

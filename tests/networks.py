@@ -1,7 +1,5 @@
 """Tiny feature networks, which take a negligible fraction of a test's time."""
 
-from __future__ import annotations
-
 import functools
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """PNG files as no library writes them: with any declared size, chunks and pixel data."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 

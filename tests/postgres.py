@@ -1,7 +1,5 @@
 """PostgreSQL server for tests and benchmarks, if PostgreSQL is installed."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

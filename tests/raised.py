@@ -1,7 +1,5 @@
 """Expectation of errors of the service, by their problem."""
 
-from __future__ import annotations
-
 import pytest
 
 from service.problems import ProblemType, ServiceError

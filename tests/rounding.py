@@ -1,7 +1,5 @@
 """Emulation of a GPU's TF32 and float16 on a CPU: factors are rounded, products are summed in float32."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

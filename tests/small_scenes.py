@@ -1,7 +1,5 @@
 """Tiny scenes, cameras and files, with which an optimizer step takes a few hundredths of a second."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stores for tests, opened in copies of a database that has its tables already."""
 
-from __future__ import annotations
-
 import tempfile
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test that no class sets more attributes on itself than a reader can remember."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tests that `docs/credits.md` names each picture, and each file that others made, and no file that is gone."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from pathlib import Path

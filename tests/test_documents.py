@@ -3,8 +3,6 @@
 Anchors are checked by `make docs`.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import re

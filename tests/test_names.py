@@ -1,7 +1,5 @@
 """Tests that identifiers use terms of docs/style.md instead of everyday words."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Tests of the notebook in the documentation: a kernel runs it, and its stored outputs are small and current."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

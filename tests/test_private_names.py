@@ -3,8 +3,6 @@
 The upper bounds of Ray and uvicorn in pyproject.toml exclude a new version until these tests pass with it.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import re

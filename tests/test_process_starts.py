@@ -1,7 +1,5 @@
 """Tests that no process that the project starts runs code from the current folder."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

@@ -1,7 +1,5 @@
 """Tests that docstrings and their entries start with a noun or a verb, as docs/style.md requires."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

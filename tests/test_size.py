@@ -1,7 +1,5 @@
 """Test that the program stays within the sizes of `[tool.sgsst.size]` in pyproject.toml."""
 
-from __future__ import annotations
-
 import ast
 import io
 import tokenize

@@ -5,8 +5,6 @@ project's source, so files that the wheel lacks are missing there. The core envi
 installation without extras has.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

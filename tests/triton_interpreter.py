@@ -1,7 +1,5 @@
 """Less overhead in Triton's interpreter, which runs the kernels of most tests."""
 
-from __future__ import annotations
-
 import inspect
 from functools import cache
 from typing import Any

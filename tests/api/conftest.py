@@ -1,7 +1,5 @@
 """Fixtures of tests that need a running service."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,6 +10,7 @@ import pytest
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from tests.api.service import Service, wait_for
+from tests.small_scenes import wall, write_files
 
 #: Function that returns a running service with these settings, which tests of other files use too.
 Services = Callable[..., Service]
@@ -55,6 +54,12 @@ def whole_service(services: Services) -> Iterator[Service]:
             url = job["links"]["self"]
             client.post(f"{url}/cancel")  # refused if it has ended
             wait_for(lambda: client.delete(url).status_code == 204, "the job to end")  # noqa: B023 (called at once)
+
+
+@pytest.fixture(scope="package")
+def paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return the paths of a small scene, its cameras and a style by their role, which tests do not change."""
+    return dict(zip(("scene", "cameras", "style"), write_files(tmp_path_factory.mktemp("inputs"), wall()), strict=True))
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -193,6 +194,15 @@ def undisturbed(files: Mapping[str, Path], parameters: Mapping[str, Any], folder
     environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(ROOT)}
     subprocess.run(command, check=True, env=environment, cwd=ROOT, stdout=subprocess.DEVNULL)
     return out
+
+
+def submit(client: httpx2.Client, files: Mapping[str, Path], **parameters: Any) -> str:
+    """Submit a job with files by their role, and return its id."""
+    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
+    answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
+    assert answer.status_code == 202, answer.text
+    assert answer.headers["location"] == f"/v1/jobs/{answer.json()['id']}"
+    return str(answer.json()["id"])
 
 
 @cache

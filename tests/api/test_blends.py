@@ -1,7 +1,5 @@
 """End-to-end tests of blends over HTTP: real jobs, and the same blends computed from the downloaded files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import httpx2
@@ -9,11 +7,6 @@ import pytest
 import torch
 
 from api.client import Client
-from api.client.transport import RequestError
-from service.inspection.derived import MOST_BLENDS
-from service.settings import ServiceSettings
-from service.states import Published
-from service.store import open_store
 from sgsst_core.files.library import save
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.files.stylized_ply import blend_scenes
@@ -106,16 +99,3 @@ def test_unusable_blends_are_refused(service: Service, files: dict[str, Path], j
     httpx2.post(f"{service.url}/v1/jobs/{unfinished}/cancel")
     listed = httpx2.get(f"{service.url}/v1/jobs/{other}/artifacts").json()["artifacts"]
     assert not any(entry["name"].startswith("blends/") for entry in listed)
-
-
-def test_number_of_blends_is_limited(service: Service, jobs: list[str]) -> None:
-    store = open_store(ServiceSettings(data=service.data))
-    source = store.jobs.artifact(jobs[1], "stylized.ply")
-    assert source is not None
-    existing = [Published(f"blends/{index}.ply", f"nowhere/{index}", 0, "0" * 64) for index in range(MOST_BLENDS)]
-    store.jobs.add_derived(source, existing, "local")
-    store.close()
-    answer = post(service, jobs[1], weight=0.5)
-    assert (answer.status_code, answer.json()["limit"]) == (409, MOST_BLENDS)
-    with Client(service.url) as client, pytest.raises(RequestError, match="already has 20 blends"):
-        client.blend(jobs[1], 0.5)

@@ -1,7 +1,5 @@
 """End-to-end tests of jobs with painted views over HTTP: refusals, plan, result, and a result that is painted again."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

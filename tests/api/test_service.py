@@ -1,8 +1,5 @@
 """End-to-end tests of the service: real processes of `sgsst serve`, jobs over HTTP, and killed processes."""
 
-from __future__ import annotations
-
-import asyncio
 import hashlib
 import io
 import json
@@ -12,7 +9,6 @@ import stat
 import subprocess
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -23,13 +19,14 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from api.client import AsyncClient, Client, Job
+from api.client import Client
 from sgsst_core import container
 from sgsst_core.errors import OutputError
 from sgsst_core.files.formats import EXTRA_FORMATS, by_name
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
 from tests.api.service import ROOT, Service, wait_for
+from tests.api.service import submit as submit_job
 from tests.small_scenes import wall, write_files
 
 #: Enough steps to be killed during a job, and enough to see a job run.
@@ -63,28 +60,8 @@ def stylized(files: dict[str, Path], service: Service, folder: Path, steps: int)
     return (folder / "stylized.ply").read_bytes()
 
 
-@pytest.fixture(scope="module")
-def short_job(files: dict[str, Path], service: Service) -> str:
-    """Run a job of few steps through the asynchronous client, and return its id. Tests must not change the job."""
-
-    async def sent() -> Job:
-        async with AsyncClient(service.url) as client:
-            parameters: dict[str, Any] = PARAMETERS | {"steps_sos": 5}
-            submitted = await client.submit(files["scene"], files["style"], cameras=files["cameras"], **parameters)
-            return await client.wait(submitted.id)
-
-    ended = asyncio.run(sent())
-    assert ended.status == "succeeded", ended.error
-    return ended.id
-
-
 def submit(client: httpx2.Client, files: dict[str, Path], **parameters: Any) -> str:
-    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-    data = {"parameters": json.dumps(PARAMETERS | parameters)}
-    answer = client.post("/v1/jobs", files=body, data=data)
-    assert answer.status_code == 202, answer.text
-    assert answer.headers["location"] == f"/v1/jobs/{answer.json()['id']}"
-    return str(answer.json()["id"])
+    return submit_job(client, files, **PARAMETERS | parameters)
 
 
 def job(client: httpx2.Client, job_id: str) -> dict[str, Any]:
@@ -260,17 +237,6 @@ def test_compressed_scene_and_results_in_other_formats(
         assert not (service.data / "artifacts" / job_id).exists()
 
 
-@pytest.mark.slow
-def test_concurrent_requests_share_one_compression(service: Service, short_job: str) -> None:
-    where = f"{service.url}/v1/jobs/{short_job}/artifacts/stylized.ply?format=spz"
-    with ThreadPoolExecutor(6) as pool:
-        answers = list(pool.map(lambda _: httpx2.get(where, timeout=120), range(6)))
-    assert {answer.status_code for answer in answers} == {200}
-    assert len({answer.headers["etag"] for answer in answers}) == 1
-    stored = list((service.data / "artifacts" / short_job).rglob("stylized.spz"))
-    assert len(stored) == 1, "nothing was made twice"
-
-
 def read(folder: Path, data: bytes) -> SceneFile:
     path = folder / hashlib.sha256(data).hexdigest()
     path.write_bytes(data)
@@ -305,8 +271,16 @@ def test_stopped_job_is_continued(service: Service, files: dict[str, Path], expe
         job_id = submit(client, files)
         wait_for_step(service, client, job_id, 10)
         assert client.post(f"/v1/jobs/{job_id}/finish").status_code == 200
-        stopped = wait_until(service, client, job_id, "succeeded")["result"]
+        ended = wait_until(service, client, job_id, "succeeded")
+        stopped = ended["result"]
         assert (stopped["stopped"], stopped["steps"] < stopped["total"]) == ("on-request", True)
+        assert (ended["progress"]["eta_s"], client.post(f"/v1/jobs/{job_id}/finish").status_code) == (None, 409)
+        report = client.get(f"/v1/jobs/{job_id}/artifacts/report.json").json()
+        assert (report["stopped"], sum(each["done"] for each in report["steps"].values())) == (
+            "on-request",
+            stopped["steps"],
+        )
+        assert "stopped on request" in client.get(f"/v1/jobs/{job_id}/artifacts/report.html").text
         derived = f"/v1/jobs/{job_id}/artifacts/stylized.ply?format=spz"
         first = client.get(derived).content
         assert client.post(f"/v1/jobs/{job_id}/retry").json()["result"] is None
@@ -323,32 +297,17 @@ def test_stopped_job_is_continued(service: Service, files: dict[str, Path], expe
 
 
 @pytest.mark.slow
-def test_job_that_is_finished_early_keeps_its_colors(service: Service, files: dict[str, Path]) -> None:
-    """The request outlives the process of the attempt: the next one resumes, makes a step and writes its result."""
+def test_request_to_finish_outlives_its_attempt(service: Service, files: dict[str, Path]) -> None:
+    """The next attempt resumes, makes a step and writes its result."""
     with service.client() as client:
-        job_id, cut = (submit(client, files, steps_sos=1_000_000) for _ in range(2))
+        job_id = submit(client, files, steps_sos=1_000_000)
         wait_for_step(service, client, job_id, 5)
-        assert client.post(f"/v1/jobs/{job_id}/finish").json()["status"] == "finishing"
-        final = wait_until(service, client, job_id, "succeeded", "failed")
-        assert final["result"]["stopped"] == "on-request"
-        assert final["progress"]["eta_s"] is None
-        assert final["result"]["loss_after"] < final["result"]["loss_before"]
-        steps = final["result"]["steps"]
-        assert 5 <= steps < 1_000_000
-        report = client.get(f"/v1/jobs/{job_id}/artifacts/report.json").json()
-        assert report["stopped"] == "on-request"
-        assert sum(each["done"] for each in report["steps"].values()) == steps
-        assert "stopped on request" in client.get(f"/v1/jobs/{job_id}/artifacts/report.html").text
-        names = {each["name"] for each in client.get(f"/v1/jobs/{job_id}/artifacts").json()["artifacts"]}
-        assert {"stylized.ply", "plan.json", "before_after.jpg", "colors.f16"} <= names
-        assert client.post(f"/v1/jobs/{job_id}/finish").status_code == 409
-        wait_for_step(service, client, cut, 5)
         running = service.process("service.scheduling.attempt_process")
         assert running is not None
         running.suspend()
-        client.post(f"/v1/jobs/{cut}/finish")
+        client.post(f"/v1/jobs/{job_id}/finish")
         running.kill()
-        final = wait_until(service, client, cut, "succeeded", "failed")
+        final = wait_until(service, client, job_id, "succeeded", "failed")
         assert [attempt["outcome"] for attempt in final["attempts"]] == ["failed", "succeeded"]
         assert final["result"]["stopped"] == "on-request"
 
@@ -432,17 +391,6 @@ def test_dry_run_plans_without_queueing_and_its_job_reuses_the_plan(service: Ser
         wait_until(service, client, job_id, "succeeded")
         reused = client.get(f"/v1/jobs/{job_id}/artifacts/plan.json").json()
         assert reused["decisions"] == plan["plan"]["decisions"]
-
-
-@pytest.mark.slow
-def test_deleting_job_removes_its_files(service: Service, short_job: str) -> None:
-    """This test runs after all other tests that use the same job."""
-    with service.client() as client:
-        where = f"/v1/jobs/{short_job}/artifacts/stylized.ply"
-        assert client.get(where).status_code == 200
-        assert client.delete(f"/v1/jobs/{short_job}").status_code == 204
-        assert client.get(where).status_code == 404
-        assert not (service.data / "artifacts" / short_job).exists()
 
 
 def test_logs_contain_no_errors(service: Service) -> None:

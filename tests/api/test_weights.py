@@ -1,7 +1,5 @@
 """Tests of a corrupted weight file of the feature network: effect of a flipped bit on the service's responses."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -10,7 +8,8 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from tests.api.service import Service, check_documented, wait_for
+from tests.api.http.sending import refused
+from tests.api.service import Service, wait_for
 from tests.small_scenes import wall, write_files
 
 PARAMETERS = {"preset": "standard", "steps_sos": 3, "backbone": "vgg16", "early_stop": False}
@@ -67,11 +66,9 @@ def test_damaged_weights_block_jobs(cache: Path, tmp_path: Path) -> None:
         assert answer.status_code == 503
         assert answer.json()["status"] == "unavailable"
         assert answer.json()["checks"]["weights"] == "DamagedWeightsError"
-        for refused in (submit(client), client.post(f"{canceled}/retry")):
-            assert refused.status_code == 503
-            assert refused.json()["code"] == "weights-damaged"
-            assert int(refused.headers["retry-after"]) > 0
-            check_documented(refused)
+        for answer in (submit(client), client.post(f"{canceled}/retry")):
+            refused(answer, 503, "weights-damaged")
+            assert int(answer.headers["retry-after"]) > 0
         state = client.get(job).json()
         assert (state["status"], state["attempt"]) == ("queued", 0)
         os.replace(sound, weights)

@@ -5,8 +5,6 @@ built or pulled only once, and other containers on the machine are not affected.
 base image is built from packages, and images of third parties are replaced by those of `stand_ins`.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,9 +1,6 @@
 """Tests of `deploy/backup.py`: a running service is saved, all its data are deleted, and it is restored elsewhere."""
 
-from __future__ import annotations
-
 import contextlib
-import json
 import os
 import shutil
 import signal
@@ -19,6 +16,7 @@ import psutil
 import pytest
 
 from tests.api.service import ROOT, Service, undisturbed, wait_for
+from tests.api.service import submit as submit_job
 from tests.postgres import fresh_database
 from tests.service.conftest import postgres  # noqa: F401 (a fixture)
 from tests.service.files.s3 import environment_of, s3_server
@@ -66,10 +64,7 @@ def expected(files: dict[str, Path], tiny_installed: Path, tmp_path_factory: pyt
 
 
 def submit(client: httpx2.Client, files: dict[str, Path], **parameters: Any) -> str:
-    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-    answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(PARAMETERS | parameters)})
-    assert answer.status_code == 202, answer.text
-    return str(answer.json()["id"])
+    return submit_job(client, files, **PARAMETERS | parameters)
 
 
 def job(client: httpx2.Client, job_id: str) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Tests of `deploy/Dockerfile` and `deploy/compose.yaml`: services are built, started, used, killed and stopped."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Tests that shell scripts and Dockerfiles pass their linters."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests on simulated hosts, which are namespaces of this machine: one job, the service, and failures of hosts."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

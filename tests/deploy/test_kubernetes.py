@@ -1,7 +1,5 @@
 """Tests of `deploy/kubernetes`: manifests are rendered by kustomize, and checked against schemas and invariants."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import re

@@ -1,7 +1,5 @@
 """Tests of alert rules and dashboard: valid syntax, conditions of alerts, and use of existing metrics only."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

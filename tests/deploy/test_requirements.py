@@ -1,7 +1,5 @@
 """Tests of the lock files in `deploy/requirements`: tested versions, and digests of all files."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib.metadata import PackageNotFoundError, requires

@@ -1,7 +1,5 @@
 """Tests of `deploy/make_secrets.py` and `deploy/compose.yaml`: no service starts with a publicly known password."""
 
-from __future__ import annotations
-
 import configparser
 import json
 import os

@@ -1,7 +1,5 @@
 """Tests of the table of job states, and of features that need an extra."""
 
-from __future__ import annotations
-
 import sys
 from itertools import product
 
@@ -10,14 +8,7 @@ import pytest
 from service.settings import installed_extras, missing_extras
 from service.states import (
     ACTIONS,
-    ACTIVE,
-    ENDED,
     FINISHED,
-    STEPPING,
-    TITLES,
-    TRANSITIONS,
-    UNFINISHED,
-    WORKING,
     JobStatus,
     Transition,
     TransitionError,
@@ -60,43 +51,12 @@ def test_every_transition_of_every_state(status: JobStatus, transition: Transiti
         next_status(status, transition)
 
 
-def test_every_state_is_in_one_group() -> None:
-    assert sorted([JobStatus.QUEUED, *ACTIVE, *ENDED]) == sorted(JobStatus)
-    assert set(UNFINISHED) == set(JobStatus) - set(ENDED)
-    assert set(STEPPING) < set(WORKING) < set(ACTIVE)
-    assert set(FINISHED) == set(ENDED) - {JobStatus.EXPIRED}
-
-
-def test_every_state_is_reachable() -> None:
-    reached = {JobStatus.QUEUED}
-    while new := {way[start] for way in TRANSITIONS.values() for start in reached & way.keys()} - reached:
-        reached |= new
-    assert reached == set(JobStatus)
-
-
-def test_canceling_job_can_only_end() -> None:
-    """Such a job never returns to the queue and never fails, because its user has given it up."""
-    ways = {way[JobStatus.CANCELING] for way in TRANSITIONS.values() if JobStatus.CANCELING in way}
-    assert ways == {JobStatus.CANCELING, JobStatus.CANCELED, JobStatus.SUCCEEDED}
-
-
 def test_actions_apply_to_states_that_they_change() -> None:
     assert {name: action.statuses for name, action in ACTIONS.items()} == {
         Transition.FINISH: (JobStatus.RUNNING,),
         Transition.CANCEL: (JobStatus.QUEUED, JobStatus.STARTING, JobStatus.RUNNING, JobStatus.FINISHING),
         Transition.RETRY: FINISHED,
     }
-
-
-def test_every_state_has_a_title() -> None:
-    assert list(TITLES) == list(JobStatus)
-    assert (TITLES[JobStatus.SUCCEEDED], TITLES[JobStatus.CANCELING]) == ("Done", "Canceling")
-
-
-def test_states_are_plain_strings() -> None:
-    """The database and the API use plain strings."""
-    assert [str(status) for status in JobStatus] == [status.value for status in JobStatus]
-    assert next_status("queued", Transition.TAKE) == "starting"
 
 
 def test_missing_extra_is_not_offered_and_named_to_the_operator(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,5 @@
 """Tests of batches on this machine: what is made, what is repeated, and what fails."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

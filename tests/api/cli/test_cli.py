@@ -1,7 +1,5 @@
 """Tests of the command line with real files: options, plans, results, reports, messages, exit codes and the demo."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -10,7 +8,6 @@ import re
 import shlex
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -64,15 +61,6 @@ def files(tmp_path: Path) -> Files:
     inputs = tmp_path / "inputs with a space"
     inputs.mkdir()
     return Files(*write_files(inputs, wall(sh_degree=1)), out=tmp_path / "new" / "stylized.ply")
-
-
-def second_reader(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a binary little-endian PLY of floats, read without plyfile."""
-    head, _, body = path.read_bytes().partition(b"end_header\n")
-    names = [line.split()[2].decode() for line in head.splitlines() if line.startswith(b"property")]
-    count = next(int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element"))
-    values = np.array(struct.unpack(f"<{count * len(names)}f", body), dtype=np.float32).reshape(count, len(names))
-    return {name: values[:, i] for i, name in enumerate(names)}
 
 
 @pytest.mark.slow
@@ -136,12 +124,9 @@ def test_stylize_changes_only_f_dc(files: Files, capsys: pytest.CaptureFixture[s
         "stylized.report.html",
         "stylized.report.json",
     ]
-    colors = {"f_dc_0", "f_dc_1", "f_dc_2"}
-    with_plyfile = [PlyData.read(path)["vertex"].data for path in (files.ply, files.out)]
-    by_hand = [second_reader(path) for path in (files.ply, files.out)]
-    for before, after in (with_plyfile, by_hand):
-        names = before.dtype.names if isinstance(before, np.ndarray) else before.keys()
-        assert {name for name in names if not np.array_equal(before[name], after[name])} == colors
+    before, after = (PlyData.read(path)["vertex"].data for path in (files.ply, files.out))
+    changed = {name for name in before.dtype.names if not np.array_equal(before[name], after[name])}
+    assert changed == {"f_dc_0", "f_dc_1", "f_dc_2"}
     heads = [path.read_bytes().partition(b"end_header\n")[0] for path in (files.ply, files.out)]
     assert heads[0] == heads[1]
     report = json.loads(files.out.with_name("stylized.report.json").read_text())
@@ -552,21 +537,6 @@ def test_default_cameras_are_those_beside_the_scene_or_else_an_orbit(
     assert len(list(out.iterdir())) == 2
 
 
-def test_unwritable_folder_is_rejected_before_work_starts(
-    files: Files, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if os.geteuid() == 0:  # root may write anywhere except where the kernel itself refuses
-        folder = Path("/proc")
-        if not folder.is_dir():
-            pytest.skip("root can write everywhere on this system")
-    else:
-        folder = tmp_path / "locked"
-        folder.mkdir(mode=0o500)
-    files.out = folder / "stylized.ply"
-    assert main(files.stylize("--steps-sos", "1")) == 2
-    assert "not writable" in capsys.readouterr().err
-
-
 def test_missing_weights_error_names_fetch_command(
     files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -875,14 +845,6 @@ def test_short_calls_import_little(arguments: list[str], unneeded: str) -> None:
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
-def test_summaries_of_commands_are_theirs(capsys: pytest.CaptureFixture[str]) -> None:
-    group: Any = typer.main.get_command(app)
-    assert main(["--help"]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    for name, command in group.commands.items():
-        assert f" {name} {command.help.split('.')[0]}" in shown
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -1082,9 +1044,3 @@ def test_demo_stylizes_its_scene_and_prints_result_paths(
     assert arguments[:3] == ["sgsst", "stylize", str(out / "motorcycle.ply")]
     assert main([*arguments[1:], "--resume"]) == 2
     assert "this job is finished" in capsys.readouterr().err
-
-
-def test_demo_rejects_unwritable_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "file").touch()
-    assert main(["demo", "--out", str(tmp_path / "file")]) == 2
-    assert "file" in capsys.readouterr().err

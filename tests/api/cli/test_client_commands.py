@@ -1,14 +1,12 @@
 """Tests of the client commands against a real service: messages, exit codes, and files."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
 import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from api.client import Client
 from api.client.transport import RequestError
 from tests.api.service import ROOT, Service
 from tests.full_disk import full_disk
-from tests.http_servers import serve
+from tests.http_servers import LocalServer, send
 from tests.small_scenes import wall, write_files
 
 MISSING = "job_1a1fe701a104f943e9d4d8cce5b818c"
@@ -181,24 +179,12 @@ def test_files_outside_of_the_folder_are_refused_before_the_download(
     requested = []
     artifacts = [{"name": each, "sha256": ""} for each in ("stylized.ply", name.format(outside=tmp_path / "outside"))]
 
-    class Hostile(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            requested.append(self.path)
-            body = json.dumps({"artifacts": artifacts}).encode()
-            self.send_response(200)
-            self.send_header("Content-Type", "application/json")
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        requested.append(handler.path)
+        send(handler, json.dumps({"artifacts": artifacts}).encode(), Content_Type="application/json")
 
-        def log_message(self, *arguments: Any) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Hostile) as server:
-        serve(server)
-        url = f"http://127.0.0.1:{server.server_port}"
-        assert main(["download", MISSING, "all", "--out", str(tmp_path / "folder"), "--url", url]) == 2
-        server.shutdown()
+    with LocalServer(answer) as server:
+        assert main(["download", MISSING, "all", "--out", str(tmp_path / "folder"), "--url", server.origin]) == 2
     assert "which is outside of the download's folder" in " ".join(capsys.readouterr().err.split())
     assert requested == [f"/v1/jobs/{MISSING}/artifacts"]
     assert list(tmp_path.iterdir()) == []
@@ -335,31 +321,24 @@ def test_proxy_is_named_if_the_service_cannot_be_reached(
     assert "proxy" not in capsys.readouterr().err
 
 
-class Painter(BaseHTTPRequestHandler):
-    """Service whose texts contain escape sequences."""
+EVIL = "\x1b]0;title\x07\x1b[2J\x9b2J\u202e[/red]"
 
-    EVIL = "\x1b]0;title\x07\x1b[2J\x9b2J\u202e[/red]"
 
-    def do_GET(self) -> None:
-        """Answer a request for a job, for all jobs or for events."""
-        job: dict[str, Any] = {"id": "job_1" + self.EVIL, "status": "running" + self.EVIL, "name": "name" + self.EVIL}
-        job |= {"created_at": "2026-01-01T00:00:00Z", "result": None, "error": {"message": "error" + self.EVIL}}
-        progress = {"stage": "stage" + self.EVIL, "step": 1, "total": 2, "fraction": 0.5}
-        if self.path.endswith("/events"):
-            body = f"id: 1\nevent: progress\ndata: {json.dumps(progress)}\n\n"
-        elif self.path.startswith("/v1/jobs?"):
-            body = json.dumps({"jobs": [{**job, "progress": progress}], "next_cursor": None})
-        elif self.path.endswith(MISSING):
-            body = json.dumps({**job, "status": "failed"})
-        else:
-            body = json.dumps({"detail": "refused" + self.EVIL})
-        self.send_response(404 if "detail" in body else 200)
-        self.send_header("Content-Type", "text/event-stream" if body.startswith("id") else "application/json")
-        self.end_headers()
-        self.wfile.write(body.encode())
-
-    def log_message(self, format: str, *arguments: Any) -> None:
-        """Print nothing."""
+def answer_in_color(handler: BaseHTTPRequestHandler) -> None:
+    """Answer a request for a job, for all jobs or for events with texts that contain escape sequences."""
+    job: dict[str, Any] = {"id": "job_1" + EVIL, "status": "running" + EVIL, "name": "name" + EVIL}
+    job |= {"created_at": "2026-01-01T00:00:00Z", "result": None, "error": {"message": "error" + EVIL}}
+    progress = {"stage": "stage" + EVIL, "step": 1, "total": 2, "fraction": 0.5}
+    if handler.path.endswith("/events"):
+        body = f"id: 1\nevent: progress\ndata: {json.dumps(progress)}\n\n"
+    elif handler.path.startswith("/v1/jobs?"):
+        body = json.dumps({"jobs": [{**job, "progress": progress}], "next_cursor": None})
+    elif handler.path.endswith(MISSING):
+        body = json.dumps({**job, "status": "failed"})
+    else:
+        body = json.dumps({"detail": "refused" + EVIL})
+    kind = "text/event-stream" if body.startswith("id") else "application/json"
+    send(handler, body.encode(), 404 if "detail" in body else 200, Content_Type=kind)
 
 
 @pytest.mark.parametrize("terminal", [False, True])
@@ -368,9 +347,8 @@ def test_escape_sequences_of_a_service_are_not_printed(
 ) -> None:
     if terminal:
         monkeypatch.setenv("FORCE_COLOR", "1")
-    with ThreadingHTTPServer(("127.0.0.1", 0), Painter) as server:
-        serve(server)
-        monkeypatch.setenv("SGSST_URL", f"http://127.0.0.1:{server.server_port}")
+    with LocalServer(answer_in_color) as server:
+        monkeypatch.setenv("SGSST_URL", server.origin)
         for command, code, text in (
             (["status", MISSING], 0, "error]0;title[2J2J[/red]"),
             (["jobs"], 0, "running]0;"),
@@ -384,27 +362,18 @@ def test_escape_sequences_of_a_service_are_not_printed(
         server.shutdown()
 
 
-class Stranger(BaseHTTPRequestHandler):
-    """Another program at the address of the service: it sends a page, or redirects `/moved`."""
-
-    def do_GET(self) -> None:
-        """Answer a request."""
-        moved = self.path.startswith("/moved")
-        self.send_response(301 if moved else 200)
-        self.send_header("Location" if moved else "Content-Type", "https://new.example/" if moved else "text/html")
-        self.end_headers()
-        self.wfile.write(b"<html>")
-
-    def log_message(self, format: str, *arguments: Any) -> None:
-        """Print nothing."""
+def answer_as_a_stranger(handler: BaseHTTPRequestHandler) -> None:
+    """Send a page, as another program at the address of the service, or redirect `/moved`."""
+    if handler.path.startswith("/moved"):
+        send(handler, status=301, Location="https://new.example/")
+    else:
+        send(handler, b"<html>", Content_Type="text/html")
 
 
 def test_address_of_another_program_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    with ThreadingHTTPServer(("127.0.0.1", 0), Stranger) as server:
-        serve(server)
-        url = f"http://127.0.0.1:{server.server_port}"
+    with LocalServer(answer_as_a_stranger) as server:
         for path, what in (("", "it sends text/html"), ("/moved", "it redirects to https://new.example/")):
             for command in (["status", MISSING], ["jobs"], ["download", MISSING]):
-                assert main([*command, "--url", url + path]) == 1
+                assert main([*command, "--url", server.origin + path]) == 1
                 assert f"does not answer like the service: {what}. Check the address." in capsys.readouterr().err
         server.shutdown()

@@ -1,7 +1,5 @@
 """Tests of `sgsst mcp`: the SDK's own client over standard input and output, against a real service."""
 
-from __future__ import annotations
-
 import base64
 import io
 import re

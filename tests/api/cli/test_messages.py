@@ -1,7 +1,5 @@
 """Tests of messages that all commands share: after Ctrl-C, about words that an option does not accept, and warnings."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

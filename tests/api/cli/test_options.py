@@ -1,7 +1,5 @@
 """Tests that command line, API and reference documentation use the same help text and bounds of each option."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -13,7 +13,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +27,10 @@ from api.client.uploads import camera_files, image_files
 from service.store import Store
 from sgsst_core.files.atomic import temporary_path
 from tests.api.service import Service
-from tests.http_servers import serve
+from tests.http_servers import LocalServer, send
 from tests.nginx import Nginx
 from tests.sgsst_core.files.formats.samples import archived, streamed, unpacked
-from tests.small_scenes import wall, write_files
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    return {"scene": ply, "style": style, "cameras": cameras}
+from tests.small_scenes import wall
 
 
 @pytest.fixture(autouse=True)
@@ -97,9 +91,9 @@ def test_clients_have_same_methods() -> None:
         assert inspect.isgeneratorfunction(method) == inspect.isasyncgenfunction(awaiting[name])
 
 
-def test_iteration_may_stop_early(service: Service, files: dict[str, Path]) -> None:
+def test_iteration_may_stop_early(service: Service, paths: dict[str, Path]) -> None:
     with Client(service.url) as client:
-        created = [client.submit(files["scene"], files["style"], orbit=2).id for _ in range(2)]
+        created = [client.submit(paths["scene"], paths["style"], orbit=2).id for _ in range(2)]
         for job in client.jobs():
             assert job.id == created[-1]
             break
@@ -107,10 +101,10 @@ def test_iteration_may_stop_early(service: Service, files: dict[str, Path]) -> N
         assert client.job(created[0]).id == created[0]
 
 
-def test_interrupted_call_is_canceled(service: Service, files: dict[str, Path]) -> None:
+def test_interrupted_call_is_canceled(service: Service, paths: dict[str, Path]) -> None:
     """Ctrl-C ends a wait for a job that does not end, and the client can be used further."""
     with Client(service.url) as client:
-        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+        job_id = client.submit(paths["scene"], paths["style"], orbit=2).id
         main = threading.main_thread().ident or 0
 
         def wait() -> None:
@@ -127,18 +121,18 @@ def test_interrupted_call_is_canceled(service: Service, files: dict[str, Path]) 
 
 @both
 def test_unpacked_streamed_sog_is_sent_as_an_archive(
-    connect: Any, service: Service, files: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     folder = unpacked(tmp_path / "robot", streamed([[wall()], [wall().subset(torch.arange(10))]]))
     with connect(service.url) as client:
         for scene in (folder, folder / "lod-meta.json"):
-            data = client.job(client.submit(scene, files["style"], orbit=2).id).data
+            data = client.job(client.submit(scene, paths["style"], orbit=2).id).data
             assert data["name"] == "robot · style"
             assert "robot.zip" in json.dumps(data["inputs"])
         with pytest.raises(RequestError, match=r"0_0/meta\.json is missing"):
             client.submit(
                 archived(tmp_path / "a.zip", {"lod-meta.json": (folder / "lod-meta.json").read_bytes()}),
-                files["style"],
+                paths["style"],
                 orbit=2,
             )
 
@@ -148,7 +142,7 @@ def test_job_from_upload_to_removal(
     connect: Any,
     service: Service,
     store: Store,
-    files: dict[str, Path],
+    paths: dict[str, Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -156,15 +150,15 @@ def test_job_from_upload_to_removal(
     reported: list[tuple[int, int]] = []
     with connect(service.url) as client:
         submitted: Job = client.submit(
-            files["scene"],
-            files["style"],
-            cameras=files["cameras"],
+            paths["scene"],
+            paths["style"],
+            cameras=paths["cameras"],
             name="mine",
             steps_sos=7,
             background=None,
             progress=lambda done, total: reported.append((done, total)),
         )
-        large = [path.stat().st_size for path in files.values() if path.stat().st_size > 10_000]
+        large = [path.stat().st_size for path in paths.values() if path.stat().st_size > 10_000]
         assert reported[-1] == (sum(large), sum(large))
         assert [done for done, _ in reported] == sorted({done for done, _ in reported})
         assert len(reported) == sum(-(-size // 10_000) for size in large)
@@ -172,7 +166,7 @@ def test_job_from_upload_to_removal(
         assert (shown.status, shown.data["name"]) == ("queued", "mine")
         assert shown.data["parameters"] == {**shown.data["parameters"], "steps_sos": 7}
         digests = {entry["role"]: entry["sha256"] for entry in shown.data["inputs"]}
-        assert digests == {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()}
+        assert digests == {role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in paths.items()}
 
         assert client.cancel(submitted.id).status == "canceled"
         assert client.retry(submitted.id).status == "queued"
@@ -202,14 +196,14 @@ def test_job_from_upload_to_removal(
 
 
 @both
-def test_numbers_that_are_not_finite_are_not_sent(connect: Any, files: dict[str, Path]) -> None:
+def test_numbers_that_are_not_finite_are_not_sent(connect: Any, paths: dict[str, Path]) -> None:
     """The port of a closed socket refuses connections, which is another error."""
     with connect("http://127.0.0.1:9") as client:
         for call in (
             lambda: client.blend("job_1", math.nan),
             lambda: client.blend("job_1", 0.5, {"job_2": -math.inf}),
             lambda: client.video("job_1", seconds=math.inf),
-            lambda: client.submit(files["scene"], files["style"], orbit=2, content_weight=math.nan),
+            lambda: client.submit(paths["scene"], paths["style"], orbit=2, content_weight=math.nan),
         ):
             with pytest.raises(RequestError, match=r"contains a number that is not finite\. Give finite numbers\."):
                 call()
@@ -217,11 +211,11 @@ def test_numbers_that_are_not_finite_are_not_sent(connect: Any, files: dict[str,
 
 @both
 def test_jobs_are_listed_page_by_page(
-    connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+    connect: Any, service: Service, paths: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("api.client.client._PAGE", 2)
     with connect(service.url) as client:
-        ids = [client.submit(files["scene"], files["style"], orbit=2, seed=number).id for number in range(5)]
+        ids = [client.submit(paths["scene"], paths["style"], orbit=2, seed=number).id for number in range(5)]
         assert [job.id for job in client.jobs()][:5] == ids[::-1]
         assert [job.id for job in client.jobs(limit=3)] == ids[:1:-1]
         client.cancel(ids[0])
@@ -231,17 +225,17 @@ def test_jobs_are_listed_page_by_page(
 
 @both
 def test_plan_queues_nothing_and_rejects_bad_files(
-    connect: Any, service: Service, files: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
         before = [job.id for job in client.jobs()]
         with pytest.raises(RequestError, match="is not a scene file") as caught:
-            client.plan(files["style"], files["style"], orbit=2)
+            client.plan(paths["style"], paths["style"], orbit=2)
         assert (caught.value.status, caught.value.problem["input"]) == (422, "scene")
         with pytest.raises(RequestError, match="not a file"):
-            client.submit(tmp_path / "none.ply", files["style"], orbit=2)
+            client.submit(tmp_path / "none.ply", paths["style"], orbit=2)
         with pytest.raises(RequestError, match="contains no images"):
-            client.submit(files["scene"], files["style"], cameras=files["cameras"], photos=tmp_path)
+            client.submit(paths["scene"], paths["style"], cameras=paths["cameras"], photos=tmp_path)
         assert [job.id for job in client.jobs()] == before
 
 
@@ -279,13 +273,13 @@ def test_photos_of_all_formats_are_sent_except_hidden_files(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "connect", [Client, pytest.param(Awaited, marks=pytest.mark.slow)], ids=["Client", "AsyncClient"]
 )
-def test_plan_reports_progress(connect: Any, service: Service, files: dict[str, Path]) -> None:
-    options = {"preset": "preview", "backbone": "vgg16", "resolution": 64, "cameras": files["cameras"]}
+def test_plan_reports_progress(connect: Any, service: Service, paths: dict[str, Path]) -> None:
+    options = {"preset": "preview", "backbone": "vgg16", "resolution": 64, "cameras": paths["cameras"]}
     reported: list[tuple[int, int]] = []
     with connect(service.url) as client:
         plan = client.plan(
-            files["scene"],
-            files["style"],
+            paths["scene"],
+            paths["style"],
             planning=lambda done, total: reported.append((done, total)),
             learning_rate=0.1 if connect is Client else 0.3,  # a plan that is cached sends no progress
             **options,
@@ -294,7 +288,7 @@ def test_plan_reports_progress(connect: Any, service: Service, files: dict[str, 
         assert (3, 3) in reported
         frozen = {"name": "middle", "select": "sphere=0,0,3,2.5", "freeze": True}
         with pytest.raises(RequestError, match="that a view sees is frozen") as caught:
-            client.plan(files["scene"], files["style"], regions=[frozen], **options)
+            client.plan(paths["scene"], paths["style"], regions=[frozen], **options)
         assert (caught.value.status, caught.value.problem["code"]) == (422, "invalid-settings")
 
 
@@ -351,10 +345,10 @@ class Relay:
 
 @both
 def test_download_resumes_after_lost_connection(
-    connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, store: Store, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
-        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+        job_id = client.submit(paths["scene"], paths["style"], orbit=2).id
     content = hashlib.sha256(job_id.encode()).digest() * 100_000
     service.finish(job_id, {"stylized.ply": content})
     reported: list[tuple[int, int]] = []
@@ -374,45 +368,35 @@ def test_download_resumes_after_lost_connection(
 
 @both
 def test_download_through_compressing_proxies(
-    connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, store: Store, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     """nginx makes ETags weak when it compresses; another proxy compresses although it is asked not to."""
     with connect(service.url) as client:
-        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+        job_id = client.submit(paths["scene"], paths["style"], orbit=2).id
     content = b"content" * 10_000
     service.finish(job_id, {"stylized.ply": content})
 
-    class Compressing(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            body = gzip.compress(content)
-            self.send_response(200)
-            self.send_header("ETag", f'W/"{hashlib.sha256(content).hexdigest()}-gzip"')
-            self.send_header("Content-Encoding", "gzip")
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *arguments: Any) -> None:
-            pass
+    def compress(handler: BaseHTTPRequestHandler) -> None:
+        body = gzip.compress(content)
+        tag = f'W/"{hashlib.sha256(content).hexdigest()}-gzip"'
+        send(handler, body, ETag=tag, Content_Encoding="gzip", Content_Length=str(len(body)))
 
     upstream = int(service.environment["SGSST_PORT"])
     with (
         Nginx(tmp_path / "nginx", upstream, directives=["gzip_types *;"]) as nginx,
-        ThreadingHTTPServer(("127.0.0.1", 0), Compressing) as other,
+        LocalServer(compress) as other,
     ):
-        serve(other)
-        for url in (nginx.url, f"http://127.0.0.1:{other.server_port}"):
+        for url in (nginx.url, other.origin):
             with connect(url) as client:
                 assert client.download(job_id, tmp_path / "out.ply").read_bytes() == content
-        other.shutdown()
 
 
 @both
 def test_partial_file_is_resumed_or_discarded_and_no_other_touched(
-    connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, store: Store, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
-        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+        job_id = client.submit(paths["scene"], paths["style"], orbit=2).id
         content = job_id.encode() * 1000
         service.finish(job_id, {"stylized.ply": content})
         tag = hashlib.sha256(content).hexdigest()
@@ -435,10 +419,10 @@ def test_partial_file_is_resumed_or_discarded_and_no_other_touched(
 
 @both
 def test_events_resume_after_lost_connection(
-    connect: Any, service: Service, store: Store, files: dict[str, Path], tmp_path: Path
+    connect: Any, service: Service, store: Store, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     with connect(service.url) as client:
-        job_id = client.submit(files["scene"], files["style"], orbit=2).id
+        job_id = client.submit(paths["scene"], paths["style"], orbit=2).id
         for _ in range(5):
             client.cancel(job_id)
             client.retry(job_id)
@@ -451,17 +435,17 @@ def test_events_resume_after_lost_connection(
 
 @both
 def test_upload_resumes_after_lost_connection(
-    connect: Any, service: Service, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+    connect: Any, service: Service, paths: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The response to a part is lost. The client sends the part again; the service refuses it as already received."""
     monkeypatch.setattr(uploads, "PART_BYTES", 20_000)
     # Connections stay open: the first one of each relay passes the answer to the creation, not that to the first part.
     with Relay(int(service.environment["SGSST_PORT"]), [900]) as relay, connect(relay.url) as client:
-        uploaded = client.upload(files["scene"])
+        uploaded = client.upload(paths["scene"])
         assert relay.cuts == 1
     with service.client() as plain:
         shown = plain.get(f"/v1/uploads/{uploaded}").json()
-    assert shown["sha256"] == hashlib.sha256(files["scene"].read_bytes()).hexdigest()
+    assert shown["sha256"] == hashlib.sha256(paths["scene"].read_bytes()).hexdigest()
 
 
 @both

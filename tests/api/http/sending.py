@@ -1,7 +1,5 @@
 """Requests of tests, parts of them, and the check of refusals."""
 
-from __future__ import annotations
-
 import io
 import re
 import socket

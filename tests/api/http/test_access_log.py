@@ -1,7 +1,5 @@
 """Tests of the access log and the metrics of requests: every response is in both, those to unexpected errors too."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import re

@@ -1,7 +1,5 @@
 """Test of the running service with a reader process that is compromised by a malicious scene."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import socket

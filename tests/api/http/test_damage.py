@@ -1,7 +1,5 @@
 """Tests of stored files that were lost or corrupted: they are neither sent nor used, and a new upload restores them."""
 
-from __future__ import annotations
-
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,14 +15,7 @@ from service.problems import LostFileError, NotFoundError
 from service.settings import ServiceSettings
 from service.store import Store
 from service.store.queue import Lease
-from tests.api.service import Service, check_documented
-from tests.small_scenes import wall, write_files
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, bytes]]:
-    paths = zip(("scene", "cameras", "style"), write_files(tmp_path_factory.mktemp("inputs"), wall()), strict=True)
-    return {role: (path.name, path.read_bytes()) for role, path in paths}
+from tests.api.service import Service, check_documented, submit
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +25,6 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     data.chmod(0o755)  # as an earlier version created it
     with Service(data, alone=True) as running:
         yield running
-
-
-def submit(client: httpx2.Client, files: dict[str, tuple[str, bytes]]) -> str:
-    answer = client.post("/v1/jobs", files=files)
-    assert answer.status_code == 202, answer.text
-    return str(answer.json()["id"])
 
 
 def lease_of(store: Store, job_id: str) -> Lease:
@@ -82,9 +67,9 @@ def blob_of(service: Service, store: Store, job_id: str, role: str) -> Path:
 
 
 def test_damaged_result_is_not_sent(
-    service: Service, store: Store, client: httpx2.Client, files: dict[str, Any], tmp_path: Path
+    service: Service, store: Store, client: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = submit(client, files)
+    job_id = submit(client, paths)
     path = publish(service, store, job_id, "plan.json", b'{"a": 1}' * 1000, tmp_path)
     where = f"/v1/jobs/{job_id}/artifacts/plan.json"
     sent = client.get(where)
@@ -99,9 +84,9 @@ def test_damaged_result_is_not_sent(
 
 
 def test_replaced_result_is_not_reported_lost(
-    service: Service, store: Store, client: httpx2.Client, files: dict[str, Any], tmp_path: Path
+    service: Service, store: Store, client: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = submit(client, files)
+    job_id = submit(client, paths)
     path = publish(service, store, job_id, "plan.json", b"{}", tmp_path)
     before = store.jobs.artifact(job_id, "plan.json")
     assert before is not None
@@ -118,23 +103,23 @@ def test_replaced_result_is_not_reported_lost(
 
 @pytest.mark.parametrize("lost", [True, False])
 def test_uploading_again_restores_lost_file(
-    service: Service, store: Store, client: httpx2.Client, files: dict[str, Any], lost: bool
+    service: Service, store: Store, client: httpx2.Client, paths: dict[str, Path], lost: bool
 ) -> None:
-    job_id = submit(client, files)
+    job_id = submit(client, paths)
     path, where = blob_of(service, store, job_id, "scene"), f"/v1/jobs/{job_id}/inputs/scene"
-    assert client.get(where).content == files["scene"][1]
+    assert client.get(where).content == paths["scene"].read_bytes()
     if lost:
         path.unlink()
     else:
         flip(path)
     refused(client.get(where), "file-lost" if lost else "file-damaged")
-    again = submit(client, files)
-    assert client.get(where).content == files["scene"][1]
+    again = submit(client, paths)
+    assert client.get(where).content == paths["scene"].read_bytes()
     assert blob_of(service, store, again, "scene") == path
 
 
-def test_data_folder_is_private(service: Service, client: httpx2.Client, files: dict[str, Any]) -> None:
-    submit(client, files)
+def test_data_folder_is_private(service: Service, client: httpx2.Client, paths: dict[str, Path]) -> None:
+    submit(client, paths)
     assert stat.S_IMODE(service.data.stat().st_mode) == 0o700
     # Folders below that of the results belong to the process of this test.
     own = {path: status for path, status in service.stored().items() if "artifacts" not in path.parts[:-1]}

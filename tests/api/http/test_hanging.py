@@ -1,7 +1,5 @@
 """Tests with a file store or a folder that hangs: other requests are answered, and those that need it get 503."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import threading

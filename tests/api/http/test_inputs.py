@@ -1,7 +1,5 @@
 """Tests of downloaded files: a job's inputs, images and loss history, also with hostile names."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from email.message import Message
@@ -23,9 +21,9 @@ from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.jobs import NewJob
 from sgsst_core.progress import Progress
-from tests.api.service import Service, check_documented
+from tests.api.http.sending import refused
+from tests.api.service import Service
 from tests.service.store.helpers import SHA
-from tests.small_scenes import wall, write_files
 from tests.stores import new_store
 
 #: Names of uploaded files.
@@ -52,37 +50,26 @@ HOSTILE = [
 ]
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("files"), wall())
-    return {"scene": ply, "cameras": cameras, "style": style}
-
-
-def submit(client: httpx2.Client, files: dict[str, Path], styles: list[str]) -> str:
-    parts = [(role, (files[role].name, files[role].read_bytes())) for role in ("scene", "cameras")]
+def submit(client: httpx2.Client, paths: dict[str, Path], styles: list[str]) -> str:
+    parts = [(role, (paths[role].name, paths[role].read_bytes())) for role in ("scene", "cameras")]
     # Bytes after the end of the image make it a different file.
-    parts += [("style", (name, files["style"].read_bytes() + bytes(place))) for place, name in enumerate(styles)]
+    parts += [("style", (name, paths["style"].read_bytes() + bytes(place))) for place, name in enumerate(styles)]
     answer = client.post("/v1/jobs", files=parts)
     assert answer.status_code == 202, answer.text
     return str(answer.json()["id"])
 
 
 @pytest.fixture(scope="module")
-def job_id(client: httpx2.Client, files: dict[str, Path]) -> str:
-    return submit(client, files, ["first.png", "second.PNG"])
+def job_id(client: httpx2.Client, paths: dict[str, Path]) -> str:
+    return submit(client, paths, ["first.png", "second.PNG"])
 
 
-def refused(answer: httpx2.Response, status: int, code: str) -> None:
-    assert (answer.status_code, answer.json()["code"]) == (status, code), answer.text
-    check_documented(answer)
-
-
-def test_inputs_are_returned_unchanged(client: httpx2.Client, files: dict[str, Path], job_id: str) -> None:
+def test_inputs_are_returned_unchanged(client: httpx2.Client, paths: dict[str, Path], job_id: str) -> None:
     listed = client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]
-    style = files["style"].read_bytes()
+    style = paths["style"].read_bytes()
     sent = [
-        ("scene", "scene", files["scene"].read_bytes(), "application/octet-stream"),
-        ("cameras", "cameras", files["cameras"].read_bytes(), "application/json"),
+        ("scene", "scene", paths["scene"].read_bytes(), "application/octet-stream"),
+        ("cameras", "cameras", paths["cameras"].read_bytes(), "application/json"),
         ("style", "style", style, "image/png"),
         ("style", "style:1", style + b"\0", "image/png"),
     ]
@@ -101,8 +88,8 @@ def test_inputs_are_returned_unchanged(client: httpx2.Client, files: dict[str, P
     assert client.get(f"/v1/jobs/{job_id}/inputs/style:0").content == style
 
 
-def test_inputs_are_sent_in_ranges(client: httpx2.Client, files: dict[str, Path], job_id: str) -> None:
-    url, whole = f"/v1/jobs/{job_id}/inputs/scene", files["scene"].read_bytes()
+def test_inputs_are_sent_in_ranges(client: httpx2.Client, paths: dict[str, Path], job_id: str) -> None:
+    url, whole = f"/v1/jobs/{job_id}/inputs/scene", paths["scene"].read_bytes()
     size = len(whole)
     for asked, start, stop in (("0-99", 0, 100), ("100-", 100, size), ("-7", size - 7, size), ("5-999999999", 5, size)):
         answer = client.get(url, headers={"Range": f"bytes={asked}"})
@@ -142,8 +129,8 @@ def test_missing_inputs_are_not_found(client: httpx2.Client, job_id: str, role: 
     refused(client.get(f"/v1/jobs/{job_id}/inputs/{role}"), 404, "not-found")
 
 
-def test_inputs_of_deleted_job_are_not_found(client: httpx2.Client, files: dict[str, Path], store: Store) -> None:
-    job_id = submit(client, files, ["style.png"])
+def test_inputs_of_deleted_job_are_not_found(client: httpx2.Client, paths: dict[str, Path], store: Store) -> None:
+    job_id = submit(client, paths, ["style.png"])
     client.post(f"/v1/jobs/{job_id}/cancel")
     assert client.get(f"/v1/jobs/{job_id}/inputs/scene").status_code == 200
     later = open_store(ServiceSettings(data=Path(store.database.url.database or "").parent), lambda: 1e11)
@@ -182,9 +169,9 @@ def test_safe_file_names_are_unchanged() -> None:
     assert disposition("caf\u00e9.png", inline=True) == "inline; filename=\"caf_.png\"; filename*=UTF-8''caf%C3%A9.png"
 
 
-def test_hostile_file_names_are_sanitized(client: httpx2.Client, files: dict[str, Path]) -> None:
+def test_hostile_file_names_are_sanitized(client: httpx2.Client, paths: dict[str, Path]) -> None:
     names = [name for name in HOSTILE if name.strip() and "\ud800" not in name][:14]
-    job_id = submit(client, files, names)
+    job_id = submit(client, paths, names)
     for entry in client.get(f"/v1/jobs/{job_id}/inputs").json()["inputs"]:
         answer = client.get(entry["url"])
         assert answer.status_code == 200
@@ -198,8 +185,8 @@ def test_hostile_file_names_are_sanitized(client: httpx2.Client, files: dict[str
         )
 
 
-def test_previews_and_loss_history(client: httpx2.Client, files: dict[str, Path], store: Store, tmp_path: Path) -> None:
-    job_id = submit(client, files, ["style.png"])
+def test_previews_and_loss_history(client: httpx2.Client, paths: dict[str, Path], store: Store, tmp_path: Path) -> None:
+    job_id = submit(client, paths, ["style.png"])
     assert client.get(f"/v1/jobs/{job_id}/progress").json() == {"points": []}
     image_path = tmp_path / "p.jpg"
     image_path.write_bytes(b"\xff\xd8\xff")
@@ -250,9 +237,9 @@ def test_reference_reads_no_other_entry(tmp_path: Path) -> None:
 
 
 def test_new_job_uses_inputs_of_an_earlier_one(
-    service: Service, store: Store, client: httpx2.Client, files: dict[str, Path]
+    service: Service, store: Store, client: httpx2.Client, paths: dict[str, Path]
 ) -> None:
-    first = submit(client, files, ["one.png", "two.png"])
+    first = submit(client, paths, ["one.png", "two.png"])
     used, blobs = client.get(f"/v1/jobs/{first}").json()["inputs"], store.inputs.locations()
     at = f"/v1/jobs/{first}/inputs"
     body = {"scene": f"{at}/scene", "cameras": [f"{at}/cameras:0"], "style": [f"{at}/style:1", f"{at}/style"]}
@@ -263,36 +250,34 @@ def test_new_job_uses_inputs_of_an_earlier_one(
     assert sorted(map(str, again["inputs"])) == sorted(map(str, used))
     assert [each["name"] for each in again["inputs"] if each["role"] == "style"] == ["two.png", "one.png"]
     form = [("scene", (None, f"{at}/scene")), ("cameras", (None, f"{at}/cameras"))]
-    style = ("style", (files["style"].name, files["style"].read_bytes()))
+    style = ("style", (paths["style"].name, paths["style"].read_bytes()))
     mixed = client.post("/v1/jobs", files=[*form, style])
     assert mixed.status_code == 202, mixed.text
     assert store.inputs.locations() >= blobs
     assert [each["sha256"] for each in mixed.json()["inputs"] if each["role"] == "scene"] == [used[0]["sha256"]]
     store.jobs.cancel(first, None)
     client.delete(f"/v1/jobs/{first}")
-    assert client.get(f"/v1/jobs/{again['id']}/inputs/scene").content == files["scene"].read_bytes()
-    refused = client.post("/v1/jobs", json=body)
-    check_documented(refused)
-    assert (refused.status_code, refused.json()["code"], refused.json()["input"]) == (422, "unknown-input", "scene")
-    assert "Upload the file again." in refused.json()["detail"]
+    assert client.get(f"/v1/jobs/{again['id']}/inputs/scene").content == paths["scene"].read_bytes()
+    problem = refused(client.post("/v1/jobs", json=body), 422, "unknown-input")
+    assert problem["input"] == "scene"
+    assert "Upload the file again." in problem["detail"]
 
 
 @pytest.mark.parametrize("name", ["scene:1", "style:2", "photos", "style:-1", "style:1/..", "stylized.ply", "scene:x"])
 def test_reference_to_an_input_that_a_job_has_not_is_refused(
-    client: httpx2.Client, files: dict[str, Path], name: str
+    client: httpx2.Client, paths: dict[str, Path], name: str
 ) -> None:
-    at = f"/v1/jobs/{submit(client, files, ['one.png', 'two.png'])}/inputs"
+    at = f"/v1/jobs/{submit(client, paths, ['one.png', 'two.png'])}/inputs"
     answer = client.post("/v1/jobs", json={"scene": f"{at}/{name}", "style": f"{at}/style", "cameras": [at]})
     assert answer.status_code == 422
     assert answer.json()["code"] in ("unknown-input", "unknown-upload")
     assert answer.json()["input"] == "scene"
 
 
-def test_references_do_not_reach_jobs_of_other_keys(service: Service, store: Store, files: dict[str, Path]) -> None:
+def test_references_do_not_reach_jobs_of_other_keys(service: Service, store: Store, paths: dict[str, Path]) -> None:
     (_, mine), (_, other) = store.keys.create("mine"), store.keys.create("other")
     with service.client(mine) as me, service.client(other) as you:
-        at = f"/v1/jobs/{submit(me, files, ['one.png'])}/inputs"
+        at = f"/v1/jobs/{submit(me, paths, ['one.png'])}/inputs"
         body = {"scene": f"{at}/scene", "style": f"{at}/style", "cameras": [f"{at}/cameras"]}
-        answer = you.post("/v1/jobs", json=body)
-        assert (answer.status_code, answer.json()["code"]) == (422, "unknown-input")
+        refused(you.post("/v1/jobs", json=body), 422, "unknown-input")
         assert me.post("/v1/jobs", json=body).status_code == 202

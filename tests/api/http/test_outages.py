@@ -1,12 +1,9 @@
 """Tests with a stopped, killed or locked database: requests get 503 with Retry-After, and health checks still work."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import signal
 import sqlite3
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,7 +18,7 @@ from api.http.app import create_app
 from api.http.sessions import MOST_FAILURES
 from service.problems import SHARE_ID, SHARE_TOKEN
 from service.settings import ServiceSettings
-from service.store import Store, open_store
+from service.store import open_store
 from tests.api.http.test_api import TUS, form, refused
 from tests.api.service import Service, wait_for
 from tests.postgres import Postgres, controlled_server, fresh_database, is_installed
@@ -253,30 +250,3 @@ def test_locked_database_is_busy_but_readable(tmp_path: Path, files: dict[str, b
             other.execute("ROLLBACK")
             assert create_upload(client).status_code == 201
             assert client.post(f"/v1/jobs/{job_id}/cancel").status_code == 200
-
-
-def test_lock_wait_is_bounded_across_writers(tmp_path: Path) -> None:
-    """Only one writer at a time waits for a locked database; timeouts of other writers do not add up."""
-    store: Store = open_store(ServiceSettings(data=tmp_path), answer_seconds=0.5)
-    with contextlib.closing(sqlite3.connect(tmp_path / "sgsst.db")) as other:
-        other.isolation_level = None
-        other.execute("BEGIN EXCLUSIVE")
-        refusals: list[Exception] = []
-
-        def write() -> None:
-            try:
-                store.operations.record_heartbeat("one", 1, 1)
-            except Exception as error:
-                refusals.append(error)
-
-        threads = [threading.Thread(target=write) for _ in range(MANY)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert [type(error).__name__ for error in refusals] == ["DatabaseBusyError"] * MANY
-        assert store.operations.check() == 0
-        other.execute("ROLLBACK")
-    store.operations.record_heartbeat("one", 1, 1)
-    assert len(store.operations.dispatchers()) == 1
-    store.close()

@@ -1,8 +1,5 @@
 """Tests of dry runs that report their progress."""
 
-from __future__ import annotations
-
-import asyncio
 import io
 import json
 import math
@@ -12,14 +9,9 @@ import httpx2
 import pytest
 import torch
 from PIL import Image
-from starlette.requests import Request
-from starlette.types import Message
 
-from api.http.events import answer_work
-from api.http.schemas import PlanView
-from service import problems
-from tests.api.service import PATIENCE, Service, wait_for
-from tests.raised import raises_problem
+from tests.api.http.sending import refused
+from tests.api.service import Service, wait_for
 from tests.small_scenes import cameras
 
 #: Region that freezes every Gaussian in view, but not those at the corners of the wall.
@@ -91,8 +83,7 @@ def test_views_and_regions_without_gaussians_are_warned_about(service: Service, 
 def test_unusable_files_are_rejected_before_first_event(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         headers = {"Accept": "text/event-stream"}
-        answer = client.post("/v1/jobs", headers=headers, **request({**files, "scene": b"none"}))
-        assert (answer.status_code, answer.json()["code"]) == (422, "invalid-scene")
+        refused(client.post("/v1/jobs", headers=headers, **request({**files, "scene": b"none"})), 422, "invalid-scene")
 
 
 def test_planning_errors_are_events(service: Service, files: dict[str, bytes]) -> None:
@@ -128,9 +119,8 @@ def photo(name: str) -> tuple[str, tuple[str, bytes]]:
 def test_plan_lists_camera_and_photo_decisions(service: Service, files: dict[str, bytes]) -> None:
     with service.client() as client:
         asked = request({**files, "cameras": blender(k1=0.1)})
-        refused = client.post("/v1/jobs", **asked)
-        assert (refused.status_code, refused.json()["code"]) == (422, "invalid-cameras")
-        assert "gives no size. Add the sizes" in refused.json()["detail"]
+        problem = refused(client.post("/v1/jobs", **asked), 422, "invalid-cameras")
+        assert "gives no size. Add the sizes" in problem["detail"]
         asked["files"] += [photo("train/view_0.png"), photo("train/view_2.png")]
         answer = client.post("/v1/jobs", **asked)
         assert answer.status_code == 200, answer.text
@@ -166,100 +156,22 @@ def test_mismatched_cameras_are_rejected_immediately(service: Service, files: di
         ):
             asked = request(files)
             asked["files"][1] = ("cameras", (name, content))
-            answer = client.post("/v1/jobs", **asked)
-            assert (answer.status_code, answer.json()["code"]) == (422, "invalid-cameras")
-            assert detail in answer.json()["detail"]
+            assert detail in refused(client.post("/v1/jobs", **asked), 422, "invalid-cameras")["detail"]
 
 
 @pytest.mark.slow
-def test_disconnect_cancels_planning_with_events(service: Service, files: dict[str, bytes]) -> None:
-    with service.client() as client:
-        events(client, files)
-        both = len(service.processes("service.inspection.process"))
-        begin_and_leave(service, client, with_many_views(files), both, seed=1)
-        assert events(client, files, resolution=96)[-1].event == "plan"
-
-
-def test_disconnect_cancels_planning_without_events(service: Service, files: dict[str, bytes]) -> None:
-    with service.client() as client:
-        events(client, files)
-        both = len(service.processes("service.inspection.process"))
-        many = with_many_views(files)
-        begin_and_leave(service, client, many, both, seed=2)  # validated by now, and not planned
-
-    async def leave() -> None:
-        async with httpx2.AsyncClient(base_url=service.url, headers=client.headers, timeout=PATIENCE) as waiting:
-            answer = asyncio.create_task(waiting.post("/v1/jobs", **request(many, resolution=1024, seed=2)))
-            await asyncio.to_thread(
-                wait_for, lambda: len(service.processes("service.inspection.process")) >= both, "the planning to begin"
-            )
-            assert not answer.done()
-            answer.cancel()
-
-    asyncio.run(leave())
-    wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
-    with service.client() as client:
-        assert client.post("/v1/jobs", **request(files, resolution=96)).status_code == 200
-
-
-def test_disconnect_while_files_are_read_ends_the_work() -> None:
-    ended = asyncio.Event()
-
-    async def read_files(show: Any) -> PlanView:
-        try:
-            await asyncio.Event().wait()
-        finally:
-            ended.set()
-        raise AssertionError
-
-    async def leave() -> Message:
-        return {"type": "http.disconnect"}
-
-    async def ask() -> int:
-        streamed = Request({"type": "http", "headers": [(b"accept", b"text/event-stream")]}, leave)
-        answer = await asyncio.wait_for(
-            answer_work(streamed, read_files, "planning", "plan", set(), asyncio.Event()), PATIENCE
-        )
-        await ended.wait()
-        return answer.status_code
-
-    assert asyncio.run(ask()) == 499
-
-
-def test_service_that_stops_ends_the_work() -> None:
-    async def wait(show: Any) -> PlanView:
-        await asyncio.Event().wait()
-        raise AssertionError
-
-    async def stay() -> Message:
-        return await asyncio.get_running_loop().create_future()
-
-    async def ask(accept: bytes) -> object:
-        working: set[asyncio.Task[Any]] = set()
-        asked = Request({"type": "http", "headers": [(b"accept", accept)]}, stay)
-        asyncio.get_running_loop().call_later(0, lambda: [task.cancel() for task in working])
-        checked = asyncio.Event()
-        checked.set()
-        answer = await answer_work(asked, wait, "planning", "plan", working, checked)
-        return [part async for part in answer.body_iterator]  # type: ignore[attr-defined]
-
-    with raises_problem(problems.STOPPING):
-        asyncio.run(ask(b"application/json"))
-    assert b'"code": "busy"' in asyncio.run(ask(b"text/event-stream"))[-1]  # type: ignore[index]
-
-
-def with_many_views(files: dict[str, bytes]) -> dict[str, bytes]:
-    """Return the files with 1,000 views, which take several times as long to plan as a client takes to disconnect."""
+def test_disconnect_cancels_planning(service: Service, files: dict[str, bytes]) -> None:
+    """A thousand views take several times as long to plan as a client takes to disconnect at the first event."""
     views = json.loads(files["cameras"])
     many = [{**views[index % len(views)], "img_name": f"view_{index}"} for index in range(1000)]
-    return {**files, "cameras": json.dumps(many).encode()}
-
-
-def begin_and_leave(service: Service, client: httpx2.Client, files: dict[str, bytes], both: int, seed: int) -> None:
-    """Start a dry run, disconnect at the first event, and wait until fewer than `both` inspecting processes run."""
-    with client.sse("/v1/jobs", method="POST", **request(files, resolution=1024, seed=seed)) as source:
-        next(iter(source))
-    wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
+    long = request({**files, "cameras": json.dumps(many).encode()}, resolution=1024, seed=1)
+    with service.client() as client:
+        events(client, files)
+        both = len(service.processes("service.inspection.process"))
+        with client.sse("/v1/jobs", method="POST", **long) as source:
+            next(iter(source))
+        wait_for(lambda: len(service.processes("service.inspection.process")) < both, "the planning process to end")
+        assert events(client, files, resolution=96)[-1].event == "plan"
 
 
 def test_plan_of_an_orbit_says_whether_up_is_sure(service: Service, files: dict[str, bytes]) -> None:
@@ -270,9 +182,8 @@ def test_plan_of_an_orbit_says_whether_up_is_sure(service: Service, files: dict[
         assert (asked["sure"], len(asked["candidates"])) == (False, 2)
         assert asked["candidates"][0] == "-y"
         assert "most captures" in asked["reason"]
-        refused = client.post("/v1/jobs", **request(without) | {"params": {"sure_up": True}})  # an orbit by default
-        assert (refused.status_code, refused.json()["code"]) == (422, "unsure-up")
-        assert refused.json()["candidates"] == asked["candidates"]
+        answer = client.post("/v1/jobs", **request(without) | {"params": {"sure_up": True}})  # an orbit by default
+        assert refused(answer, 422, "unsure-up")["candidates"] == asked["candidates"]
         assert jobs(client) == before
         given = client.post("/v1/jobs", **request(without, orbit=2, up="z")).json()["up"]
         assert given == {"direction": "z", "sure": True, "candidates": ["z"], "reason": "requested"}

@@ -1,7 +1,5 @@
 """Tests of the service behind nginx, at the root of a host and at a subpath."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

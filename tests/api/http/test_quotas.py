@@ -1,7 +1,5 @@
 """Tests of quotas and rate limits as a client sees them: 429 with the reason and the time to retry."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -25,14 +23,7 @@ from tests.api.http.test_api import TUS, form, refused
 from tests.api.service import PATIENCE, Service, wait_for
 from tests.postgres import fresh_database, is_installed, server
 from tests.raised import raises_problem
-from tests.service.store.helpers import usage_of
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.service.store.helpers import Clock, usage_of
 
 
 def test_average_rate_is_limited() -> None:
@@ -63,14 +54,6 @@ def test_request_after_retry_after_is_allowed(a_second: float) -> None:
         except ServiceError as error:
             clock.now += error.retry_after or 0
             rates.take("alice", a_second)
-
-
-def test_inactive_owners_are_forgotten() -> None:
-    rates = Rates(Clock())
-    for number in range(20_000):
-        rates.take(f"key_{number}", 1.0)
-    assert len(rates._left) == 10_000
-    assert "key_19999" in rates._left
 
 
 @pytest.fixture(scope="module")

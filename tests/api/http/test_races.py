@@ -1,7 +1,5 @@
 """Random interleavings of all pairs of operations on one job: whoever comes second gets an answer, never a 500."""
 
-from __future__ import annotations
-
 import itertools
 import random
 import threading

@@ -4,8 +4,6 @@ The document is complete and has valid examples of everything; with Schemathesis
 that it lacks.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

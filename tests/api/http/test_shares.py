@@ -1,7 +1,5 @@
 """Tests of links to results: what they show, when they end, and that they give access to nothing else."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -19,9 +17,9 @@ from service.store import Store, open_store
 from service.store.jobs import MOST_SHARES
 from service.store.tables import ShareRow
 from tests.api.conftest import KEYED, Services
+from tests.api.http.sending import refused
 from tests.api.http.test_hanging import MANY
-from tests.api.service import Service, check_documented, wait_for
-from tests.small_scenes import wall, write_files
+from tests.api.service import Service, check_documented, submit, wait_for
 
 PLY, COLORS, THUMBNAIL = b"ply\nstylized", b"\0\1" * 9, b"\xff\xd8\xff\xe0"
 
@@ -45,18 +43,9 @@ def visitor(service: Service) -> Iterator[httpx2.Client]:
         yield client
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    ply, cameras, style = write_files(tmp_path_factory.mktemp("files"), wall())
-    return {"scene": ply, "cameras": cameras, "style": style}
-
-
-def finished(client: httpx2.Client, service: Service, files: dict[str, Path]) -> str:
+def finished(client: httpx2.Client, service: Service, paths: dict[str, Path]) -> str:
     """Return a finished job, with results in place of those of a dispatcher."""
-    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-    parameters = {"background": "white", "name": "my wall", "seed": 7}
-    answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
-    job_id = str(answer.json()["id"])
+    job_id = submit(client, paths, background="white", name="my wall", seed=7)
     contents = {"stylized.ply": PLY, "colors.f16": COLORS, "report.json": b"{}", "plan.json": b'{"decisions": []}'}
     service.finish(job_id, {**contents, "previews/thumbnail.jpg": THUMBNAIL})
     return job_id
@@ -71,14 +60,13 @@ def share(client: httpx2.Client, job_id: str, **body: Any) -> tuple[dict[str, An
 
 
 def assert_missing(answer: httpx2.Response, code: str = "not-found") -> None:
-    assert (answer.status_code, answer.json()["code"]) == (404, code), answer.text
-    check_documented(answer)
+    refused(answer, 404, code)
 
 
 def test_link_shows_the_result_and_nothing_else(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     view, token = share(me, job_id)
     shown = visitor.get(f"/v1/shared/{token}")
     assert shown.headers["referrer-policy"] == "no-referrer"
@@ -92,8 +80,8 @@ def test_link_shows_the_result_and_nothing_else(
         "files": ["colors.f16", "stylized.ply", "poster"],
     }
     for name, content in (
-        ("scene", files["scene"].read_bytes()),
-        ("cameras:0", files["cameras"].read_bytes()),
+        ("scene", paths["scene"].read_bytes()),
+        ("cameras:0", paths["cameras"].read_bytes()),
         ("colors.f16", COLORS),
         ("stylized.ply", PLY),
     ):
@@ -114,9 +102,9 @@ def test_link_shows_the_result_and_nothing_else(
 
 
 def test_link_with_poster_names_its_image(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     assert me.patch(f"/v1/jobs/{job_id}", json={"name": 'my "<wall>"'}).status_code == 200
     view = me.post(f"/v1/jobs/{job_id}/shares", json={"poster": True}).json()
     path, token = view["url"], view["url"].rpartition("/")[2]
@@ -149,9 +137,9 @@ def viewpoint(name: str, **changed: Any) -> dict[str, Any]:
 
 
 def test_link_shows_the_named_viewpoints(
-    service: Service, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path]
+    service: Service, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path]
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     _, token = share(me, job_id)
     here, named = f"/v1/jobs/{job_id}", [viewpoint("front"), viewpoint("left", position=[-1.0, 0.0, 0.5])]
     changed = me.patch(here, json={"viewpoints": {"named": named}})
@@ -169,27 +157,19 @@ def test_link_shows_the_named_viewpoints(
         ({"named": [viewpoint("a", up=[0, 1, 0])]}, "up"),
         ({"begin": None}, "begin"),
     ):
-        answer = me.patch(here, json={"viewpoints": wrong})
-        assert (answer.status_code, answer.json()["code"]) == (422, "invalid-request"), answer.text
-        assert reason in answer.json()["detail"]
-        check_documented(answer)
+        assert reason in refused(me.patch(here, json={"viewpoints": wrong}), 422, "invalid-request")["detail"]
     unreadable = me.patch(here, json={"viewpoints": {"start": viewpoint("")}})  # the result is no PLY
     assert unreadable.status_code == 422
     check_documented(unreadable)
-    nothing = me.patch(here, json={})
-    assert nothing.status_code == 422
-    assert "give a name or viewpoints" in nothing.json()["detail"]
+    assert "give a name or viewpoints" in refused(me.patch(here, json={}), 422, "invalid-request")["detail"]
     assert me.get(here).json()["viewpoints"] == {"start": None, "named": named}, "nothing else was stored"
-    queued = me.post("/v1/jobs", files={role: (path.name, path.read_bytes()) for role, path in files.items()}).json()
-    early = me.patch(queued["links"]["self"], json={"viewpoints": {"named": named}})
-    assert early.status_code == 409
-    check_documented(early)
+    refused(me.patch(f"/v1/jobs/{submit(me, paths)}", json={"viewpoints": {"named": named}}), 409, "conflict")
 
 
 def test_only_permitted_sites_may_frame_a_link(
-    service: Service, services: Services, store: Store, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, services: Services, store: Store, me: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     hidden, posted = (me.post(f"/v1/jobs/{job_id}/shares", json={"poster": poster}).json() for poster in (False, True))
     assert hidden["embed_url"].startswith("/shared?embed=1#shr_")
     for view in (hidden, posted):
@@ -225,18 +205,18 @@ def test_token_opens_no_other_file(
     store: Store,
     me: httpx2.Client,
     visitor: httpx2.Client,
-    files: dict[str, Path],
+    paths: dict[str, Path],
     tmp_path: Path,
     name: str,
 ) -> None:
-    _, token = share(me, finished(me, service, files))
+    _, token = share(me, finished(me, service, paths))
     assert visitor.get(f"/v1/shared/{token}/{name}").status_code in (404, 422)
 
 
 def test_token_is_no_key_and_of_one_job(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id, other = (finished(me, service, files) for _ in range(2))
+    job_id, other = (finished(me, service, paths) for _ in range(2))
     view, token = share(me, job_id)
     for headers in ({"Authorization": f"Bearer {token}"}, {"Cookie": f"sgsst_session={token}"}):
         for method, path in (
@@ -259,9 +239,9 @@ def test_token_is_no_key_and_of_one_job(
 
 
 def test_wrong_tokens_open_nothing(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    view, token = share(me, finished(me, service, files))
+    view, token = share(me, finished(me, service, paths))
     secret = token.partition(".")[2]
     changed = ("A" if secret[0] != "A" else "B") + secret[1:]
     for wrong in (f"{view['id']}.{changed}", view["id"], f"{view['id']}.", f"{token}x", f"x{token}", secret, "x" * 100):
@@ -272,9 +252,9 @@ def test_wrong_tokens_open_nothing(
 
 
 def test_link_ends_when_it_expires_or_is_revoked(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     (first, one), (second, two), (_, three) = (share(me, job_id) for _ in range(3))
     with store.database.writing() as session:
         session.get_one(ShareRow, first["id"]).expires_at = store.database.clock() - 1
@@ -291,32 +271,28 @@ def test_link_ends_when_it_expires_or_is_revoked(
 
 
 def test_link_ends_with_the_key_of_its_job(
-    service: Service, store: Store, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
     key, text = store.keys.create("leaving")
     with service.client(text) as client:
-        _, token = share(client, finished(client, service, files))
+        _, token = share(client, finished(client, service, paths))
     assert visitor.get(f"/v1/shared/{token}").status_code == 200
     store.keys.revoke(key.id)
     assert_missing(visitor.get(f"/v1/shared/{token}"))
 
 
 def test_only_results_of_ones_own_can_be_shared(
-    service: Service, store: Store, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     with service.client(store.keys.create("other")[1]) as other:
         for method in ("GET", "POST"):
             assert_missing(other.request(method, f"/v1/jobs/{job_id}/shares", json={}))
         view, _ = share(me, job_id)
         assert_missing(other.delete(f"/v1/jobs/{job_id}/shares/{view['id']}"))
-    own = finished(me, service, files)
+    own = finished(me, service, paths)
     assert_missing(me.delete(f"/v1/jobs/{own}/shares/{view['id']}"))
-    body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-    waiting = me.post("/v1/jobs", files=body).json()["id"]
-    refused = me.post(f"/v1/jobs/{waiting}/shares", json={})
-    check_documented(refused)
-    assert (refused.status_code, refused.json()["code"]) == (409, "conflict")
+    refused(me.post(f"/v1/jobs/{submit(me, paths)}/shares", json={}), 409, "conflict")
     for days in (0, -1, 91, "x", "7", True, None, 1e400, 1e-300, 0.0006):
         assert (
             me.post(
@@ -329,14 +305,13 @@ def test_only_results_of_ones_own_can_be_shared(
     share(me, job_id, days=1 / 1440)
     for _ in range(MOST_SHARES - 2):
         share(me, job_id)
-    refused = me.post(f"/v1/jobs/{job_id}/shares", json={})
-    assert (refused.status_code, refused.json()["code"]) == (409, "too-many-shares")
+    refused(me.post(f"/v1/jobs/{job_id}/shares", json={}), 409, "too-many-shares")
 
 
 def test_expired_links_do_not_count_toward_the_limit(
-    store: Store, service: Service, me: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    store: Store, service: Service, me: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     for _ in range(MOST_SHARES):
         share(me, job_id)
     now = store.database.clock()
@@ -347,9 +322,9 @@ def test_expired_links_do_not_count_toward_the_limit(
 
 
 def test_stored_digest_is_no_token_and_logs_contain_none(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     view, token = share(me, job_id)
     with store.database.reading() as session:
         row = session.get_one(ShareRow, view["id"])
@@ -366,24 +341,22 @@ def test_stored_digest_is_no_token_and_logs_contain_none(
 
 
 @pytest.mark.slow
-def test_requests_of_a_link_are_limited(files: dict[str, Path], tmp_path: Path) -> None:
+def test_requests_of_a_link_are_limited(paths: dict[str, Path], tmp_path: Path) -> None:
     settings = {"SGSST_REQUIRE_KEYS": "true", "SGSST_MAX_REQUESTS_A_SECOND_PER_KEY": "0.5"}
     with Service(tmp_path / "data", alone=True, **settings) as service, service.client() as visitor:
         store = open_store(ServiceSettings(data=service.data))
         with service.client(store.keys.create("me")[1]) as me:
-            _, token = share(me, finished(me, service, files))
+            _, token = share(me, finished(me, service, paths))
         store.close()
         for path in (token, "shr_1.x"):
             answers = [visitor.get(f"/v1/shared/{path}") for _ in range(20)]
-            refused = next(answer for answer in answers if answer.status_code == 429)
-            check_documented(refused)
-            assert refused.json()["code"] == "rate-limited"
+            refused(next(answer for answer in answers if answer.status_code == 429), 429, "rate-limited")
 
 
 def test_link_whose_files_hang_occupies_no_thread_of_others(
-    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, files: dict[str, Path], tmp_path: Path
+    service: Service, store: Store, me: httpx2.Client, visitor: httpx2.Client, paths: dict[str, Path], tmp_path: Path
 ) -> None:
-    job_id = finished(me, service, files)
+    job_id = finished(me, service, paths)
     _, token = share(me, job_id)
     row = store.jobs.artifact(job_id, "plan.json")
     assert row is not None

@@ -1,7 +1,5 @@
 """Tests of the page's static files: addresses, caching and policy."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import json
@@ -13,10 +11,8 @@ import pytest
 
 from api.http.static import DOCS_POLICY, POLICY, StaticFiles, static_files
 from api.static_files import FOLDER, exported_viewer
-from service.states import ACTIONS, STEPPING, TITLES, UNFINISHED, WORKING
 from sgsst_core.files.formats import DOWNLOADS, FORMATS
 from sgsst_core.files.scene_file import read_scene
-from sgsst_core.settings import STRENGTHS
 from tests.api.conftest import KEYED, Services
 from tests.api.service import Service
 
@@ -101,46 +97,6 @@ def test_page_knows_the_registered_scene_formats(client: httpx2.Client, files: S
     assert [entry["name"] for entry in json.loads(offered[1])] == choices == [*DOWNLOADS]
 
 
-def test_page_knows_what_is_installed(client: httpx2.Client, files: StaticFiles) -> None:
-    assert '{"video": true, "heif": true}' in client.get(f"/static/{files.digest}/tables.js").text
-    assert json.dumps(STRENGTHS) in client.get(f"/static/{files.digest}/options.js").text
-
-
-def test_page_knows_the_states_of_jobs(client: httpx2.Client, files: StaticFiles) -> None:
-    module = client.get(f"/static/{files.digest}/tables.js").text
-    states = re.search(r"states = .*\((\{.*\})\);", module)
-    assert states
-    assert json.loads(states[1]) == {
-        "titles": dict(TITLES),
-        "unfinished": list(UNFINISHED),
-        "working": list(WORKING),
-        "stepping": list(STEPPING),
-        "actions": [
-            {"name": name, "title": name.capitalize(), "statuses": list(action.statuses)}
-            for name, action in ACTIONS.items()
-        ],
-    }
-
-
-@pytest.mark.parametrize(
-    ("header", "status"),
-    [("{}", 304), ("W/{}", 304), ('"a,b", {}', 304), ("*", 304), ('"x' + "{}", 200), ("", 200)],
-)
-def test_if_none_match_accepts_several_tags(
-    client: httpx2.Client, files: StaticFiles, header: str, status: int
-) -> None:
-    path = f"/static/{files.digest}/api.js"
-    tag = client.get(path, headers={"Accept-Encoding": "identity"}).headers["etag"]
-    sent = {"Accept-Encoding": "identity", "If-None-Match": header.format(tag)}
-    assert client.get(path, headers=sent).status_code == status
-
-
-def test_modules_have_javascript_type(client: httpx2.Client, files: StaticFiles) -> None:
-    for name, file in files.files.items():
-        if name.endswith(".js"):
-            assert file.kind.startswith("text/javascript"), name
-
-
 def test_large_files_are_compressed_once(client: httpx2.Client, files: StaticFiles) -> None:
     path = f"/static/{files.digest}/{BUNDLE}"
     with client.stream("GET", path, headers={"Accept-Encoding": "br, gzip;q=0.5"}) as answer:
@@ -174,13 +130,6 @@ def test_changed_file_changes_digest(tmp_path: Path) -> None:
     first, second = (static_files(tmp_path / name) for name in "01")
     assert first.digest != second.digest
     assert first.pages["index.html"].digest != second.pages["index.html"].digest
-
-
-def test_static_files_reject_other_methods(client: httpx2.Client) -> None:
-    for path in ("/", "/docs", "/static/x/y"):
-        answer = client.post(path)
-        assert (answer.status_code, answer.headers["allow"]) == (405, "GET, HEAD")
-        assert client.head("/").status_code == 200
 
 
 @pytest.mark.parametrize("library", ["swagger-ui", "fzstd"])

@@ -1,7 +1,5 @@
 """Tests of two API processes that share a data folder: for any order of writes, stored files match their digests."""
 
-from __future__ import annotations
-
 import hashlib
 import random
 import socket

@@ -1,7 +1,5 @@
 """Tests of inputs by URL: allowed hosts and addresses, limits of size and time, and what a refusal leaves."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import ipaddress
@@ -9,10 +7,10 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +18,6 @@ import httpx2
 import pytest
 
 from api.cli.main import main
-from api.client import Client
-from api.client.transport import RequestError
 from api.http.receiving import Fetcher, Receipt, Receipts, file_name
 from service import outgoing, problems
 from service.deadlines import FileThreads
@@ -32,8 +28,9 @@ from service.problems import ServiceError
 from service.settings import ServiceSettings
 from service.store import Store, open_store
 from service.store.keys import Quotas
-from tests.api.service import Service, check_documented
-from tests.http_servers import serve
+from tests.api.http.sending import refused
+from tests.api.service import Service
+from tests.http_servers import Answer, LocalServer, send
 from tests.raised import raises_problem
 from tests.service.store.helpers import usage_of
 from tests.small_scenes import wall, write_files
@@ -46,58 +43,28 @@ FILE = b"a file\n" * 1000
 PUBLIC = "8.8.8.8"
 METADATA = "169.254.169.254"
 
-Answer = Callable[[BaseHTTPRequestHandler], object]
 
-
-class FileServer:
-    """HTTP server on loopback. Each path has its own answer; all requests are recorded."""
+class FileServer(LocalServer):
+    """Server whose paths have their own answers; all requests are recorded."""
 
     def __init__(self) -> None:
         self.answers: dict[str, Answer] = {}
         self.requests: list[tuple[str, str]] = []
-        server = self
+        super().__init__(self._answer)
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                server.requests.append((self.headers["host"], self.path))
-                server.answers[self.path](self)
-
-            def log_message(self, *ignored: object) -> None:
-                return
-
-        class Server(ThreadingHTTPServer):
-            daemon_threads = True
-            block_on_close = False
-
-            def handle_error(self, *ignored: object) -> None:  # clients that leave early
-                return
-
-        self._server = Server(("127.0.0.1", 0), Handler)
-        self.port = self._server.server_port
-        self.origin = f"http://127.0.0.1:{self.port}"
-        serve(self._server)
+    def _answer(self, handler: BaseHTTPRequestHandler) -> None:
+        self.requests.append((handler.headers["host"], handler.path))
+        self.answers[handler.path](handler)
 
     def url(self, path: str, answer: Answer) -> str:
         """Set the answer of a path, and return its URL."""
         self.answers[path] = answer
         return self.origin + path
 
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-
 
 def sends(body: bytes, status: int = 200, **headers: str) -> Answer:
-    """Return an answer with a body; without `Content_Length`, the body ends with the connection."""
-
-    def answer(handler: BaseHTTPRequestHandler) -> None:
-        handler.send_response(status)
-        for name, value in headers.items():
-            handler.send_header(name.replace("_", "-"), value)
-        handler.end_headers()
-        handler.wfile.write(body)
-
-    return answer
+    """Return an answer with a body."""
+    return lambda handler: send(handler, body, status, **headers)
 
 
 def redirects(target: str) -> Answer:
@@ -106,9 +73,8 @@ def redirects(target: str) -> Answer:
 
 @pytest.fixture
 def files() -> Iterator[FileServer]:
-    server = FileServer()
-    yield server
-    server.close()
+    with FileServer() as server:
+        yield server
 
 
 @pytest.fixture
@@ -188,7 +154,7 @@ def fetch(stored: Stored, *urls: str, requests: int = 1, bytes_quota: int | None
 def test_file_is_stored_with_its_digest(stored: Stored, files: FileServer) -> None:
     url = files.url("/scene.ply", sends(FILE))
     assert fetch(stored, url, url_hosts=files.origin) == [hashlib.sha256(FILE).hexdigest()]
-    assert files.requests == [(f"127.0.0.1:{files.port}", "/scene.ply")]
+    assert files.requests == [(f"127.0.0.1:{files.server_port}", "/scene.ply")]
 
 
 def test_nothing_is_fetched_by_default(stored: Stored, files: FileServer) -> None:
@@ -283,7 +249,7 @@ def test_connection_uses_the_checked_address(
 ) -> None:
     """A second lookup of the name would return another address, so there must not be one."""
     names["allowed.example"] = ["127.0.0.1"]
-    host = f"allowed.example:{files.port}"
+    host = f"allowed.example:{files.server_port}"
 
     def answer(handler: BaseHTTPRequestHandler) -> None:
         names["allowed.example"] = ["127.0.0.2"]
@@ -301,7 +267,7 @@ def test_redirects_among_allowed_hosts_are_followed(
     stored: Stored, files: FileServer, names: dict[str, list[str]], public_loopback: None
 ) -> None:
     names["allowed.example"] = ["127.0.0.1"]
-    other = f"http://allowed.example:{files.port}"
+    other = f"http://allowed.example:{files.server_port}"
     url = files.url("/a/b", redirects("../c?d=e"))
     files.answers |= {"/c?d=e": redirects(f"{other}/f"), "/f": sends(FILE)}
     hosts = f"{files.origin}, {other}"
@@ -462,9 +428,8 @@ def test_requests_of_one_owner_are_limited(stored: Stored, files: FileServer) ->
 
 @pytest.fixture(scope="module")
 def shared_files() -> Iterator[FileServer]:
-    server = FileServer()
-    yield server
-    server.close()
+    with FileServer() as server:
+        yield server
 
 
 @pytest.fixture(scope="module")
@@ -502,18 +467,6 @@ def test_job_from_urls(service: Service, shared_files: FileServer, urls: dict[st
                 assert hashlib.sha256(content).hexdigest() == entry["sha256"]
 
 
-def test_client_submits_urls_and_files(service: Service, urls: dict[str, str], tmp_path: Path) -> None:
-    style = tmp_path / "local.png"
-    style.write_bytes(httpx2.get(urls["style"]).content)
-    with Client(service.url) as client:
-        styles: list[str | Path] = [urls["style"], style]
-        job = client.submit(urls["scene"], styles, cameras=urls["cameras"], style_weights=[0.7, 0.3])
-        names = [entry["name"] for entry in job.data["inputs"] if entry["role"] == "style"]
-        assert names == [urls["style"].rsplit("/", 1)[1], "local.png"]
-        with pytest.raises(RequestError, match="not among the hosts"):
-            client.submit("https://evil.test/scene.ply", style, orbit=3)
-
-
 def test_submit_command_accepts_urls(
     service: Service, urls: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -547,9 +500,7 @@ def test_requests_are_checked_before_anything_is_fetched(
     before = len(shared_files.requests)
     with service.client() as client:
         for code, body in wrong:
-            answer = client.post("/v1/jobs", json=body)
-            assert (answer.status_code, answer.json()["code"]) == (422, code)
-            check_documented(answer)
+            refused(client.post("/v1/jobs", json=body), 422, code)
     assert len(shared_files.requests) == before
 
 
@@ -565,9 +516,7 @@ def test_failures_are_problem_documents(service: Service, shared_files: FileServ
     with service.client() as client:
         for code, answer in bad.items():
             body = {"scene": scene, "style": shared_files.url("/bad", answer), "cameras": [urls["cameras"]]}
-            response = client.post("/v1/jobs", json=body)
-            assert (response.status_code, response.json()["code"]) == (422, code), response.text
-            check_documented(response)
+            refused(client.post("/v1/jobs", json=body), 422, code)
     assert list((service.data / "incoming").iterdir()) == []
     assert sorted((service.data / "blobs").glob("*/*")) == stored
 

@@ -1,9 +1,8 @@
 """Tests of videos of finished jobs, rendered by a request that reports its progress."""
 
-from __future__ import annotations
-
 import io
 import json
+from pathlib import Path
 from typing import Any
 
 import av
@@ -12,8 +11,7 @@ import pytest
 
 from api.client import Client
 from api.client.transport import RequestError
-from tests.api.service import Service, wait_for
-from tests.small_scenes import wall, write_files
+from tests.api.service import Service, submit, wait_for
 
 PARAMETERS = {"preset": "preview", "backbone": "vgg16", "steps_coarse": 1, "steps_sos": 1, "measure": False}
 pytestmark = pytest.mark.slow
@@ -25,16 +23,10 @@ def service(whole_service: Service) -> Service:
 
 
 @pytest.fixture(scope="module")
-def job(service: Service, tmp_path_factory: pytest.TempPathFactory) -> str:
+def job(service: Service, paths: dict[str, Path]) -> str:
     """Return the id of a finished job."""
-    scene, cameras, style = write_files(tmp_path_factory.mktemp("inputs"), wall())
-    files = [("scene", (scene.name, scene.read_bytes())), ("cameras", (cameras.name, cameras.read_bytes()))]
-    files.append(("style", (style.name, style.read_bytes())))
     with service.client() as client:
-        data = {"parameters": json.dumps(PARAMETERS)}
-        created = client.post("/v1/jobs", files=files, data=data)
-        assert created.status_code == 202, created.text
-        job_id: str = created.json()["id"]
+        job_id = submit(client, paths, **PARAMETERS)
         wait_for(lambda: client.get(f"/v1/jobs/{job_id}").json()["status"] in ("succeeded", "failed"), "the job to end")
         assert client.get(f"/v1/jobs/{job_id}").json()["status"] == "succeeded"
         return job_id

@@ -1,7 +1,5 @@
 """Fixtures of the packages for other programs: they are built, installed and used with a live service."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Test of the Blender add-on: Blender's own extension system installs it, and Blender's Python module runs it."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

@@ -1,7 +1,5 @@
 """Tests of the ComfyUI nodes: in a real ComfyUI if there is one, else with a stand-in of its published interface."""
 
-from __future__ import annotations
-
 import asyncio
 import importlib
 import inspect

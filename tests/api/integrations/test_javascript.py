@@ -1,7 +1,5 @@
 """Test of the TypeScript client: its types are generated from the OpenAPI document, and its example runs a job."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

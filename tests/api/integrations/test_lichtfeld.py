@@ -1,7 +1,5 @@
 """Tests of the LichtFeld Studio plugin with a stand-in of its published Python API, and of its manifests."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import sys

@@ -1,61 +1,41 @@
 """Tests of the client that all packages contain."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from api.integrations import sgsst_rest
 from tests.api.conftest import KEYED, Services
 from tests.api.service import Service
-from tests.http_servers import serve
+from tests.http_servers import LocalServer, send
 
 
-class Odd(BaseHTTPRequestHandler):
-    """Server that truncates some files and is no service of sgsst."""
-
-    def do_GET(self) -> None:
-        if not self.path.endswith(("truncated", "whole")):
-            self.send_error(404)
-            return
-        self.send_response(200)
-        self.send_header("ETag", f'"{hashlib.sha256(b"content").hexdigest()}"')
-        self.send_header("Content-Length", "7")
-        self.end_headers()
-        self.wfile.write(b"cont" if self.path.endswith("truncated") else b"content")
-
-    def log_message(self, *arguments: Any) -> None:
-        pass
+def answer_oddly(handler: BaseHTTPRequestHandler) -> None:
+    """Truncate a file, send another one whole, and refuse all else: this is no service of sgsst."""
+    if not handler.path.endswith(("truncated", "whole")):
+        handler.send_error(404)
+        return
+    tag = f'"{hashlib.sha256(b"content").hexdigest()}"'
+    send(handler, b"cont" if handler.path.endswith("truncated") else b"content", ETag=tag, Content_Length="7")
 
 
 @pytest.fixture
 def odd() -> Iterator[sgsst_rest.Service]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), Odd) as server:
-        serve(server)
-        yield sgsst_rest.Service(f"http://127.0.0.1:{server.server_port}")
-        server.shutdown()
+    with LocalServer(answer_oddly) as server:
+        yield sgsst_rest.Service(server.origin)
 
 
 def test_key_is_for_one_origin(monkeypatch: pytest.MonkeyPatch) -> None:
     sent = []
 
-    class Redirecting(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            sent.append(self.headers["Authorization"])
-            self.send_response(302)
-            self.send_header("Location", f"{other}/")
-            self.end_headers()
+    def redirect(handler: BaseHTTPRequestHandler) -> None:
+        sent.append(handler.headers["Authorization"])
+        send(handler, status=302, Location=f"{other}/")
 
-        def log_message(self, *arguments: Any) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Redirecting) as server:
-        serve(server)
+    with LocalServer(redirect) as server:
         own, other = (f"http://{host}:{server.server_port}" for host in ("127.0.0.1", "localhost"))
         monkeypatch.setenv("SGSST_URL", own)
         monkeypatch.setenv("SGSST_KEY", "secret")
@@ -65,7 +45,6 @@ def test_key_is_for_one_origin(monkeypatch: pytest.MonkeyPatch) -> None:
                 sgsst_rest.Service(url, key).json("GET", "/v1/jobs")
         with pytest.raises(sgsst_rest.ServiceError, match=f"redirects to {other}"):
             sgsst_rest.Service().json("GET", "/v1/jobs")
-        server.shutdown()
     assert sent == ["Bearer secret", "Bearer secret", None, "Bearer own", "Bearer secret"]
 
 

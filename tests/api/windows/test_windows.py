@@ -1,7 +1,5 @@
 """Library, commands and client, run by the Windows build of Python under Wine; `prepare.sh` installs both."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """S3 server for tests (moto's), and a proxy that injects faults."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading

@@ -1,7 +1,5 @@
 """Tests of input files: shared by hosts in a failing S3-compatible store, and uploads whose API process was killed."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import os
@@ -28,7 +26,6 @@ from service.store.tables import BlobRow, UploadRow
 from tests.api.service import Service
 from tests.raised import raises_problem
 from tests.service.files.s3 import Fault, FaultyS3, environment_of, s3_server
-from tests.small_scenes import wall, write_files
 from tests.stores import new_store
 
 MB = 1 << 20
@@ -291,16 +288,6 @@ def test_short_store_failure_is_retried(fleet: Fleet, fault: Fault) -> None:
     assert fleet.read(fleet.host("two"), sha256) == data
 
 
-def test_only_the_interrupted_chunk_is_fetched_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = os.urandom(100_001)
-    sha256 = fleet.take(fleet.host("one"), data)
-    monkeypatch.setattr("service.files.objects._PIECE_BYTES", 10_000)
-    before = len(fleet.s3.asked)
-    fleet.s3.fail("cut-off", 2, lambda method, path: method == "GET")
-    assert fleet.read(fleet.host("two"), sha256) == data
-    assert sum(method == "GET" for method, _ in fleet.s3.asked[before:]) == 11 + 2
-
-
 @pytest.mark.slow
 def test_store_outage_is_reported_as_unavailable(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"the scene"
@@ -385,20 +372,6 @@ def test_last_part_can_be_sent_again(service: Service) -> None:
     blobs = [path.read_bytes() for path in (service.data / "blobs").glob("*/*") if path.is_file()]
     assert [blobs.count(content) for content in contents.values()] == [1, 1]
     assert not any((service.data / "uploads").iterdir())
-
-
-@pytest.mark.slow
-def test_job_can_use_the_finished_upload_at_once(service: Service, tmp_path: Path) -> None:
-    scene, _, style = write_files(tmp_path, wall())
-    where = begin(service, scene.read_bytes())
-    service.stop(signal.SIGKILL)
-    write_the_end(service, scene.read_bytes(), where, linked=True)
-    service.start()
-    body = {"style": ("style.png", style.read_bytes())}
-    data = {"scene": where.rsplit("/", 1)[1], "parameters": '{"orbit": 2}'}
-    answer = httpx2.post(f"{service.url}/v1/jobs", files=body, data=data, timeout=60)
-    assert answer.status_code == 202, answer.text
-    assert httpx2.get(f"{service.url}{where}").json()["complete"]
 
 
 def test_missing_bytes_are_not_read_as_zeros(service: Service) -> None:

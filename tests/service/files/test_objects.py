@@ -1,10 +1,7 @@
 """Tests of files in a local folder and in an S3-compatible bucket, and of the cache of stored files."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
-import json
 import multiprocessing
 import os
 import subprocess
@@ -19,7 +16,7 @@ import pytest
 
 from service.files.objects import Artifacts, FileCache, ObjectStore
 from service.problems import DamagedFileError, LostFileError, NoSpaceError, StoreError
-from tests.api.service import Service, undisturbed, wait_for
+from tests.api.service import Service, submit, undisturbed, wait_for
 from tests.service.files.s3 import environment_of, s3_server
 from tests.small_scenes import wall, write_files
 
@@ -328,10 +325,7 @@ def test_api_and_dispatcher_share_a_bucket_and_no_folder(
         dispatcher(tmp_path / "dispatcher", service.environment),
         service.client() as client,
     ):
-        body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-        answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
-        assert answer.status_code == 202, answer.text
-        where = f"/v1/jobs/{answer.json()['id']}"
+        where = f"/v1/jobs/{submit(client, files, **parameters)}"
 
         def ended() -> bool:
             return client.get(where).json()["status"] in ("succeeded", "failed")

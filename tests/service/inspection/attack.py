@@ -1,7 +1,5 @@
 """Code of an attacker who controls a reader process. Tests send it as the content of a scene; it does no real harm."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import fcntl

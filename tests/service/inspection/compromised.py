@@ -5,8 +5,6 @@
 It behaves as if the kernel did not support the named features.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

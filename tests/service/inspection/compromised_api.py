@@ -1,7 +1,5 @@
 """API process whose compromised readers execute a scene's content as code."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tests of files derived from results: turns of owners, and the number of blends, while many are requested at once."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import json

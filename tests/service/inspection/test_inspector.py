@@ -1,20 +1,15 @@
 """Tests of turns of owners on inspections, and of limits that grow with the size of files."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import json
 import random
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-import psutil
 import pytest
 from PIL import Image
 
@@ -22,7 +17,7 @@ from service import problems
 from service.deadlines import FileThreads
 from service.files.blobs import BlobFolder
 from service.inputs import JobParameters, Staged, WorkRequest
-from service.inspection.inspector import MAX_WAITING, InspectionProcess, Inspector, Lanes, Processes, Show
+from service.inspection.inspector import MAX_WAITING, InspectionProcess, Inspector, Lanes, Show
 from service.inspection.process import WORK, _memory_besides_reading
 from service.problems import ServiceError
 from service.settings import ServiceSettings
@@ -172,20 +167,6 @@ def inspecting(folder: Path, **limits: Any) -> Iterator[Inspect]:
             store.close()
 
 
-def test_process_is_started_once_in_advance(tmp_path: Path) -> None:
-    processes = Processes(ServiceSettings(data=tmp_path))
-
-    async def started() -> int:
-        before = psutil.Process().children()
-        try:
-            await asyncio.gather(processes.warm(), processes.warm())
-            return len(set(psutil.Process().children()) - set(before))
-        finally:
-            await processes.close()
-
-    assert asyncio.run(started()) == 1
-
-
 def inspect(folder: Path, files: dict[str, Path], **limits: Any) -> dict[str, Any]:
     """Inspect files with these limits in the settings, and return the findings."""
     with inspecting(folder, **limits) as ask:
@@ -202,13 +183,6 @@ def large(path: Path, side: int) -> Path:
     """Write a scene of side * side Gaussians with SH of degree 3."""
     write_scene(path, wall(side, side, sh_degree=3))
     return path
-
-
-@pytest.mark.slow
-def test_limits_grow_with_the_size_of_a_scene(files: dict[str, Path], tmp_path: Path) -> None:
-    files["scene"] = large(tmp_path / "large.ply", 300)
-    findings = inspect(tmp_path, files, inspection_bytes=16_000_000, inspection_seconds=0.5)
-    assert (findings["gaussians"], findings["sh_degree"]) == (90_000, 3)
 
 
 def test_small_file_that_expands_exceeds_the_memory_limit(files: dict[str, Path], tmp_path: Path) -> None:
@@ -285,14 +259,3 @@ def test_sizes_of_many_frames_are_checked_in_a_file_of_many_values(tmp_path: Pat
         path.write_text(json.dumps({"frames": [frame]}))
         with pytest.raises(CameraError, match="gives no size"):
             check_frames_have_sizes(path)
-
-
-@pytest.mark.slow
-def test_registries_of_kernels_are_loaded_before_a_request() -> None:
-    """Otherwise, each confined child would load them again."""
-    code = (
-        "import sys, service.inspection.process; from sgsst_core.compiled import load_registries; "
-        "before = set(sys.modules); load_registries(); print(*set(sys.modules) - before)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == ""

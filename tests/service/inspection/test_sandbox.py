@@ -1,7 +1,5 @@
 """Tests of the sandbox around readers: attacks by a compromised reader fail, and other users' files still pass."""
 
-from __future__ import annotations
-
 import errno
 import inspect as source
 import json

@@ -1,7 +1,5 @@
 """Fixtures for tests of the dispatcher: a database with one blob, and the lease of a job that reads it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

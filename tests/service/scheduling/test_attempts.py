@@ -1,7 +1,5 @@
 """Tests of how an attempt ended, of its reports, and of publishing its files, without running a process."""
 
-from __future__ import annotations
-
 import errno
 import io
 import resource

@@ -1,7 +1,5 @@
 """Tests of how jobs share a machine's GPUs, with a real database and simulated machines."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

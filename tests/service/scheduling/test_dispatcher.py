@@ -1,6 +1,4 @@
-"""Tests of a dispatcher's other tasks: heartbeats, housekeeping, and taking over jobs of dead dispatchers."""
-
-from __future__ import annotations
+"""Tests of a dispatcher's other tasks: heartbeats and health, housekeeping, taking over jobs of dead dispatchers."""
 
 import os
 import subprocess
@@ -16,17 +14,20 @@ from sqlalchemy import text
 
 from service.files.blobs import BlobFolder
 from service.files.objects import Artifacts
+from service.health import dispatcher_is_healthy
+from service.prepare import main as prepare
+from service.scheduling import housekeeping
 from service.scheduling.capacity import Grant, Machine, is_dead, own_name
 from service.scheduling.dispatcher import Dispatcher
 from service.settings import ServiceSettings
-from service.store import Store
+from service.states import Published
+from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.queue import Lease
 from tests.api.service import wait_for
 from tests.service.scheduling.conftest import new_lease
+from tests.service.store.helpers import SHA
 from tests.stores import new_store
-
-SHA = "a" * 64
 
 
 @contextmanager
@@ -211,4 +212,62 @@ def test_job_with_a_lost_or_damaged_input_fails(tmp_path: Path, damage: str, cod
     assert ended.error is not None
     assert (ended.error["code"], ended.attempt) == (code, 2)
     assert sha256 in ended.error["message"]
+    store.close()
+
+
+def test_dispatcher_is_healthy_while_it_sends_heartbeats(tmp_path: Path) -> None:
+    now = 1000.0
+    store = open_store(ServiceSettings(data=tmp_path, lease_seconds=30), lambda: now)
+    assert not dispatcher_is_healthy(store)
+    store.operations.record_heartbeat("elsewhere-01234567-1-1", 1, 1)
+    assert not dispatcher_is_healthy(store), "that is another machine's"
+    store.operations.record_heartbeat(own_name(), 1, 1)
+    assert dispatcher_is_healthy(store)
+    now += 31
+    assert not dispatcher_is_healthy(store)
+    store.close()
+
+
+def test_dispatcher_is_healthy_during_a_database_outage() -> None:
+    url = "postgresql+psycopg://nobody@127.0.0.1:1/none"
+    pytest.importorskip("psycopg", reason="psycopg is not installed: see the extra [postgresql]")
+    assert dispatcher_is_healthy(Store(ServiceSettings(database=url)))
+
+
+def test_prepare_creates_the_tables_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SGSST_DATA", str(tmp_path))
+    assert prepare() == prepare() == 0
+    store = Store(ServiceSettings())
+    assert store.database.is_up_to_date()
+    store.close()
+    monkeypatch.setenv("SGSST_DATABASE", "postgresql+psycopg://nobody@127.0.0.1:1/none")
+    monkeypatch.setenv("SGSST_START_SECONDS", "0")
+    assert prepare() == 1
+
+
+def test_stray_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = ServiceSettings(data=tmp_path / "data")
+    store, artifacts = open_store(settings), Artifacts(settings.artifacts_url)
+    store.inputs.add_blob(SHA, "aa/blob", 3)
+    source = tmp_path / "file"
+    source.write_bytes(b"x")
+
+    def put(job_id: str, epoch: int) -> Published:
+        return artifacts.put(job_id, epoch, "plan.json", source)
+
+    done, running = new_lease(store), new_lease(store)
+    referenced = put(done.job_id, 1)
+    store.leases.succeed(done, [referenced], {})
+    late, unknown = put(done.job_id, 1), put("job_0123456789", 1)
+    store.leases.release(running)
+    again = store.leases.take("two")
+    assert again is not None
+    assert again.epoch == 2
+    before, own = put(running.job_id, 1), put(running.job_id, 2)
+    everything = {file.location for file in (referenced, late, unknown, before, own)}
+    assert set(artifacts.objects.below("")) == everything
+    assert housekeeping.remove_strays(store, artifacts) == 0, "rows may still be on their way"
+    monkeypatch.setattr(housekeeping, "REMOTE_ORPHAN_SECONDS", -60.0)
+    assert housekeeping.remove_strays(store, artifacts) == 3
+    assert set(artifacts.objects.below("")) == {referenced.location, own.location}
     store.close()

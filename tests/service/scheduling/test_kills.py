@@ -1,7 +1,5 @@
 """Tests of SIGKILL at critical moments: jobs are neither lost nor published twice, and results stay the same."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

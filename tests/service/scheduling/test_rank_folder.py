@@ -1,7 +1,5 @@
 """Tests of a rank's working folder on a machine that shares only the file store with others."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle

@@ -1,8 +1,7 @@
 """Tests of webhooks: signatures, retries, validation of addresses, and isolation of receivers from slow ones."""
 
-from __future__ import annotations
-
 import base64
+import contextlib
 import datetime
 import hashlib
 import hmac
@@ -13,7 +12,7 @@ import socket
 import ssl
 import threading
 from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from service.store import Store, open_store
 from service.store.jobs import NewJob
 from service.store.tables import DeliveryRow
 from sgsst_core.progress import Progress
-from tests.http_servers import serve
+from tests.http_servers import Answer, LocalServer, send
 from tests.service.store.helpers import Clock
 from tests.stores import migrated_database, new_store
 
@@ -43,55 +42,31 @@ PATIENCE = 60.0
 LARGE = 64 << 20
 
 
-class Receiver:
-    """HTTP server on loopback that records the messages it receives.
+class Receiver(LocalServer):
+    """Server that records the messages it receives.
 
     Args:
         behave: Handling of a connection after its message is read; by default the response is `status`.
         certificate: Certificate and key for TLS.
     """
 
-    def __init__(self, behave: Callable[[Any], None] | None = None, certificate: Path | None = None) -> None:
+    def __init__(self, behave: Answer | None = None, certificate: Path | None = None) -> None:
         self.status = 200
         self.received: list[tuple[dict[str, str], bytes]] = []
         self.names: list[str | None] = []
-        receiver = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                body = self.rfile.read(int(self.headers["content-length"]))
-                receiver.received.append(({name.lower(): value for name, value in self.headers.items()}, body))
-                if behave is not None:
-                    behave(self)
-                    return
-                self.send_response(receiver.status)
-                self.send_header("Location", receiver.url)
-                self.end_headers()
-
-            def log_message(self, *ignored: object) -> None:
-                return
-
-        class Server(ThreadingHTTPServer):
-            daemon_threads = True
-            block_on_close = False
-            request_queue_size = 100
-
-            def handle_error(self, *ignored: object) -> None:  # clients that do not complete TLS
-                return
-
-        self._server = Server(("127.0.0.1", 0), Handler)
+        self._behave = behave or (lambda handler: send(handler, status=self.status, Location=self.url))
+        super().__init__(self._receive)
         if certificate is not None:
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
             context.load_cert_chain(certificate)
             context.sni_callback = lambda connection, name, context: self.names.append(name)
-            self._server.socket = context.wrap_socket(self._server.socket, server_side=True)
-        self.port = self._server.server_port
-        self.url = f"{'https' if certificate else 'http'}://127.0.0.1:{self.port}/hook"
-        serve(self._server)
+            self.socket = context.wrap_socket(self.socket, server_side=True)
+        self.url = f"{'https' if certificate else 'http'}://127.0.0.1:{self.server_port}/hook"
 
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+    def _receive(self, handler: BaseHTTPRequestHandler) -> None:
+        body = handler.rfile.read(int(handler.headers["content-length"]))
+        self.received.append(({name.lower(): value for name, value in handler.headers.items()}, body))
+        self._behave(handler)
 
 
 Start = Callable[..., Receiver]
@@ -100,15 +75,8 @@ Start = Callable[..., Receiver]
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Yield a function that starts receivers, which are stopped after the test."""
-    started: list[Receiver] = []
-
-    def start(*arguments: Any, **named: Any) -> Receiver:
-        started.append(Receiver(*arguments, **named))
-        return started[-1]
-
-    yield start
-    for each in started:
-        each.close()
+    with contextlib.ExitStack() as started:
+        yield lambda *arguments, **named: started.enter_context(Receiver(*arguments, **named))
 
 
 @pytest.fixture
@@ -160,7 +128,7 @@ def test_message_is_signed_as_in_standard_webhooks(tmp_path: Path, store: Store,
     ((headers, body),) = receiver.received
     assert json.loads(body)["type"] == "job.canceled"
     assert json.loads(body)["data"]["id"] == job_id
-    assert headers["host"] == f"127.0.0.1:{receiver.port}"
+    assert headers["host"] == f"127.0.0.1:{receiver.server_port}"
     key = base64.b64decode(store.operations.webhook_secret().removeprefix("whsec_"))
     signed = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + body
     expected = base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
@@ -342,8 +310,7 @@ def test_slow_receivers_do_not_delay_other_messages(tmp_path: Path, store: Store
     received = threading.Semaphore(0)
 
     def answer(handler: Any) -> None:
-        handler.send_response(200)
-        handler.end_headers()
+        send(handler)
         received.release()
 
     quick = start(answer)
@@ -399,8 +366,8 @@ def _check_turns(store: Store) -> None:
 
 def test_private_addresses_are_refused(tmp_path: Path, store: Store, receiver: Receiver) -> None:
     _end_job(store, receiver.url)
-    _end_job(store, f"http://localhost:{receiver.port}/")
-    _end_job(store, f"http://2130706433:{receiver.port}/")  # 127.0.0.1 to the system's resolver
+    _end_job(store, f"http://localhost:{receiver.server_port}/")
+    _end_job(store, f"http://2130706433:{receiver.server_port}/")  # 127.0.0.1 to the system's resolver
     _deliver(store, tmp_path, webhook_private_addresses=False)
     assert receiver.received == []
     assert _tries(store) == [1] * 3
@@ -448,10 +415,10 @@ def test_connection_uses_the_checked_address(
         return getaddrinfo("127.0.0.1" if len(looked_up) == 1 else "127.0.0.2", *arguments, **named)
 
     monkeypatch.setattr(socket, "getaddrinfo", resolve)
-    _end_job(store, f"http://receiver.example:{receiver.port}/hook")
+    _end_job(store, f"http://receiver.example:{receiver.server_port}/hook")
     _deliver(store, tmp_path)
     ((headers, _),) = receiver.received
-    assert headers["host"] == f"receiver.example:{receiver.port}"
+    assert headers["host"] == f"receiver.example:{receiver.server_port}"
     assert len(looked_up) == 1
 
 
@@ -462,16 +429,16 @@ def test_certificate_is_verified_for_the_host_name(
     """The connection goes to an address; SNI, certificate and `Host` use the name."""
     receiver = start(certificate=_certificate(tmp_path, name))
     tls = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
-    _end_job(store, f"https://localhost:{receiver.port}/hook")
+    _end_job(store, f"https://localhost:{receiver.server_port}/hook")
     Deliverer(_settings(tmp_path), store, tls).deliver_due()
     assert receiver.names == ["localhost"]
-    assert [headers["host"] for headers, _ in receiver.received] == [f"localhost:{receiver.port}"] * delivered
+    assert [headers["host"] for headers, _ in receiver.received] == [f"localhost:{receiver.server_port}"] * delivered
     assert _tries(store) == [1] * (not delivered)
 
 
 def test_certificate_of_an_unknown_authority_is_refused(tmp_path: Path, store: Store, start: Start) -> None:
     receiver = start(certificate=_certificate(tmp_path, "localhost"))
-    _end_job(store, f"https://localhost:{receiver.port}/hook")
+    _end_job(store, f"https://localhost:{receiver.server_port}/hook")
     _deliver(store, tmp_path)
     assert receiver.names == ["localhost"]
     assert not receiver.received

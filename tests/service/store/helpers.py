@@ -1,7 +1,5 @@
 """Helpers for tests of the store: a simulated clock, jobs, and the usage of keys."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

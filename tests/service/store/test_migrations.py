@@ -1,8 +1,5 @@
 """Tests that processes of this version still work and start on the tables of the next one, which adds to them."""
 
-from __future__ import annotations
-
-import json
 import os
 import shutil
 import subprocess
@@ -16,6 +13,7 @@ from sqlalchemy import text
 from service.store.database import MIGRATIONS, SCHEMA, Database
 from sgsst_core.errors import SettingsError
 from tests.api.service import ROOT, Service, wait_for
+from tests.api.service import submit as submit_job
 from tests.small_scenes import wall, write_files
 
 VERSIONS = sorted(path.name[:4] for path in (MIGRATIONS / "versions").glob("[0-9]*.py"))
@@ -60,11 +58,7 @@ def test_this_version_runs_on_tables_of_the_next_one(tmp_path: Path, tiny_instal
     files = dict(zip(("scene", "cameras", "style"), write_files(tmp_path, wall()), strict=True))
 
     def submit(client: Any) -> str:
-        body = {role: (path.name, path.read_bytes()) for role, path in files.items()}
-        parameters = {"steps_sos": 300, "steps_coarse": 0, "backbone": "vgg16"}
-        answer = client.post("/v1/jobs", files=body, data={"parameters": json.dumps(parameters)})
-        assert answer.status_code == 202, answer.text
-        return str(answer.json()["id"])
+        return submit_job(client, files, steps_sos=300, steps_coarse=0, backbone="vgg16")
 
     with Service(tmp_path / "data") as service, service.client() as client:
         job = submit(client)

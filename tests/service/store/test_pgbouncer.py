@@ -1,7 +1,5 @@
 """Tests of the store behind pgbouncer, which runs each transaction on any of its connections to the server."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """Tests of the order of the queue, and of the decision whether a job is retried."""
 
-from __future__ import annotations
-
 import random
 
 import pytest
@@ -11,7 +9,6 @@ from service.store import Store
 from service.store.queue import (
     MAX_LOSSES,
     MAX_RETRY_SECONDS,
-    OVERTAKEN_SECONDS,
     RetryPolicy,
     Verdict,
     cause_of,
@@ -49,24 +46,6 @@ def test_queue_order_equals_a_plain_sort(store: Store, clock: Clock, seed: int) 
             store.leases.release(lease)
         elif ending == 2:
             store.leases.succeed(lease, [], {})  # in the fourth case the job is lost
-
-
-def test_jobs_of_others_overtake_a_job_that_does_not_fit_for_a_while(store: Store, clock: Clock) -> None:
-    big = queue(store, "a")
-    small = []
-    for owner in "bca":
-        clock.now += 1
-        small.append(queue(store, owner))
-
-    def full(job: JobRow) -> bool:
-        return job.id != big
-
-    taken = [held.job_id for _ in range(3) if (held := store.leases.take("one", full))]
-    assert taken == small[:2], "but not its owner's"
-    clock.now += OVERTAKEN_SECONDS
-    queue(store, "d")
-    assert store.leases.take("two", full) is None
-    assert lease(store, "one").job_id == big, "wherever it fits first"
 
 
 def test_waiting_jobs_are_counted_up_to_a_maximum(store: Store, clock: Clock) -> None:

@@ -1,7 +1,5 @@
 """Tests of the store on SQLite and PostgreSQL with a simulated clock, including a comparison with a model."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 import tempfile
@@ -107,17 +105,6 @@ def test_codes_of_the_server_decide_what_an_error_means(problem: ProblemType | N
         error = type("Error", (psycopg.DatabaseError,), {"sqlstate": code})
         with raises_problem(problem) if problem else pytest.raises(error), translated():
             raise error
-
-
-def test_idempotency_key_creates_one_job(store: Store) -> None:
-    first, created = store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "f" * 64))
-    again, created_again = store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "f" * 64))
-    assert (created, created_again, first.id) == (True, False, again.id)
-    with raises_problem(problems.IDEMPOTENCY_KEY_REUSED):
-        store.jobs.create(new_job(), limit=10, idempotency=Idempotency("k", "e" * 64))
-    other, created = store.jobs.create(new_job("other"), limit=10, idempotency=Idempotency("k", "e" * 64))
-    assert created
-    assert other.id != first.id
 
 
 def test_queue_positions_match_the_order_of_leases(store: Store, clock: Clock) -> None:
@@ -232,18 +219,6 @@ def test_loss_counts_once_without_free_capacity(store: Store, clock: Clock) -> N
     assert [row.outcome for row in store.jobs.detail(job_id, None)[1]] == ["lost", None]
 
 
-def test_retry_delay_grows_with_each_failure(store: Store, clock: Clock) -> None:
-    job_id = queue(store)
-    error = {"code": "x", "message": "x"}
-    for wait in (RETRY, 2 * RETRY):
-        assert store.leases.fail(lease(store), error, permanent=False)
-        clock.now += wait - 0.1
-        assert store.leases.take("one") is None
-        clock.now += 0.2
-    assert not store.leases.fail(lease(store), error, permanent=False)
-    assert store.jobs.get(job_id, "local").status == "failed"
-
-
 def test_outages_never_fail_a_job(store: Store, clock: Clock) -> None:
     job_id = queue(store)
     outage, error = {"code": "infrastructure", "message": "x"}, {"code": "x", "message": "x"}
@@ -353,14 +328,6 @@ def test_job_of_another_owner_is_not_found(store: Store) -> None:
     with pytest.raises(NotFoundError):
         store.jobs.retry(job_id, "b", limit=1)
     assert store.jobs.page("b") == []
-
-
-def test_unfinished_jobs_of_a_key_are_limited(store: Store) -> None:
-    for _ in range(3):
-        store.jobs.create(new_job("a"), limit=3)
-    with raises_problem(problems.QUEUE_FULL):
-        store.jobs.create(new_job("a"), limit=3)
-    store.jobs.create(new_job("b"), limit=3)
 
 
 def test_old_progress_events_are_deleted_but_not_status_events(store: Store) -> None:
@@ -494,19 +461,6 @@ def test_held_blobs_are_not_collected(store: Store, clock: Clock) -> None:
     assert store.inputs.collect() == ["aa/blob"]
     with pytest.raises(NotFoundError):
         store.inputs.hold([SHA])
-
-
-def test_expired_job_is_deleted_after_its_results(store: Store, clock: Clock) -> None:
-    job_id = queue(store)
-    store.leases.succeed(lease(store), [Published("stylized.ply", "x", 1, SHA)], {})
-    clock.now += RETENTION + 1
-    assert store.retention.expire() == [job_id]
-    assert store.jobs.get(job_id, "local").status == "expired"
-    assert store.jobs.artifacts(job_id) == []
-    clock.now += RETENTION + 1
-    store.retention.expire()
-    with pytest.raises(NotFoundError):
-        store.jobs.get(job_id, "local")
 
 
 @pytest.mark.parametrize(("requested", "seconds"), [(RETENTION / 4, RETENTION / 4), (3 * RETENTION, RETENTION)])

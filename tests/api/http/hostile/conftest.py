@@ -1,7 +1,5 @@
 """Service for tests of hostile requests, which checks after each test that it is unharmed."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

@@ -1,7 +1,5 @@
 """Tests of hostile connections: the API ends them, serves others meanwhile, and keeps no memory afterwards."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

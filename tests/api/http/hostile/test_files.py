@@ -1,7 +1,5 @@
 """Tests of hostile files: the API responds with a problem document, and keeps no files or memory afterwards."""
 
-from __future__ import annotations
-
 import asyncio
 import gzip
 import io
@@ -148,13 +146,6 @@ def spz_4_bomb() -> bytes:
     """Return an SPZ 4 file of one Gaussian, whose positions are a gigabyte of zeros."""
     stream = zstd.compress(bytes(1 << 30))
     return spz_4(len(stream)) + 5 * stream
-
-
-def sog(**means: Any) -> bytes:
-    """Return a SOG archive without images, with these values in the entry `means`."""
-    entry = {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": ["means_l.webp", "means_u.webp"], **means}
-    steps = {name: {"codebook": [0.0], "files": [f"{name}.webp"]} for name in ("scales", "quats", "sh0")}
-    return zipped("meta.json", json.dumps({"version": 2, "count": 16, "means": entry, **steps}).encode())
 
 
 def ksplat_with(scene: bytes, place: int, *values: int) -> bytes:

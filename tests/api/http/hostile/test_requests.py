@@ -1,7 +1,5 @@
 """Tests of hostile requests: the API responds with a problem document, and keeps no files or memory afterwards."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import gzip
