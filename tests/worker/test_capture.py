@@ -1,7 +1,5 @@
 """Tests that cameras and photos are read together, and that the plan reports what was done to them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +15,11 @@ from sgsst_core.files.formats import by_name
 from sgsst_core.files.images import BLACK, WHITE, save_png
 from sgsst_core.files.photos import check_names, find_masks, load_photo
 from sgsst_core.files.scene_file import read_scene, write_scene
-from sgsst_core.progress import warnings_of
 from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.scene.panorama import FACES
-from sgsst_core.scene.rendering import CLASSIC, Rendering, RenderMode
+from sgsst_core.scene.rendering import Rendering
 from sgsst_core.scene.spherical_harmonics import scene_colors
-from tests.sgsst_core.files.test_camera_files import colmap, views
 from tests.sgsst_core.objects import figure, ground, joined
 from tests.small_scenes import ball, cameras, wall, write_files
 from worker.capture import Capture, about_background, about_notes, about_rendering, choose_axes, read_capture
@@ -74,15 +70,6 @@ def test_cameras_without_distortion_and_photos_need_no_line(tmp_path: Path) -> N
     half = read_capture(request(tmp_path, resolution=32), SCENE).with_photos(photos)
     assert lines(half) == []
     assert half.cameras[0].width == 32
-
-
-def test_models_that_may_lack_views_are_reported(tmp_path: Path) -> None:
-    for model, count in (("0", 2), ("1", 3)):
-        colmap(tmp_path / "sparse" / model, views(count), text=True)
-    capture = read_capture(SceneRequest(scene=tmp_path / "scene.ply", cameras=tmp_path), SCENE)
-    (line,) = lines(capture.with_photos(None))
-    assert line.startswith(f"cameras: warning: they may not be all: {tmp_path}/sparse/0 has 2 images, and the model ")
-    assert warnings_of(capture.decisions)
 
 
 def test_photos_mostly_without_cameras_or_with_several_are_reported(tmp_path: Path) -> None:
@@ -233,11 +220,6 @@ def test_videos_lead_through_the_front_faces_of_panoramas(tmp_path: Path) -> Non
         assert torch.allclose(pose, expected.world_to_camera, atol=1e-6)
 
 
-def test_orbits_are_not_checked(tmp_path: Path) -> None:
-    capture = read_capture(SceneRequest(scene=tmp_path / "none.ply", orbit=4), ball())
-    assert capture.with_photos(None).checked(ball(), 0.2) == capture
-
-
 def spz(folder: Path, scene: Scene) -> SceneRequest:
     """Write an SPZ file that does not state its axes."""
     path = folder / "scene.spz"
@@ -309,12 +291,6 @@ def test_up_direction_determines_axes_of_spz_without_stated_axes_or_cameras(tmp_
         assert choose_axes(source) == ("auto", [])
 
 
-def test_stated_axes_are_used(tmp_path: Path) -> None:
-    source = spz(tmp_path, SCENE)
-    write_scene(source.scene, rotated(SCENE), by_name("spz"))
-    assert choose_axes(source) == ("auto", [])
-
-
 def test_plan_names_render_mode_and_warnings(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     write_scene(path, ball())
@@ -345,13 +321,3 @@ def test_white_background_of_the_run_is_reported(tmp_path: Path) -> None:
     assert about_background(tmp_path / "a" / "b" / "scene.ply", BLACK) == []
     (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3, white_background=False)")
     assert about_background(path, BLACK) == []
-
-
-@pytest.mark.parametrize("mode", ["auto", "classic", "antialiased"])
-def test_job_is_rendered_in_requested_mode(tmp_path: Path, mode: RenderMode) -> None:
-    path, cameras, _ = write_files(tmp_path, replace(ball(), rendering=Rendering("antialiased", 0.2)))
-    source = SceneRequest(scene=path, cameras=cameras, render_mode=mode)
-    file, _ = read_scene_and_capture(source)
-    assert file.scene.rendering == (CLASSIC if mode == "classic" else Rendering("antialiased", 0.2))
-    file, _ = read_scene_and_capture(source.model_copy(update={"eps2d": 0.5}))
-    assert file.scene.rendering.eps2d == 0.5

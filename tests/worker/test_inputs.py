@@ -1,7 +1,5 @@
 """Tests of selecting the Gaussians of regions, and of reading a scene once per machine."""
 
-from __future__ import annotations
-
 import gc
 import hashlib
 import os
@@ -21,10 +19,9 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sgsst_core import container
-from sgsst_core.errors import ImageError, SceneError, SceneTooLargeError, SettingsError
+from sgsst_core.errors import ImageError, SceneError, SceneTooLargeError
 from sgsst_core.files import scene_file
 from sgsst_core.files.formats import EXTRA_FORMATS
-from sgsst_core.files.formats.scene_format import SceneFormat
 from sgsst_core.files.formats.spz import SPZ
 from sgsst_core.files.images import save_png
 from sgsst_core.files.scene_file import SceneFile, read_scene, write_scene
@@ -34,7 +31,6 @@ from sgsst_core.rasterizer import make_rasterizer
 from sgsst_core.scene.gaussians import TENSORS, Scene
 from sgsst_core.scene.spherical_harmonics import rest_colors
 from sgsst_core.scene.stored_harmonics import StoredHarmonics, held
-from sgsst_core.style import Style
 from tests.small_scenes import cameras, wall, write_files
 from tests.worker.ranks.spawn import on_ranks
 from worker.inputs import cropped, load_styles, read_shared_scene, select, select_regions
@@ -113,8 +109,6 @@ def test_standard_properties_are_selectable_in_every_format(tmp_path: Path, file
 
 
 def test_dropped_rows_are_dropped_from_masks_and_properties(tmp_path: Path) -> None:
-    scene = wall(6, 4)
-    scene.means[3, 0] = torch.nan
     path = write_files(tmp_path, wall(6, 4))[0]
     with_property(path, np.arange(24).astype("f4"))
     rows = PlyData.read(path)["vertex"].data.copy()
@@ -131,15 +125,20 @@ def test_dropped_rows_are_dropped_from_masks_and_properties(tmp_path: Path) -> N
     assert labels_of(file, region("a", "property=extra=5")) == wanted
 
 
-def test_image_masks_of_some_views_select_gaussians(tmp_path: Path) -> None:
-    """The masks are white where the right half of the scene is drawn. One of the views has no mask."""
+@pytest.mark.parametrize("in_alpha", [False, True])
+def test_image_masks_of_some_views_select_gaussians(tmp_path: Path, in_alpha: bool) -> None:
+    """The masks are white or opaque where the right half of the scene is drawn. One of the views has no mask."""
     scene: Scene = wall()
     file = read_scene(write_files(tmp_path, scene)[0])
     views, folder = cameras(), tmp_path / "masks"
     folder.mkdir()
     right = (scene.means[:, 0] > 0).float()[:, None].expand(-1, 3).contiguous()
     for view in views[:2]:
-        save_png(folder / f"{view.name}.png", make_rasterizer("cpu", scene).render(right, view))
+        mask = Image.fromarray((make_rasterizer("cpu", scene).render(right, view) * 255).round().byte().numpy())
+        if in_alpha:
+            mask, alpha = Image.new("RGBA", mask.size, "white"), mask.getchannel(0)
+            mask.putalpha(alpha)
+        mask.save(folder / f"{view.name}.png")
     selected = select(parse_selection(f"masks={folder}", "a"), file, views, 0.2)
     clear = scene.means[:, 0].abs() > 0.15
     assert torch.equal(selected[clear], scene.means[clear, 0] > 0)
@@ -154,43 +153,6 @@ def test_invalid_mask_folders_are_refused(tmp_path: Path, file: SceneFile) -> No
     save_png(empty / f"{views[0].name}.png", torch.zeros(10, 64, 3))
     with pytest.raises(ImageError, match="another aspect"):
         labels_of(file, region("a", f"masks={empty}"))
-
-
-def test_freezing_every_gaussian_is_refused(file: SceneFile) -> None:
-    everything = region("a", "half-space=1,0,0,-100", freeze=True)
-    with pytest.raises(SettingsError, match=r"Every Gaussian is frozen \(a\)"):
-        labels_of(file, everything)
-    assert select_regions((), file, cameras(), 0.2, load_styles) is None
-
-
-def test_region_styles_are_loaded(tmp_path: Path, file: SceneFile) -> None:
-    from worker.options import StyleFile
-
-    save_png(tmp_path / "s.png", torch.full((8, 8, 3), 0.5))
-    request = region("a", "half-space=1,0,0,0", styles=(StyleFile(tmp_path / "s.png"),), weight=2.0)
-    regions = select_regions((request,), file, cameras(), 0.2, load_styles)
-    assert regions is not None
-    assert isinstance(regions.every[1].style, Style)
-    assert (regions.every[1].style.names, regions.every[1].weight, regions.every[1].select) == (
-        ("s.png",),
-        2.0,
-        "half-space=1,0,0,0",
-    )
-
-
-def test_masks_in_the_alpha_channel_select_what_is_opaque(tmp_path: Path) -> None:
-    scene: Scene = wall()
-    file = read_scene(write_files(tmp_path, scene)[0])
-    view = cameras()[0]
-    (tmp_path / "masks").mkdir()
-    right = (scene.means[:, 0] > 0).float()[:, None].expand(-1, 3).contiguous()
-    alpha = (make_rasterizer("cpu", scene).render(right, view)[..., 0] * 255).round().to(torch.uint8)
-    image = Image.new("RGBA", (view.width, view.height), "white")
-    image.putalpha(Image.fromarray(alpha.numpy()))
-    image.save(tmp_path / "masks" / f"{view.name}.png")
-    selected = select(parse_selection(f"masks={tmp_path / 'masks'}", "a"), file, [view], 0.2)
-    clear = scene.means[:, 0].abs() > 0.15
-    assert torch.equal(selected[clear], scene.means[clear, 0] > 0)
 
 
 linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory files are looked for in Linux's /proc")
@@ -261,16 +223,6 @@ def test_every_rank_reads_the_scene_where_memory_files_are_missing(tmp_path: Pat
     assert [rank[2] for rank in results] == [(socket.gethostname(), psutil.Process().username())] * 2
 
 
-@linux
-@pytest.mark.parametrize("format", EXTRA_FORMATS)
-def test_compressed_scene_is_read_once(tmp_path: Path, format: SceneFormat) -> None:
-    path = tmp_path / "scene"
-    write_scene(path, wall(sh_degree=1), format)
-    results = on_ranks(2, shared, path, False)
-    assert [rank[0] for rank in results] == [digest(read_scene(path).scene)] * 2
-    assert [rank[1] for rank in results] == [True, False]
-
-
 def test_compressed_scene_needs_memory_of_its_floats(tmp_path: Path) -> None:
     """The requirement follows from the header, before the scene is decompressed."""
     path = tmp_path / "scene"
@@ -334,10 +286,3 @@ def test_scene_beyond_memory_is_refused_with_figures(tmp_path: Path) -> None:
         pytest.skip(f"no file of this size here: {error}")
     with pytest.raises(SceneTooLargeError, match=r"1,000,000,000 Gaussians need \d+\.\d+ GB .* are free"):
         read_shared_scene(path, ALONE)
-
-
-def test_single_rank_copies_nothing(tmp_path: Path) -> None:
-    write_scene(tmp_path / "scene.ply", wall())
-    file, reader = read_shared_scene(tmp_path / "scene.ply", ALONE)
-    assert reader
-    assert torch.equal(file.scene.means, read_scene(tmp_path / "scene.ply").scene.means)

@@ -1,7 +1,5 @@
 """Tests of style and region options on the command line and in JSON."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

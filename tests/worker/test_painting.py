@@ -1,7 +1,5 @@
 """Tests of `sgsst paint`: pictures of views, painted scenes, and pictures that cannot be used."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

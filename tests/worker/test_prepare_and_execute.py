@@ -1,10 +1,6 @@
 """Tests of whole jobs on one rank, from input files to output files, including resuming and a full disk."""
 
-from __future__ import annotations
-
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,14 +12,12 @@ from PIL import Image
 from sgsst_core.errors import CheckpointError
 from sgsst_core.features.network_weights import BackboneWeights
 from sgsst_core.files.formats import by_name
-from sgsst_core.files.images import save_jpg
 from sgsst_core.files.scene_file import read_scene, write_scene
 from sgsst_core.planning.plan import Plan
 from sgsst_core.progress import Progress
 from sgsst_core.scene.gaussians import Scene
 from sgsst_core.settings import make_settings
 from sgsst_core.stylizing.checkpoint import Checkpoints, load_checkpoint, save_plan
-from sgsst_core.stylizing.color_transfer import warm_start
 from sgsst_core.stylizing.loop import Callbacks, run
 from sgsst_core.stylizing.stylizer import Stylizer
 from tests.sgsst_core.stylizing.test_refining import large_wall
@@ -71,13 +65,6 @@ def test_transparent_parts_of_photos_get_the_background_of_the_job(
     assert load is not None
     assert load(1)[:, :32].unique(dim=0).unique(dim=1).flatten().tolist() == pytest.approx(list(background))
     assert load(1)[0, 40].tolist() == [0, 1, 0]
-
-
-@pytest.mark.slow
-def test_steps_do_not_wait_for_the_fonts_of_charts() -> None:
-    """Matplotlib scans all fonts when it is first imported on a machine."""
-    code = "import sys, api.cli.scene_tools, worker.prepare, worker.execute; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_job_that_ends_early_has_no_steps_left(request_: JobSpec) -> None:
@@ -196,13 +183,6 @@ def test_resume_refines_identically_and_writes_all_gaussians(tmp_path: Path, for
     assert "splitting large Gaussians" in resumed.out.with_name("s.report.html").read_text()
 
 
-def test_planning_is_shown(request_: JobSpec) -> None:
-    reports: list[Progress] = []
-    job = prepare(request_, show_planning=reports.append)
-    views = len(job.stylizer.job.views)
-    assert [progress.step for progress in reports if progress.stage == "planning"] == [*range(views + 1)]
-
-
 def test_report_has_seconds_before_the_first_step(request_: JobSpec) -> None:
     names = ("reading", "survey", "planning", "preparing")
     first = prepare(request_)
@@ -270,19 +250,6 @@ def test_job_plans_if_its_dry_run_is_not_usable(wrong: str, request_: JobSpec, t
     assert [progress.step for progress in shown if progress.stage == "planning"] == [0, 1, 2, 3]
 
 
-def test_damaged_checkpoint_falls_back_to_previous(request_: JobSpec) -> None:
-    job = prepare(request_)
-    run_job(job, steps=4, checkpoint_seconds=0)
-    job.outputs.checkpoint.write_bytes(job.outputs.checkpoint.read_bytes()[:-100])
-    warnings: list[str] = []
-    again = prepare(request_, resume=Resume(True), warn=warnings.append)
-    assert again.resumed is not None
-    # Both checkpoints are of step 4: the last one was written when the job was interrupted.
-    assert again.resumed.state.step == 4
-    assert len(warnings) == 1
-    assert "not a readable checkpoint" in warnings[0]
-
-
 def test_optional_resume_starts_without_checkpoint(request_: JobSpec) -> None:
     with pytest.raises(CheckpointError, match="no checkpoint to resume from"):
         prepare(request_, resume=Resume(True))
@@ -330,33 +297,6 @@ def test_colors_file_matches_the_result(request_: JobSpec, tmp_path: Path) -> No
             colors = np.fromfile(alone, "<f2").reshape(-1, 3)
             assert colors.shape == exact.shape
             assert np.array_equal(colors, exact.numpy().astype(np.float16))
-
-
-def test_first_preview_shows_warm_start_colors(
-    tiny_weights: BackboneWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(previews_module, "_FIRST_SECONDS", 3600)
-    settings = make_settings("standard", steps_coarse=0, steps_sos=2, coarsest_side=24)
-    style = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.5, 0.1])
-    scene = wall()
-    stylizer = Stylizer.planned(scene, cameras(), style, settings, weights=tiny_weights)
-    missing: list[str] = []
-    previews = Previews(tmp_path / "previews", 3600, missing.append)
-    run(stylizer, Callbacks(preview=previews, preview_seconds=0))
-    assert stylizer.step == 2
-    (written,) = (tmp_path / "previews").iterdir()
-    assert written.name == "step_0000000.jpg", "and none before the hour is over"
-    assert not missing
-
-    index = stylizer.job.evaluation_views[0]
-    wanted = warm_start(scene.sh_dc, stylizer.job.plan.survey.total_blend_weights, stylizer.job.style)[
-        stylizer.job.plan.seen
-    ]
-    views = stylizer.job.views
-    save_jpg(tmp_path / "wanted.jpg", views.rasterizer.render(views.colors(index, wanted), views.cameras[index]))
-    actual, expected = (np.asarray(Image.open(path)) for path in (written, tmp_path / "wanted.jpg"))
-    np.testing.assert_array_equal(actual, expected)
-    assert actual.std() > 1
 
 
 def test_thumbnail_shows_the_scene_on_the_left_and_the_result_on_the_right(

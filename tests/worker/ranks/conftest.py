@@ -1,7 +1,5 @@
 """Fixture of a Ray cluster for tests that join one."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

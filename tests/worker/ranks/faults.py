@@ -1,7 +1,5 @@
 """Fault injection in ranks: real signals to real processes, at reproducible points of the program."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -117,11 +115,6 @@ def fired(request: JobSpec) -> float | None:
     """Return the time of the fault in seconds since the epoch; None if it has not occurred."""
     path = _fired(request)
     return path.stat().st_mtime if path.exists() else None
-
-
-def forget(request: JobSpec) -> None:
-    """Delete the record that the fault occurred."""
-    _fired(request).unlink(missing_ok=True)
 
 
 def small_request(folder: Path, steps: int, **settings: Any) -> JobSpec:

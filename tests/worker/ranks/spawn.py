@@ -1,7 +1,5 @@
 """Runner of functions on several gloo ranks, which are single-threaded processes that are reused by all tests."""
 
-from __future__ import annotations
-
 import atexit
 import functools
 import multiprocessing

@@ -1,7 +1,5 @@
 """Tests that jobs with killed, suspended or disconnected ranks give the same results as an undisturbed run."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

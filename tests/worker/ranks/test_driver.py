@@ -1,7 +1,5 @@
 """Tests of the driver of ranks: retries, relayed events, requested resources, and clusters that do not answer."""
 
-from __future__ import annotations
-
 import socket
 import sys
 from collections.abc import Iterator
@@ -96,10 +94,6 @@ def test_different_error_step_or_progress_is_retried() -> None:
     assert check_retry([failed(raised(error), 4, progressed=True)] * 2)
 
 
-def test_lost_ranks_without_an_error_are_retried() -> None:
-    assert check_retry([failed(), failed()])
-
-
 def test_error_summary_is_first_line_or_type() -> None:
     assert first_line(RuntimeError("  It broke.\nAt length.")) == "It broke"
     assert first_line(RuntimeError()) == "RuntimeError"
@@ -149,21 +143,6 @@ def test_planning_progress_is_relayed_until_prepared() -> None:
         ("resumed", None),
         ("sos", 1),
     ]
-
-
-def test_views_of_a_quality_check_are_relayed() -> None:
-    recorder = EventRecorder()
-    done = RankStatus(prepared=Prepared([], 0, 10), progress=step(10))
-    checked = [step(10).model_copy(update={"views_checked": view, "views_to_check": 2}) for view in (0, 0, 1)]
-    checks = [replace(done, progress=each) for each in checked]
-    assert recorder.after(done, *checks)[1:] == [("resumed", None), ("sos", 10), ("sos", 10), ("sos", 10)]
-
-
-def test_new_attempt_relays_planning_again() -> None:
-    recorder = EventRecorder()
-    recorder.after(planned(3))
-    recorder.relay.begin_attempt()
-    assert recorder.after(planned(3)) == [("planning", 3)]
 
 
 def test_resumed_attempt_relays_no_preparation() -> None:

@@ -1,7 +1,5 @@
 """Tests that gradients, losses and whole jobs on several ranks equal those on one rank, for any division of work."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,10 +1,11 @@
-"""Tests of collectives against their definitions, and of messages, of which hostile ones are refused."""
-
-from __future__ import annotations
+"""Tests of collectives against their definitions, of messages, and of what a rank sets when it starts."""
 
 import json
 import math
+import os
 import struct
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
@@ -26,7 +27,7 @@ from sgsst_core.features.statistics import LayerStatistics, layer_statistics
 from sgsst_core.files.photos import Photo
 from sgsst_core.loss.terms import LossTerms
 from sgsst_core.messages import decode, encode
-from sgsst_core.parallel.collectives import ALONE, Collectives, ImageExchange, Team, same_on_all
+from sgsst_core.parallel.collectives import Collectives, ImageExchange, Team, same_on_all
 from sgsst_core.planning.facts import Machine
 from sgsst_core.progress import Decision, Progress
 from sgsst_core.scene.camera import Camera, Lens
@@ -41,10 +42,28 @@ from tests.worker.ranks.spawn import on_ranks
 from worker.capture import Capture
 from worker.outputs import Outputs
 from worker.ranks.driver import LONG_WAIT, RankGroup, RankHandle, long_wait
-from worker.ranks.process_group import WAITING, _backend, _meet
-from worker.ranks.rank import Outcome, RankStatus
+from worker.ranks.process_group import WAITING, _backend, _meet, with_index
+from worker.ranks.rank import Outcome, RankStatus, _failure
 
 HEIGHT = 70
+ROOT = Path(__file__).resolve().parents[3]
+
+#: Program that compiles an uncached kernel after Numba's threads have started and another number of threads was set.
+COLD_CACHE = """
+import os, sys
+import numba, numpy as np
+from worker.ranks.rank import set_thread_variables
+
+@numba.njit(parallel=True)
+def doubled(x):
+    for i in numba.prange(x.size):
+        x[i] *= 2
+
+doubled(np.ones(8))
+set_thread_variables(numba.config.NUMBA_NUM_THREADS + 1)
+doubled(np.ones(8, np.float32))
+print(os.environ["OMP_NUM_THREADS"])
+"""
 
 
 @pytest.mark.parametrize(
@@ -169,16 +188,6 @@ def test_merged_statistics_match_one_rank(empty: int | None) -> None:
             assert float(statistics.std()[zero]) == 0.0
 
 
-def test_merged_empty_statistics_are_empty() -> None:
-    for statistics in on_ranks(2, merge_empty):
-        assert not float(statistics.count)
-        assert not statistics.centered.any()
-
-
-def merge_empty(collectives: Collectives) -> LayerStatistics:
-    return collectives.all_reduce_statistics([LayerStatistics.zero(4)], numbers(0.0))[0][0]
-
-
 def values(collectives: Collectives, groups: int) -> dict[str, Any]:
     group = collectives.split_group(groups)
     return {
@@ -236,17 +245,6 @@ def drift(collectives: Collectives) -> str:
 def test_drifting_ranks_are_detected() -> None:
     for message in on_ranks(2, drift):
         assert message.startswith("Step 50: the ranks' colors are no longer the same.")
-
-
-def test_single_rank_collectives_return_their_input() -> None:
-    band = image(0)
-    filled = torch.zeros_like(band)
-    exchange = ImageExchange([WHOLE], [WHOLE])
-    ALONE.gather_parts([exchange], [band], [filled])
-    assert torch.equal(filled, band)
-    assert torch.equal(ALONE.reduce_parts([exchange], [band])[0], band)
-    assert ALONE.all_reduce(band) is band
-    assert ALONE.all_gather("a") == ["a"]
 
 
 VALUES = [
@@ -412,3 +410,29 @@ def rank_handle(waiting: float, stage: str | None = None, kind: Literal["failed"
 def test_long_wait_names_the_late_ranks(handles: list[RankHandle], said: str | None) -> None:
     line = long_wait(RankGroup(handles))
     assert line == (said and f"Waiting for more than 60 s: {said}")
+
+
+@pytest.mark.slow
+def test_thread_count_can_be_set_after_kernels_ran() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ended = subprocess.run(
+        [sys.executable, "-c", COLD_CACHE], env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout) > 1
+
+
+def test_devices_get_an_index(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyTorch refuses a device without an index, and does so before it looks for a GPU."""
+    with pytest.raises(ValueError, match="index"):
+        torch.cuda.set_device(torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 3)
+    assert with_index("cuda") == torch.device("cuda", 3)
+    assert with_index("cuda:1") == torch.device("cuda", 1)
+    assert with_index("cpu") == torch.device("cpu")
+
+
+def test_store_error_is_an_echo_of_a_lost_rank() -> None:
+    """Such an error occurs if a rank is lost while the other ranks form their process group."""
+    assert _failure(dist.DistStoreError("wait timeout")).echo
+    assert not _failure(RuntimeError("wait timeout")).echo

@@ -1,7 +1,5 @@
 """Tests on GPUs: several ranks with NCCL against one rank, and one GPU against the CPU."""
 
-from __future__ import annotations
-
 from datetime import timedelta
 from pathlib import Path
 from typing import Any

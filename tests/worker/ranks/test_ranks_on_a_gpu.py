@@ -1,7 +1,5 @@
 """Tests of ranks with simulated CUDA devices, over gloo: results and host synchronizations of their steps."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

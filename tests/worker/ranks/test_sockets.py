@@ -1,7 +1,5 @@
 """Tests of the sockets of ranks: if all ranks are on one machine, other machines cannot reach them."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import sys
